@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: BSD-3-Clause
+# `make demo` and `make test` set themselves up: a virtual environment in the checkout, and nothing outside it.
+PYTHON ?= python3
+BIN := .venv/bin
+NATIVE := $(wildcard camera_node/native/*)
+
+.PHONY: demo test check setup format clean
+
+demo: .venv/ready
+	@$(BIN)/python -m web --demo $(ARGS)
+
+test: .venv/ready
+	$(BIN)/python -m pytest $(ARGS)
+
+check: .venv/ready
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/clang-format --dry-run --Werror camera_node/native/*.cpp camera_node/native/*.hpp
+	$(BIN)/lint-imports
+	$(BIN)/basedpyright
+
+format: .venv/ready
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+	$(BIN)/clang-format -i camera_node/native/*.cpp camera_node/native/*.hpp
+
+setup: .venv/ready
+
+.venv/ready: pyproject.toml CMakeLists.txt $(NATIVE)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "error: $(PYTHON) is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@$(PYTHON) -m venv .venv
+	@echo "setting up .venv (a few minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[server,dev]'
+	@touch $@
+
+clean:
+	rm -rf .venv build

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The rig: named cameras and where they stand. Read and written as `rig.yaml`."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+
+from calib.camera import Camera
+from calib.errors import CalibrationError
+from camera_node.config import load_yaml, write_atomically
+from camera_node.errors import ConfigError
+
+
+class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Cameras by name; and what calibration says of itself (free text and figures, for people and tools)."""
+
+    cameras: dict[str, Camera]
+    calibration: dict[str, Any] = {}
+
+    def placed(self) -> dict[str, Camera]:
+        """The cameras whose pose is known."""
+        return {name: camera for name, camera in self.cameras.items() if camera.T_world_cam is not None}
+
+    def require_placed(self, path: Path) -> dict[str, Camera]:
+        """The placed cameras of the rig that was read from `path`.
+
+        Raises:
+            CalibrationError: fewer than one camera is placed.
+        """
+        placed = self.placed()
+        if not placed:
+            raise CalibrationError(f"{path} places no camera; run python -m calib wand --rig {path}")
+        return placed
+
+
+class _Entries(msgspec.Struct, forbid_unknown_fields=True):
+    cameras: dict[str, dict[str, Any]]
+    calibration: dict[str, Any] = {}
+
+
+def load_rig(path: Path) -> Rig:
+    """Read a rig; a camera without a pose is allowed, one without intrinsics is not.
+
+    Raises:
+        ConfigError: the file is missing, broken, or has a field that no rig has.
+        CalibrationError: a camera has no intrinsics.
+    """
+    for name, entry in load_yaml(path, _Entries).cameras.items():
+        if missing := [key for key in ("width", "height", "fx", "fy", "cx", "cy") if key not in entry]:
+            raise CalibrationError(
+                f"camera '{name}' in {path} has no intrinsics ({', '.join(missing)} missing); "
+                f"run python -m calib intrinsics --camera {name}"
+            )
+    rig = load_yaml(path, Rig)
+    if not rig.cameras:
+        raise ConfigError(f"{path} names no camera; run python -m calib intrinsics")
+    return rig
+
+
+def save_rig(rig: Rig, path: Path) -> None:
+    """Write a rig atomically; fields at their defaults are left out.
+
+    Raises:
+        ConfigError: the folder can't be written to.
+    """
+    write_atomically(path, dump_rig(rig))
+
+
+def dump_rig(rig: Rig) -> str:
+    """The rig as YAML text, short lists on one line."""
+    plain = msgspec.to_builtins(rig)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers stand on one line, as a person would write them."""
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
+    flat = all(isinstance(x, (int, float, str)) for x in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_Dumper.add_representer(list, _represent_list)
+_Dumper.add_representer(tuple, _represent_list)
+_Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a user can mend, and how a program says it.
+
+    RoundelError
+    ├── ConfigError          a file or an option: missing, broken, or of the wrong kind
+    ├── CameraError          a camera, an image or another source of frames
+    ├── NetworkError         a Zenoh endpoint: taken, unreachable or refused
+    ├── calib.CalibrationError
+    ├── fusion.FusionError
+    └── web.WebError
+
+Every message says what is wrong, where, and what to do. Faults in live data are never raised: they are counted.
+"""
+
+import sys
+from collections.abc import Callable
+
+
+class RoundelError(Exception):
+    """The base of every fault that a user can mend."""
+
+
+class ConfigError(RoundelError):
+    """A file or an option that is missing, broken or of the wrong kind."""
+
+
+class CameraError(RoundelError):
+    """A camera, an image or another source of frames that does not deliver."""
+
+
+class NetworkError(RoundelError):
+    """A Zenoh endpoint that is taken, unreachable or refused."""
+
+
+def run(program: Callable[[], int | None]) -> None:
+    """Run a command line program and exit: 0 or its own code; 2 with one line for a fault a user can mend."""
+    try:
+        code = program()
+    except RoundelError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        code = 130
+    sys.exit(code or 0)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Poses as people write them (`position_m`, `wxyz`) and as mathematics uses them (a 4x4 matrix).
+
+`p_world = T_world_cam @ p_cam`: adjacent names cancel.
+"""
+
+import math
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A rigid motion as it stands in a YAML file: metres, and a quaternion w, x, y, z of any length but zero."""
+
+    position_m: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.position_m, *self.wxyz))):
+            raise ValueError("a pose must be finite")
+        if math.hypot(*self.wxyz) < 1e-6:
+            raise ValueError("the quaternion wxyz must not be zero")
+
+    def matrix(self) -> Array:
+        """The (4, 4) homogeneous matrix."""
+        T = np.eye(4)
+        T[:3, :3] = rotation_from_wxyz(self.wxyz)
+        T[:3, 3] = self.position_m
+        return T
+
+    @classmethod
+    def from_matrix(cls, T: ArrayLike) -> "Pose":
+        """The pose of a (4, 4) homogeneous matrix."""
+        T = np.asarray(T, float)
+        return cls(tuple(T[:3, 3].tolist()), tuple(wxyz_from_rotation(T[:3, :3]).tolist()))
+
+
+def rotation_from_wxyz(wxyz: ArrayLike) -> Array:
+    """(3, 3) rotation of a quaternion w, x, y, z, which need not be of unit length."""
+    q = np.asarray(wxyz, float)
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def wxyz_from_rotation(R: ArrayLike) -> Array:
+    """(4,) unit quaternion w >= 0, x, y, z of a (3, 3) rotation (Shepperd's largest component first)."""
+    R = np.asarray(R, float)
+    squares = 1 + np.array([np.trace(R), *(2 * np.diag(R) - np.trace(R))])
+    k = int(np.argmax(squares))
+    a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    d, e, f = R[1, 0] + R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2]
+    s = squares[k]
+    q = np.array([[s, a, b, c], [a, s, d, e], [b, d, s, f], [c, e, f, s]][k])
+    return np.copysign(1.0, q[0]) * q / np.linalg.norm(q)
+
+
+def rotation_from_vector(omega: ArrayLike) -> Array:
+    """(3, 3) rotation by the vector `omega` (3,): axis times angle, radians."""
+    return np.asarray(cv2.Rodrigues(np.asarray(omega, float).reshape(3, 1))[0], float)
+
+
+def invert(T: Array) -> Array:
+    """The inverse of a (4, 4) rigid motion."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def look_at(position: ArrayLike, target: ArrayLike) -> Array:
+    """T_world_cam (4, 4) of a camera at `position` that looks at `target`, its image upright (world z up).
+
+    Raises:
+        ValueError: the target stands straight above or below the camera, where upright has no meaning.
+    """
+    position, target = np.asarray(position, float), np.asarray(target, float)
+    z = target - position
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    if np.linalg.norm(x) < 1e-9:
+        raise ValueError("the target stands straight above or below the camera")
+    z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    T[:3, 3] = position
+    return T

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""detections to markers to robots; holds the Zenoh router."""

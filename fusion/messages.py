@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the server says over Zenoh, in the encoding of `camera_node.messages`.."""
+
+import math
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.messages import VERSION, MessageError
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+State = Literal["tracked", "coasting", "lost"]
+
+
+class Latency(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the time went, from the newest exposure's middle to the pose's publication, milliseconds."""
+
+    camera_ms: float  # middle of the exposure until the message was sent: read-out and detection
+    network_ms: float  # until the server had it
+    wait_ms: float  # until the instant was complete
+    fuse_ms: float  # association and estimation
+    total_ms: float
+
+
+class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a robot was at `t_ns`. While `lost` the last known pose stands there with its grown covariance.
+
+    `position` and `velocity` (m/s) are the body's origin in the world; `quaternion_wxyz` turns the body into the world;
+    `angular_velocity` (rad/s) is in the world. `covariance` is (12, 12) <f4, row by row, in GTSAM's order: rotation
+    (vector in the body's frame), position (world), angular velocity (world), velocity (world). A robot of one marker
+    has +z along the marker's normal and no known turn about it: its covariance says so.
+    """
+
+    version: int = VERSION
+    robot: str
+    t_ns: int
+    state: State
+    position: Vector
+    quaternion_wxyz: tuple[float, float, float, float]
+    velocity: Vector
+    angular_velocity: Vector
+    covariance: bytes
+    n_markers: int  # markers used in this instant
+    cameras: tuple[str, ...] = ()  # cameras used in this instant
+    residual_px: float | None = None  # RMS of the reprojection in this instant
+    latency: Latency | None = None  # None offline
+
+    def check(self) -> None:
+        """Raise MessageError unless the numbers are finite and the covariance has its size."""
+        numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
+        if len(self.covariance) != 576 or not all(map(math.isfinite, numbers)):
+            raise MessageError("a pose that is not finite, or a covariance that is not 12 x 12")
+
+    @property
+    def covariance_matrix(self) -> Array:
+        """(12, 12) covariance: rotation, position, angular velocity, velocity."""
+        return np.frombuffer(self.covariance, "<f4").reshape(12, 12).astype(float)
+
+
+class Markers(msgspec.Struct, frozen=True, kw_only=True):
+    """Every marker of a fused instant, labelled or not.
+
+    Columns, one row a marker: `position` (M, 3) <f8 m, world; `covariance` (M, 9) <f4 m^2, row by row; `normal`
+    (M, 3) <f4 unit vector out of the printed side, NaN where unknown; `robot` (M,) <i4 index into `robots`, -1 for
+    none; `marker` (M,) <i4 index in that robot, -1 for none; `cameras` (M,) <u8 bit k set where `camera_names[k]`
+    saw it.
+    """
+
+    version: int = VERSION
+    t_ns: int
+    robots: tuple[str, ...]
+    camera_names: tuple[str, ...]
+    position: bytes
+    covariance: bytes
+    normal: bytes
+    robot: bytes
+    marker: bytes
+    cameras: bytes
+
+    def __len__(self) -> int:
+        return len(self.position) // 24
+
+    def check(self) -> None:
+        """Raise MessageError unless the columns' sizes agree."""
+        n = len(self)
+        sizes = {"position": 24, "covariance": 36, "normal": 12, "robot": 4, "marker": 4, "cameras": 8}
+        for name, size in sizes.items():
+            if len(getattr(self, name)) != n * size:
+                raise MessageError(f"column {name} of {len(getattr(self, name))} bytes for {n} markers")
+
+    def positions(self) -> Array:
+        """(M, 3) positions, world."""
+        return np.frombuffer(self.position, "<f8").reshape(-1, 3)
+
+    def robot_index(self) -> NDArray[np.int32]:
+        """(M,) index into `robots`, -1 for none."""
+        return np.frombuffer(self.robot, "<i4")
+
+    def camera_bits(self) -> NDArray[np.uint64]:
+        """(M,) bit k set where `camera_names[k]` saw the marker."""
+        return np.frombuffer(self.cameras, "<u8")
+
+
+class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """What the server sees of one camera, over the last second."""
+
+    fps: float
+    lateness_ms: float  # middle of exposure to arrival, mean
+    residual_px: float | None  # RMS of what was used, None where nothing was
+    used: int  # detections that a robot or marker took
+    unused: int  # detections that nothing took
+    late: int  # frames dropped since the start because they came too late
+    calibrated: bool
+
+
+class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """How the server does, once a second. `faults` counts, since the start, what was skipped, by its reason."""
+
+    version: int = VERSION
+    t_ns: int
+    instants_per_s: float
+    latency_ms: float | None  # median over the last second, newest exposure to publication
+    cpu: float  # this process's share of one core
+    memory_mb: float
+    cameras: dict[str, CameraHealth]
+    robots: dict[str, State]
+    faults: dict[str, int]
+
+
+class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """The calibration in force, as the text of its `rig.yaml`."""
+
+    version: int = VERSION
+    t_ns: int
+    yaml: str
