@@ -79,7 +79,7 @@ class _Dumper(yaml.SafeDumper):
     """Lists of numbers stand on one line, as a person would write them."""
 
 
-def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
+def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:
     flat = all(isinstance(x, (int, float, str)) for x in data)
     return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
 

@@ -83,7 +83,7 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
             uv, jacobian = cv2.projectPoints(points, zero, zero, self.K, self._coefficients)[:2]
             translation = slice(3, 6)
         # At zero rotation, moving the frame and moving the point are the same.
-        return uv.reshape(-1, 2), jacobian[:, translation].reshape(-1, 2, 3)
+        return uv.reshape(-1, 2).astype(float), jacobian[:, translation].reshape(-1, 2, 3).astype(float)
 
     def normalise(self, uv: ArrayLike) -> Array:
         """Undistorted image plane coordinates x/z, y/z (N, 2) of raw pixels (N, 2).
@@ -97,7 +97,8 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
             xy = cv2.fisheye.undistortPoints(uv, self.K, self._coefficients).reshape(-1, 2)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-12)
-            xy = cv2.undistortPointsIter(uv, self.K, self._coefficients, None, None, criteria).reshape(-1, 2)
+            xy = cv2.undistortPoints(uv, self.K, self._coefficients, criteria=criteria).reshape(-1, 2)
+        xy = xy.astype(float)
         back = self.project(np.column_stack([xy, np.ones(len(xy))]))
         xy[~(np.linalg.norm(back - uv[:, 0], axis=1) < 1e-3)] = np.nan
         return xy

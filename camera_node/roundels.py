@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a detector sees in one frame: columns for programs, objects for people."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +36,7 @@ class Roundel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Roundels(Sequence[Roundel]):
+class Roundels:
     """All roundels of one frame, as columns of N rows. `id` and `track` are -1 where there is none.
 
     Shapes: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), angle_rad, ratio, contrast, id and track (N,).
@@ -66,9 +66,11 @@ class Roundels(Sequence[Roundel]):
     def __len__(self) -> int:
         return len(self.uv)
 
-    def __getitem__(self, k):  # a row as an object; a slice, mask or index array as columns
-        if not isinstance(k, (int, np.integer)):
-            return Roundels(*(getattr(self, name)[k] for name in self.__slots__))
+    def select(self, rows: NDArray) -> "Roundels":
+        """The rows that a mask or an index array names."""
+        return Roundels(*(getattr(self, name)[rows] for name in self.__slots__))
+
+    def __getitem__(self, k: int) -> Roundel:
         number, track = int(self.id[k]), int(self.track[k])
         return Roundel(
             self.uv[k],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the server says over Zenoh, in the encoding of `camera_node.messages`.."""
+"""What the server says over Zenoh, in the encoding of `camera_node.messages`."""
 
 import math
 from typing import Literal
