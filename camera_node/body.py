@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Rigid things that carry printed roundels: a wand, a robot."""
+
+import math
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = tuple[float, float, float]
+
+
+class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Roundels of one size at known places, printed side +z.
+
+    Attributes:
+        diameter_m: outer diameter d_o of the black disc, metres.
+        markers: centres in the body's frame, metres.
+        inner_ratio: d_i / d_o, of the white disc inside; 0.6 in the paper.
+        surround_ratio: d / d_o, of the white card around; 9/7 in the paper.
+    """
+
+    diameter_m: float
+    markers: tuple[Vector, ...] = ((0.0, 0.0, 0.0),)
+    inner_ratio: float = 0.6
+    surround_ratio: float = 9 / 7
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.diameter_m <= 10:
+            raise ValueError(f"diameter_m is {self.diameter_m}; give the black disc's diameter d_o in metres")
+        if not self.markers or not all(map(math.isfinite, np.ravel(self.markers))):
+            raise ValueError("markers must be one or more [x, y, z], finite, in metres")
+        if not (0.1 <= self.inner_ratio <= 0.95 and 1.0 <= self.surround_ratio <= 10):
+            raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(M, 3) marker centres, body frame, metres."""
+        return np.array(self.markers, float)
