@@ -26,7 +26,9 @@ REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 
 LENGTH_SIGMA_M = 0.0005  # to which a wand is made
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
 MAX_ITERATIONS = 60
-MIN_DAMPING = 1.0  # of information that reaches 1e10: holds the world, which nothing observes, against rounding
+MIN_DAMPING = (
+    1.0  # of information that reaches 1e10: holds the world, which nothing observes, against rounding
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +215,9 @@ class _Linearisation:
         self.starts = np.flatnonzero(np.diff(observations.view, prepend=-1))
         dt = np.diff(problem.knot_s)
         self.links = np.flatnonzero((dt <= MAX_GAP_S) & (dt > 0))
-        self.smooth = np.array([whitened_motion(dt[k], problem.density) for k in self.links]).reshape(-1, 2, 4)
+        self.smooth = np.array([whitened_motion(dt[k], problem.density) for k in self.links]).reshape(
+            -1, 2, 4
+        )
         self.models = {}
         self.graph: Any = None
 
@@ -293,9 +297,7 @@ class _Linearisation:
                 (count + int(k), J_knots[first:last, :, 0].reshape(2 * (last - first), -1)),
             ]
             if after != k:
-                blocks.append(
-                    (count + int(after), J_knots[first:last, :, 1].reshape(2 * (last - first), -1))
-                )
+                blocks.append((count + int(after), J_knots[first:last, :, 1].reshape(2 * (last - first), -1)))
             self._add(blocks, error[first:last].ravel())
 
     def _add_priors(self, state: State) -> None:
@@ -322,7 +324,8 @@ class _Linearisation:
         along = gap / np.linalg.norm(gap) / distance / 1e-6
         zero = np.zeros((1, 3))
         blocks = [
-            (c, np.hstack([zero, sign * along[None] @ state.cameras[c, :3, :3]])) for c, sign in ((a, 1), (b, -1))
+            (c, np.hstack([zero, sign * along[None] @ state.cameras[c, :3, :3]]))
+            for c, sign in ((a, 1), (b, -1))
         ]
         self._add(blocks, -error)
 

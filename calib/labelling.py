@@ -49,7 +49,9 @@ def require_distinct(wand: Body) -> None:
         other = distances[np.ix_(order, order)]
         if (np.abs(other - distances) <= SYMMETRY * np.maximum(other, distances)).all():
             swapped = [k for k, other in enumerate(order) if k != other]
-            pairs = ", ".join(f"{a}-{b} {distances[a, b]:.3f} m" for a, b in combinations(range(len(points)), 2))
+            pairs = ", ".join(
+                f"{a}-{b} {distances[a, b]:.3f} m" for a, b in combinations(range(len(points)), 2)
+            )
             raise CalibrationError(
                 f"the wand's spacing is symmetric: markers {' and '.join(map(str, swapped))} can be swapped "
                 f"(distances {pairs}); move one so that the spacings differ by {SYMMETRY:.0%} or more, "
@@ -148,7 +150,9 @@ class Labeller:
             if (fit := self._fit(points, dict(zip(labels, rows.tolist(), strict=True)), xy, distances))
         ]
 
-    def _on_line(self, labels: tuple[int, ...], triples: Index, rays: Array, xy: Array) -> tuple[Array, Index]:
+    def _on_line(
+        self, labels: tuple[int, ...], triples: Index, rays: Array, xy: Array
+    ) -> tuple[Array, Index]:
         a, b, c = (xy[triples[:, k]] for k in range(3))
         chord = c - a
         length = np.maximum(np.linalg.norm(chord, axis=1), 1e-12)

@@ -70,7 +70,9 @@ def shared_markers(instants: Sequence[Sequence[View]], a: str, b: str) -> Shared
             labels = np.intersect1d(seen[a].labels, seen[b].labels)
             ra, rb = seen[a].rows_of(labels), seen[b].rows_of(labels)
             for label, i, j in zip(labels, ra, rb, strict=True):
-                rows.append((k, label, *seen[a].xy[i], *seen[b].xy[j], *_point(seen[a], i), *_point(seen[b], j)))
+                rows.append(
+                    (k, label, *seen[a].xy[i], *seen[b].xy[j], *_point(seen[a], i), *_point(seen[b], j))
+                )
     table = np.array(rows, float).reshape(-1, 12)
     index = table[:, :2].astype(np.intp)
     return Shared(index[:, 0], index[:, 1], table[:, 2:4], table[:, 4:6], table[:, 6:9], table[:, 9:12])
@@ -137,7 +139,9 @@ def relate_by_rays(shared: Shared, a: str, b: str, lens: Lens, wand: Body) -> Tw
     depths: dict[tuple[str, int, int], float] = {}
     for camera, seen in ((a, points), (b, transform(invert(T), points))):
         far = np.linalg.norm(seen, axis=1).tolist()
-        depths |= dict(zip(zip([camera] * len(far), instant.tolist(), label.tolist(), strict=True), far, strict=True))
+        depths |= dict(
+            zip(zip([camera] * len(far), instant.tolist(), label.tolist(), strict=True), far, strict=True)
+        )
     return TwoView(a, b, T, len(np.unique(instant)), scale is not None, depths)
 
 

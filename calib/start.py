@@ -70,7 +70,9 @@ def explain_unplaced(
             continue
         counts = {b if a == name else a: n for (a, b), n in shared.items() if name in (a, b)}
         told = ", ".join(f"{n} with {other}" for other, n in sorted(counts.items()))
-        reasons[name] = f"instants shared with other cameras: {told}; {MIN_INSTANTS} or more that agree are needed"
+        reasons[name] = (
+            f"instants shared with other cameras: {told}; {MIN_INSTANTS} or more that agree are needed"
+        )
     return reasons
 
 

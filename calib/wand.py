@@ -64,7 +64,9 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
     unplaced = explain_unplaced(sorted(rig.cameras), list(start), counts, shared)
     if len(start) < 2:
         told = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
-        raise CalibrationError(f"no two cameras could be placed; wave where two see the wand at once ({told})")
+        raise CalibrationError(
+            f"no two cameras could be placed; wave where two see the wand at once ({told})"
+        )
     return _solve(rig, wand, start, instants, left_out, unplaced, views, metric=pairs[0].metric)
 
 
@@ -205,7 +207,9 @@ def _conclude(
     covariances = adjusted.covariance()
     for name, T, cov in zip(names, adjusted.state.cameras, covariances, strict=True):
         rows = tuple(tuple(row) for row in cov.tolist())
-        cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=Pose.from_matrix(T), covariance=rows)
+        cameras[name] = msgspec.structs.replace(
+            cameras[name], T_world_cam=Pose.from_matrix(T), covariance=rows
+        )
     T_world = upright(adjusted.state.cameras, adjusted.state.motion[:, 0].reshape(-1, 3))
     lengths = measure_lengths(problem, observations, adjusted)
     frames = Counter(view.camera for view in views)

@@ -98,7 +98,9 @@ def read_positions(path: Path) -> dict[str, Array]:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             if missing := {"camera", "x", "y", "z"} - set(reader.fieldnames or ()):
-                raise ConfigError(f"{path} lacks the column {', '.join(sorted(missing))}; it needs camera,x,y,z")
+                raise ConfigError(
+                    f"{path} lacks the column {', '.join(sorted(missing))}; it needs camera,x,y,z"
+                )
             positions: dict[str, Array] = {}
             for row in reader:
                 positions[_new_name(row["camera"], positions, path)] = _point(row, path, reader.line_num)
