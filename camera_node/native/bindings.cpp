@@ -2,15 +2,32 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
-#include "threshold.hpp"
+#include "detector.hpp"
 
 namespace nb = nanobind;
 using Grey = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
+using Table = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 
 static roundel::ImageView view(const Grey& image) {
     if (image.shape(1) > 1 && image.stride(1) != 1) throw nb::value_error("image rows must be contiguous");
     return {image.data(), int(image.shape(1)), int(image.shape(0)), ptrdiff_t(image.stride(0))};
+}
+
+/// One row a roundel, in the order that `_core.pyi` states.
+static Table table(const std::vector<roundel::Fit>& fits) {
+    constexpr size_t kColumns = 16;
+    auto* rows = new double[fits.size() * kColumns + 1];
+    const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+    double* to = rows;
+    for (const auto& f : fits)
+        for (const double value :
+             {f.outer.x, f.outer.y, f.covariance.xx, f.covariance.xy, f.covariance.yy, f.outer.major,
+              f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.residual, f.offset_x, f.offset_y,
+              f.offset_covariance.xx, f.offset_covariance.xy, f.offset_covariance.yy})
+            *to++ = value;
+    return Table(rows, {fits.size(), kColumns}, owner);
 }
 
 NB_MODULE(_core, m) {
@@ -23,4 +40,30 @@ NB_MODULE(_core, m) {
             return std::tuple(levels.dark, levels.bright, levels.dark_count);
         },
         nb::arg("image").noconvert(), nb::arg("theta"));
+    m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
+          nb::arg("major"));
+    nb::class_<roundel::Detector>(m, "Detector")
+        .def(
+            "__init__",
+            [](roundel::Detector* self, std::vector<double> ratios, double tolerance, double min_diameter,
+               double max_diameter, double min_contrast) {
+                new (self) roundel::Detector(
+                    {std::move(ratios), tolerance, min_diameter, max_diameter, min_contrast});
+            },
+            nb::arg("inner_ratios"), nb::arg("ratio_tolerance"), nb::arg("min_diameter"),
+            nb::arg("max_diameter"), nb::arg("min_contrast"))
+        .def(
+            "detect",
+            [](roundel::Detector& self, const Grey& image) {
+                const auto pixels = view(image);
+                std::vector<roundel::Fit> fits;
+                {
+                    nb::gil_scoped_release release;
+                    fits = self.detect(pixels);
+                }
+                return table(fits);
+            },
+            nb::arg("image").noconvert())
+        .def_prop_ro("saturated", &roundel::Detector::saturated)
+        .def_prop_ro("theta", &roundel::Detector::theta);
 }

@@ -2,16 +2,11 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <vector>
+
+#include "image.hpp"
 
 namespace roundel {
-
-/// A view of an 8-bit grey image; `stride` is the distance between rows in bytes.
-struct ImageView {
-    const uint8_t* data;
-    int width, height;
-    ptrdiff_t stride;
-    const uint8_t* row(int y) const { return data + y * stride; }
-};
 
 /// Mean grey levels of the two classes that the grey level `theta` separates, and how many pixels are dark.
 struct Levels {
@@ -22,5 +17,36 @@ struct Levels {
 /// m_d and m_b of the paper's adaptive threshold theta = (m_d + m_b) / 2 (Faigl et al., Section III-B).
 /// A class without pixels has the mean `theta`.
 Levels class_means(const ImageView& image, uint8_t theta);
+
+/// Share of the pixels that are 250 or brighter.
+double saturated_share(const ImageView& image);
+
+/// The paper's threshold theta, kept from frame to frame (Faigl et al., Section III-B).
+class Theta {
+  public:
+    double value() const { return value_; }
+    /// A roundel of mean levels m_d and m_b was found: theta = (m_d + m_b) / 2.
+    void settle(double dark, double bright);
+    /// Nothing was found: theta steps through 1/2, 1/4, 3/4, 1/8, ... of the grey scale.
+    void step();
+
+  private:
+    double value_ = 128;
+    unsigned steps_ = 1;
+};
+
+/// A threshold for each square tile of an image; a pixel is dark where it is below its tile's threshold.
+struct ThresholdMap {
+    int tile = 1, columns = 0;
+    std::vector<uint8_t> theta;  // row by row
+    /// The thresholds of the `width` pixels of row `y`.
+    void expand(int y, int width, uint8_t* out) const;
+};
+
+ThresholdMap constant_threshold(int width, int height, uint8_t theta);
+
+/// Local light: the mid-range of each 8 x 8 tile and its neighbours. A tile with less contrast than
+/// `min_contrast` asks tiles of 16, 32, 64 and 128 pixels around it, and at last takes `theta`.
+ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta);
 
 }  // namespace roundel

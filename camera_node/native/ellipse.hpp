@@ -1,0 +1,25 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+
+namespace roundel {
+
+/// An ellipse in pixels: its centre, its full axes, and the direction of the major one from +x towards +y in
+/// (-pi/2, pi/2].
+struct Ellipse {
+    double x, y, major, minor, angle;
+};
+
+/// A symmetric 2 x 2 matrix.
+struct Symmetric {
+    double xx, xy, yy;
+    double det() const { return xx * yy - xy * xy; }
+};
+
+/// Eigenvalues, the larger first, and the direction of its eigenvector in (-pi/2, pi/2].
+struct Eigen {
+    double first, second, angle;
+};
+
+Eigen eigen(const Symmetric& matrix);
+
+}  // namespace roundel

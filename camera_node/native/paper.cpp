@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "paper.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+namespace roundel {
+
+namespace {
+
+Symmetric covariance(const Moments& m) {
+    const double x = m.x / m.n, y = m.y / m.n;
+    return {m.xx / m.n - x * x, m.xy / m.n - x * y, m.yy / m.n - y * y};
+}
+
+bool is_whole(const Segment& s, int width, int height) {
+    return s.left > 0 && s.top > 0 && s.right < width - 1 && s.bottom < height - 1;
+}
+
+bool has_size(const Segment& s, const Settings& settings) {
+    // The upright box of an ellipse is between 1/sqrt(2) and 1 of its major axis; blur takes up to a pixel.
+    const int side = std::max(s.width(), s.height());
+    return side >= settings.min_diameter / std::numbers::sqrt2 - 1 && side <= settings.max_diameter + 1;
+}
+
+bool is_inside(const Segment& inner, const Segment& outer) {
+    return inner.left > outer.left && inner.right < outer.right && inner.top > outer.top &&
+           inner.bottom < outer.bottom;
+}
+
+}  // namespace
+
+bool fills_its_box(const Segment& outer, const Moments& disc) {
+    const Symmetric c = covariance(disc);
+    const double upright = c.det() / (c.xx * c.yy);  // 1 - rho^2
+    const double expected = std::numbers::pi / 4 * std::sqrt(upright) * outer.width() * outer.height();
+    return upright > 0 && std::abs(disc.n / expected - 1) < 0.3;
+}
+
+bool are_concentric(const Moments& disc, const Moments& inner) {
+    const double apart = std::hypot(disc.x / disc.n - inner.x / inner.n, disc.y / disc.n - inner.y / inner.n);
+    return apart < 0.1 * covariance_ellipse(disc).minor + 0.5;
+}
+
+bool has_area_ratio(const Moments& disc, const Moments& inner, const Settings& settings) {
+    const double ratio = std::sqrt(inner.n / disc.n);
+    const double tolerance = settings.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
+    return std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(),
+                       [&](double r) { return std::abs(ratio - r) < tolerance; });
+}
+
+Ellipse covariance_ellipse(const Moments& disc) {
+    const Eigen e = eigen(covariance(disc));
+    return {disc.x / disc.n, disc.y / disc.n, 4 * std::sqrt(e.first), 4 * std::sqrt(std::max(e.second, 0.0)),
+            e.angle};
+}
+
+double distance_by_principal_axis(double diameter, double major) { return diameter / major; }
+
+std::vector<Pair> find_pairs(const Segments& segments, int width, int height, const Settings& settings) {
+    std::vector<Pair> pairs;
+    for (int k = 0; k < int(segments.list.size()); ++k) {
+        const Segment& outer = segments.list[size_t(k)];
+        if (!outer.dark || !is_whole(outer, width, height) || !has_size(outer, settings)) continue;
+        const Moments& m = outer.moments;
+        const int centre = segments.at(int(std::lround(m.x / m.n)), int(std::lround(m.y / m.n)));
+        const Segment& inner = segments.list[size_t(centre)];
+        if (inner.dark || !is_inside(inner, outer)) continue;
+        Moments disc = m;
+        disc += inner.moments;
+        if (!fills_its_box(outer, disc) || !are_concentric(disc, inner.moments)) continue;
+        if (has_area_ratio(disc, inner.moments, settings)) pairs.push_back({k, centre, disc});
+    }
+    return pairs;
+}
+
+}  // namespace roundel

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The detector on photographs that this project did not make."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.detector import Detector
+from camera_node.source import read_grey
+
+
+def test_a_lab_full_of_roundels(shared_data: Callable[[str], Path]):
+    """48 roundels, 47 of them pasted; the real one is on a sheet of paper at about (639, 402)."""
+    found = Detector().detect(read_grey(shared_data("photos") / "lrse_many.png"))
+    assert 44 <= len(found) <= 48
+    assert np.linalg.norm(found.uv - [639, 402], axis=1).min() < 2
+
+
+@pytest.mark.parametrize("name", ["cctag_01.png", "monocam_Test_Image.jpg"])
+def test_other_round_markers_are_no_roundels(name: str, shared_data: Callable[[str], Path]):
+    """Bullseyes of several rings, and tags within a disc."""
+    assert len(Detector().detect(read_grey(shared_data("photos") / name))) == 0
