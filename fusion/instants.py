@@ -2,6 +2,7 @@
 """Frames of free-running cameras, gathered into instants. Time comes from the data and the caller, never a clock."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,13 +91,13 @@ class Instants:
         """The instants that are complete at `now_ns`: a server's time, or offline the newest capture time."""
         if self._end_ns is None and not self._begin(now_ns):
             return []
-        return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns)
+        return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns, GONE_NS)
 
     def finish(self) -> list[Instant]:
         """The instants of all frames that are left, at the end of a recording."""
         if self._end_ns is None:
             self._start()
-        return self._close(lambda end: True) if self._waiting else []
+        return self._close(lambda end: True, 0) if self._waiting else []
 
     def _begin(self, now_ns: int) -> bool:
         """Start the row of instants once the rate is known."""
@@ -120,11 +121,14 @@ class Instants:
         end = middle + self.period_ns // 2
         self._end_ns = end - (end - first - 1) // self.period_ns * self.period_ns
 
-    def _close(self, is_due) -> list[Instant]:
+    def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[Instant]:
+        """Cut what is due; without frames to come, go on for `silence_ns` so that robots are known to be lost."""
         closed = []
-        while self._waiting and self._end_ns is not None and self.period_ns and is_due(self._end_ns):
-            oldest = min(frame.t_ns for frame in self._waiting)
-            if oldest > self._end_ns + MAX_GAP_NS:
+        while self._end_ns is not None and self.period_ns and is_due(self._end_ns):
+            oldest = min((frame.t_ns for frame in self._waiting), default=None)
+            if oldest is None and self._end_ns > self._newest_ns + silence_ns:
+                break
+            if oldest is not None and oldest > self._end_ns + MAX_GAP_NS:
                 self._start()
                 continue
             closed.append(self._cut(self._end_ns, self.period_ns))
@@ -139,4 +143,4 @@ class Instants:
     def _complete(self, end_ns: int) -> bool:
         """Whether no live camera owes a frame of the instant, were it to keep its rhythm (to a tenth)."""
         live = [c for c in self._cameras.values() if c.times and c.times[-1] > self._newest_ns - GONE_NS]
-        return all(c.times[-1] + 0.9 * c.interval_ns >= end_ns for c in live if c.interval_ns) and any(live)
+        return all(c.times[-1] + 1.1 * c.interval_ns >= end_ns for c in live)
