@@ -44,7 +44,8 @@ class Observations:
 
     def select(self, rows: NDArray) -> "Observations":
         """The rows that a mask or an index array names."""
-        return Observations(*(getattr(self, name)[rows] for name in self.__slots__))
+        columns = (self.uv, self.cov, self.axes_px, self.angle_rad)
+        return Observations(self.discs.select(rows), *(column[rows] for column in columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +94,7 @@ class Estimator:
     def update(self, prediction: Prediction, observations: Observations, iterations: int = ITERATIONS) -> States:
         """Fuse an instant's observations; robots without any stay as predicted."""
         seen = np.unique(observations.discs.body)
-        states = prediction.states.select(slice(None))
+        states = prediction.states
         delta = np.zeros((len(states), 12))
         P = states.P.copy()
         for _ in range(iterations):

@@ -162,7 +162,8 @@ class Tracker:
 
     def _find_singles(self, lost: list[int], markers: list[Marker], t_ns: int) -> list[tuple[int, Marker]]:
         """Robots of one marker and theirs, where within reach there is one robot to one marker; else none."""
-        within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost]).reshape(len(lost), -1)
+        within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost], bool)
+        within = within.reshape(len(lost), len(markers))
         return [
             (k, markers[int(np.argmax(row))])
             for k, row in zip(lost, within, strict=True)
