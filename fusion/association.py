@@ -109,9 +109,8 @@ def match(
     if not len(frames) or not len(markers):
         return Matches(np.empty(0, np.intp), np.empty(0, np.intp))
     rows = np.tile(markers, len(frames))
-    camera, tau = (
-        np.repeat(column[first], len(markers)) for column in (sightings.camera, sightings.tau)
-    )
+    camera = np.repeat(sightings.camera[first], len(markers))
+    tau = np.repeat(sightings.tau[first], len(markers))
     views = optics.view(states, catalogue.discs(rows, camera, tau))
     spread = views.jacobian @ states.P[catalogue.robot[rows]] @ views.jacobian.transpose(0, 2, 1)
     visible = _is_visible(views, camera, optics)
@@ -147,7 +146,8 @@ def _assign(costs: Array) -> tuple[Index, Index]:
     """The rows and columns of the cheapest assignment with as many pairs as there can be."""
     open_ = np.isfinite(costs)
     if (open_.sum(0) <= 1).all() and (open_.sum(1) <= 1).all():
-        return np.nonzero(open_)
+        a, b = np.nonzero(open_)
+        return a, b
     a, b = linear_sum_assignment(np.where(open_, costs, 1e6))
     kept = open_[a, b]
     return a[kept], b[kept]

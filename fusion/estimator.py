@@ -18,7 +18,9 @@ from fusion.state import THETA, States, forget_turn, predict
 
 Array = NDArray[np.float64]
 CAUCHY = 4.0  # whitened distance at which an observation's weight is halved
-NOMINAL_WEIGHT = 0.8983  # mean Cauchy weight of Gaussian noise in two dimensions: E[1 / (1 + chi2_2 / CAUCHY^2)]
+NOMINAL_WEIGHT = (
+    0.8983  # mean Cauchy weight of Gaussian noise in two dimensions: E[1 / (1 + chi2_2 / CAUCHY^2)]
+)
 ITERATIONS = 2
 STEP = 1e-4  # rad, of the difference quotient of an outline's shape
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more than noise does
@@ -91,7 +93,9 @@ class Estimator:
         moved = replace(moved, P=np.where(self.single[:, None, None], forget_turn(moved.P), moved.P))
         return Prediction(states.P, moved, F, Q)
 
-    def update(self, prediction: Prediction, observations: Observations, iterations: int = ITERATIONS) -> States:
+    def update(
+        self, prediction: Prediction, observations: Observations, iterations: int = ITERATIONS
+    ) -> States:
         """Fuse an instant's observations; robots without any stay as predicted."""
         seen = np.unique(observations.discs.body)
         states = prediction.states
@@ -102,7 +106,9 @@ class Estimator:
             weights = rows.weights()
             for k in seen:
                 mine = rows.body == k
-                step, P[k] = self._eliminate(prediction, k, rows.A[mine], rows.b[mine], weights[mine], delta[k])
+                step, P[k] = self._eliminate(
+                    prediction, k, rows.A[mine], rows.b[mine], weights[mine], delta[k]
+                )
                 delta[k] += step
         P[self.single] = forget_turn(P[self.single])
         return replace(prediction.states.moved(delta), P=P)
@@ -116,8 +122,8 @@ class Estimator:
     def _linearise(self, states: States, observations: Observations) -> _Rows:
         views = self.optics.view(states, observations.discs)
         L = np.linalg.cholesky(observations.cov)
-        A = np.linalg.solve(L, views.jacobian)
-        b = np.linalg.solve(L, (observations.uv - views.uv)[:, :, None])[:, :, 0]
+        A: Array = np.linalg.solve(L, views.jacobian)
+        b: Array = np.linalg.solve(L, (observations.uv - views.uv)[:, :, None])[:, :, 0]
         known = np.isfinite(b).all(1)
         rows = _Rows(observations.discs.body[known], A[known], b[known])
         shaped = self.single[observations.discs.body] & np.isfinite(observations.axes_px).all(1) & known

@@ -23,7 +23,10 @@ MIN_PARALLAX = np.sin(np.radians(3)) ** 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marker:
-    """A marker that stands at `position` (3,), covariance (3, 3), seen as `sightings` by `cameras`; its size, NaN if unknown."""
+    """A marker that stands at `position` (3,), covariance (3, 3).
+
+    `sightings` of `cameras` are of it; `diameter_m` is NaN where unknown.
+    """
 
     position: Array
     covariance: Array
@@ -132,4 +135,6 @@ def _triangulate(rays: _Rays, members: Index, near: Array, rows: Index) -> Marke
     sizes = rays.size[members] * range_m
     known = sizes[np.isfinite(sizes)]
     cameras = rays.camera[members]
-    return Marker(position, covariance, rows[members], cameras, float(np.median(known)) if len(known) else np.nan)
+    return Marker(
+        position, covariance, rows[members], cameras, float(np.median(known)) if len(known) else np.nan
+    )

@@ -77,10 +77,9 @@ class Instants:
     def add(self, frame: Frame) -> bool:
         """Take a frame; False if it came too late."""
         camera = self._cameras.setdefault(frame.camera, _Camera())
-        if self._end_ns is not None and self.period_ns:
-            if frame.t_ns < self._end_ns - self.period_ns - self.lateness_ns:
-                camera.late += 1
-                return False
+        if frame.t_ns < self._oldest_ns():
+            camera.late += 1
+            return False
         if not camera.times or frame.t_ns > camera.times[-1]:
             camera.times.append(frame.t_ns)
         self._waiting.append(frame)
@@ -98,6 +97,12 @@ class Instants:
         if self._end_ns is None:
             self._start()
         return self._close(lambda end: True, 0) if self._waiting else []
+
+    def _oldest_ns(self) -> int:
+        """Capture times before this come too late."""
+        if self._end_ns is None or not self.period_ns:
+            return 0
+        return self._end_ns - self.period_ns - self.lateness_ns
 
     def _begin(self, now_ns: int) -> bool:
         """Start the row of instants once the rate is known."""

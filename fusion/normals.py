@@ -18,7 +18,7 @@ ELSEWHERE = np.cos(np.radians(40))
 def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: float) -> Array | None:
     """The unit normal (3,) in the world, or None where the views do not settle it."""
     seen = sightings.select(marker.sightings)
-    seen = seen.select(np.isfinite(seen.axes_px).all(1))
+    seen = seen.select(np.flatnonzero(np.isfinite(seen.axes_px).all(1)))
     normals = fibonacci_sphere(DIRECTIONS)
     to = optics.centres[seen.camera] - marker.position
     normals = normals[(normals @ to.T > 0).all(1)]
@@ -26,7 +26,10 @@ def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: fl
         return None
     n, v = len(normals), len(seen)
     expected = optics.outlines(
-        np.tile(seen.camera, n), np.tile(marker.position, (n * v, 1)), np.repeat(normals, v, 0), np.full(n * v, radius)
+        np.tile(seen.camera, n),
+        np.tile(marker.position, (n * v, 1)),
+        np.repeat(normals, v, 0),
+        np.full(n * v, radius),
     )
     measured = np.tile(measured_outlines(seen.axes_px, seen.angle_rad), (n, 1, 1))
     sigma = 2 * AXIS_SIGMA_PX / seen.axes_px[:, 1]

@@ -50,7 +50,9 @@ class Summary:
         """What a person wants to know."""
         yield f"{self.instants} instants, {self.unlabelled} markers of no robot"
         for robot in robots:
-            shares = {s: self.states[robot, s] / max(self.instants, 1) for s in ("tracked", "coasting", "lost")}
+            shares = {
+                s: self.states[robot, s] / max(self.instants, 1) for s in ("tracked", "coasting", "lost")
+            }
             yield f"{robot}: " + ", ".join(f"{state} {share:.1%}" for state, share in shares.items())
         for name in sorted(self.used):
             rms = np.sqrt(self.squared_px[name] / self.used[name]) if self.used[name] else np.nan

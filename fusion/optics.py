@@ -107,7 +107,9 @@ class Optics:
         """
         R_cw = self.R_cam_world[camera]
         c, n = _rotate(R_cw, centre - self.centres[camera]), _rotate(R_cw, normal)
-        dual = c[:, :, None] * c[:, None] - radius[:, None, None] ** 2 * (np.eye(3) - n[:, :, None] * n[:, None])
+        dual = c[:, :, None] * c[:, None] - radius[:, None, None] ** 2 * (
+            np.eye(3) - n[:, :, None] * n[:, None]
+        )
         dual = dual / dual[:, 2:, 2:]
         middle = dual[:, :2, 2]
         J = self.project(camera, np.column_stack([middle, np.ones(len(middle))]))[1][:, :, :2]

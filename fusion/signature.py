@@ -48,10 +48,14 @@ def identify(
     for k, fit in enumerate(fits):
         if any(fit.rivals(better) for better in accepted):
             continue
-        rest = (other for other in fits[k + 1 :] if fit.rivals(other) and len(other.points) == len(fit.points))
+        rest = (
+            other for other in fits[k + 1 :] if fit.rivals(other) and len(other.points) == len(fit.points)
+        )
         if any(other.chi2 < fit.chi2 + CLEARLY for other in rest):
             continue
-        if any(fit.rivals(other) for other in fits[:k] if other not in accepted and not _beaten(other, accepted)):
+        if any(
+            fit.rivals(other) for other in fits[:k] if other not in accepted and not _beaten(other, accepted)
+        ):
             continue
         accepted.append(fit)
     return accepted

@@ -56,7 +56,9 @@ class States:
         )
 
 
-def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Array, Array]:
+def predict(
+    states: States, dt: Array, densities: Array, single: NDArray[np.bool_]
+) -> tuple[States, Array, Array]:
     """Where bodies are after `dt` (N,) seconds.
 
     Args:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
+from camera_node.pose import wxyz_from_rotation
 from fusion.association import Catalogue, Matches, Sightings, match
 from fusion.estimator import Estimator, Observations
 from fusion.grouping import Marker, group
@@ -18,7 +19,6 @@ from fusion.optics import Optics
 from fusion.robots import Robot
 from fusion.signature import fits_size, identify
 from fusion.state import POSITION, States, skew
-from camera_node.pose import wxyz_from_rotation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -183,9 +183,7 @@ class Tracker:
         error = marker.position - place
         return bool(error @ np.linalg.solve(covariance + marker.covariance, error) < REACH)
 
-    def _bear(
-        self, k: int, R: Array, p: Array, sightings: Sightings, born: Matches, sigmas: tuple
-    ) -> bool:
+    def _bear(self, k: int, R: Array, p: Array, sightings: Sightings, born: Matches, sigmas: tuple) -> bool:
         """Start robot k at this pose, refined by its observations; False if they do not agree."""
         at = States.at_rest(R[None], p[None], sigmas)
         states = self.states.select(np.arange(len(self.robots)))
@@ -278,7 +276,9 @@ class Tracker:
     def _usage(
         self, sightings: Sightings, matches: Matches, free: list[Marker], squared: Array
     ) -> dict[str, CameraUse]:
-        used = np.isin(np.arange(len(sightings)), np.concatenate([matches.sighting, *(m.sightings for m in free)]))
+        used = np.isin(
+            np.arange(len(sightings)), np.concatenate([matches.sighting, *(m.sightings for m in free)])
+        )
         n = len(self.optics.names)
         taken = np.bincount(sightings.camera[used], minlength=n)
         unused = np.bincount(sightings.camera[~used], minlength=n)
@@ -291,7 +291,9 @@ class Tracker:
 
 def _claim(markers: list[Marker], discs: list) -> Matches:
     counts = [len(marker.sightings) for marker in markers]
-    return Matches(np.concatenate([m.sightings for m in markers]), np.repeat(np.array(discs, np.intp), counts))
+    return Matches(
+        np.concatenate([m.sightings for m in markers]), np.repeat(np.array(discs, np.intp), counts)
+    )
 
 
 def _joined(a: Matches, b: Matches) -> Matches:
@@ -304,4 +306,3 @@ def _free(sightings: Sightings, matches: Matches) -> Index:
 
 def _bits(cameras: Index) -> int:
     return sum(1 << int(c) for c in np.unique(cameras))
-
