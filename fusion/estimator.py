@@ -122,8 +122,8 @@ class Estimator:
     def _linearise(self, states: States, observations: Observations) -> _Rows:
         views = self.optics.view(states, observations.discs)
         L = np.linalg.cholesky(observations.cov)
-        A: Array = np.linalg.solve(L, views.jacobian)
-        b: Array = np.linalg.solve(L, (observations.uv - views.uv)[:, :, None])[:, :, 0]
+        A = np.asarray(np.linalg.solve(L, views.jacobian), float)
+        b = np.asarray(np.linalg.solve(L, (observations.uv - views.uv)[:, :, None]), float)[:, :, 0]
         known = np.isfinite(b).all(1)
         rows = _Rows(observations.discs.body[known], A[known], b[known])
         shaped = self.single[observations.discs.body] & np.isfinite(observations.axes_px).all(1) & known
