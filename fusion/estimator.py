@@ -133,7 +133,7 @@ class Estimator:
         return _Rows(*(np.concatenate([getattr(rows, f), getattr(shapes, f)]) for f in rows.__slots__))
 
     def _linearise_shapes(self, states: States, seen: Observations) -> _Rows:
-        """How an outline is stretched tells the normal, where fewer than three markers do; its size, prone to blur, is left out."""
+        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
         e, turned = self._stretch(states, seen, np.zeros(3)), []
         for axis in np.eye(3)[:2]:
             turned.append((self._stretch(states, seen, STEP * axis) - e) / STEP)

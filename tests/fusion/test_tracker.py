@@ -24,7 +24,7 @@ def test_exact_without_noise_though_cameras_run_free(run_arena, motion):
     assert len(late) >= 19
     assert np.abs(error[:, 3:]).max() < 5e-5
     assert np.abs(error[:, :3]).max() < 5e-4
-    R, p = arena.truth("a", late[-1].t_ns)
+    _, p = arena.truth("a", late[-1].t_ns)
     velocity = (arena.truth("a", late[-1].t_ns + 10**6)[1] - p) / 1e-3
     assert np.abs(late[-1].velocity - velocity).max() < 0.01
 
