@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.optics import Discs, Optics, measured_outlines, place
-from fusion.state import THETA, States, forget_turn, predict
+from fusion.state import States, forget_turn, predict
 
 Array = NDArray[np.float64]
 CAUCHY = 4.0  # whitened distance at which an observation's weight is halved
@@ -134,22 +134,18 @@ class Estimator:
 
     def _linearise_shapes(self, states: States, seen: Observations) -> _Rows:
         """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
-        e, turned = self._stretch(states, seen, np.zeros(3)), []
-        for axis in np.eye(3)[:2]:
-            turned.append((self._stretch(states, seen, STEP * axis) - e) / STEP)
+        R, _, normal, centre = place(states, seen.discs)
+        # (n, 3, 3): as it is, and turned a little about the body's x and y
+        normals = normal[:, None] + STEP * np.stack([0 * normal, -R[:, :, 1], R[:, :, 0]], 1)
+        of = np.repeat(np.arange(len(seen)), 3)
+        expected = self.optics.outlines(
+            seen.discs.camera[of], centre[of], normals.reshape(-1, 3), seen.discs.radius[of]
+        )
+        stretch = shears(measured_outlines(seen.axes_px, seen.angle_rad)[of], expected).reshape(-1, 3, 2)
         A = np.zeros((len(seen), 2, 12))
-        A[:, :, THETA][:, :, :2] = -np.stack(turned, -1)
+        A[:, :, :2] = -(stretch[:, 1:] - stretch[:, :1]).transpose(0, 2, 1) / STEP
         sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[:, 0, 0])) / seen.axes_px[:, 1]
-        return _Rows(seen.discs.body, A / sigma[:, None, None], e / sigma[:, None])
-
-    def _stretch(self, states: States, seen: Observations, turn: Array) -> Array:
-        """(N, 2) measured outline relative to the predicted one, bodies turned a little: its two shears."""
-        delta = np.zeros((len(states), 12))
-        delta[:, THETA] = turn
-        _, _, normal, _ = place(states.moved(delta), seen.discs)
-        _, _, _, centre = place(states, seen.discs)
-        expected = self.optics.outlines(seen.discs.camera, centre, normal, seen.discs.radius)
-        return shears(measured_outlines(seen.axes_px, seen.angle_rad), expected)
+        return _Rows(seen.discs.body, A / sigma[:, None, None], stretch[:, 0] / sigma[:, None])
 
     @staticmethod
     def _eliminate(

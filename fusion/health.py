@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fusion.messages import CameraHealth, FusionStatus, State
-from fusion.tracker import CameraUse
+from fusion.report import CameraUse
 
 log = logging.getLogger("fusion")
 MAX_CAMERAS = 256  # more names are a fault of whoever publishes them

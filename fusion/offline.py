@@ -19,8 +19,9 @@ from camera_node.messages import Detections
 from camera_node.observations import detect_frames, read_observations
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose
+from fusion.report import Fused
 from fusion.robots import Robot, load_robots
-from fusion.tracker import Fused, Limits, Tracker
+from fusion.tracker import Limits, Tracker
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 

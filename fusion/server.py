@@ -24,8 +24,9 @@ from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import Latency, State
+from fusion.report import Fused
 from fusion.robots import load_robots
-from fusion.tracker import Fused, Tracker
+from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
 QUEUE = 2000  # messages: seconds of a large arena

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Instants in, robots and markers out: the same code live and offline, without a clock of its own."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.pose import wxyz_from_rotation
 from fusion.association import Catalogue, Matches, Sightings, match
-from fusion.estimator import Estimator, Observations
+from fusion.estimator import Estimator
 from fusion.grouping import Marker, group
 from fusion.instants import Instant
-from fusion.messages import Markers, RobotPose, State
+from fusion.messages import State
 from fusion.normals import find_normal, rotation_to
 from fusion.optics import Optics
+from fusion.report import Fused, report
 from fusion.robots import Robot
 from fusion.signature import fits_size, identify
-from fusion.state import POSITION, States, skew
+from fusion.state import POSITION, States
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -39,25 +39,6 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sigma_floor_px: float = 0.08  # added to the noise that detectors claim
     lost_after_s: float = 0.3  # without an observation
     lateness_ms: float = 30.0  # how long an instant waits for a camera
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraUse:
-    """What an instant used of one camera: detections used and unused, and the sum of squared residuals, px^2."""
-
-    used: int
-    unused: int
-    squared_px: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fused:
-    """What an instant tells."""
-
-    t_ns: int
-    poses: tuple[RobotPose, ...]
-    markers: Markers
-    cameras: dict[str, CameraUse]
 
 
 class Tracker:
@@ -95,7 +76,7 @@ class Tracker:
         self.states = self.estimator.update(prediction, observations)
         matches, free = self._find(instant.t_ns, sightings, matches)
         self._note(instant.t_ns, matches)
-        return self._report(instant, sightings, matches, free)
+        return report(self, instant, sightings, matches, free)
 
     def _predict(self, t_ns: int):
         dt = BIRTH_S if self._t_ns is None else max((t_ns - self._t_ns) * 1e-9, BIRTH_S)
@@ -119,24 +100,16 @@ class Tracker:
     # Robots that are not tracked.
 
     def _find(self, t_ns: int, sightings: Sightings, matches: Matches) -> tuple[Matches, list[Marker]]:
-        """Look for lost robots among detections that nothing claims: constellations first, then single markers."""
-        sizes = np.unique([robot.diameter_m for robot in self.robots])
+        """Look for lost robots among detections that nothing claims: constellations first, then single markers.
+
+        Returns the matches with theirs, and the markers that stay nobody's.
+        """
         lost = [k for k, status in enumerate(self.status) if status in (None, "lost")]
         bodies = {k: self.robots[k] for k in lost if not self._single[k]}
-        if bodies:  # a constellation's marker may have been taken for a robot of one marker
-            matches = self._without_singles(matches)
-        markers = group(self.optics, sightings, _free(sightings, matches), sizes)
-        for fit in identify(bodies, markers, self._faces):
-            discs = [np.flatnonzero(self.catalogue.robot == fit.robot)[n] for n in fit.numbers]
-            born = _claim([markers[p] for p in fit.points], discs)
-            if self._bear(fit.robot, fit.R, fit.t, sightings, born, BIRTH):
-                matches = _joined(matches, born)
         if bodies:
-            matches = self._with_singles(matches, sightings)
-            markers = group(self.optics, sightings, _free(sightings, matches), sizes)
-        claimed = set(matches.sighting.tolist())
-        markers = [marker for marker in markers if not claimed & set(marker.sightings.tolist())]
-        for robot, marker in self._find_singles([k for k in lost if self._single[k]], markers, t_ns):
+            matches = self._find_bodies(bodies, sightings, matches)
+        markers = self._group(sightings, matches)
+        for robot, marker in self._pair_singles([k for k in lost if self._single[k]], markers):
             born = _claim([marker], [np.flatnonzero(self.catalogue.robot == robot)[0]])
             normal = find_normal(self.optics, sightings, marker, self.robots[robot].diameter_m / 2)
             R = rotation_to(self._towards(marker) if normal is None else normal)
@@ -145,14 +118,29 @@ class Tracker:
                 markers = [other for other in markers if other is not marker]
         return matches, markers
 
-    def _without_singles(self, matches: Matches) -> Matches:
-        kept = ~self._single[self.catalogue.robot[matches.disc]]
-        self._set_aside = Matches(matches.sighting[~kept], matches.disc[~kept])
-        return Matches(matches.sighting[kept], matches.disc[kept])
+    def _find_bodies(self, bodies: dict[int, Robot], sightings: Sightings, matches: Matches) -> Matches:
+        """The matches with those of the constellations found, whose markers may have passed for single ones."""
+        matches, aside = self._without_singles(matches)
+        markers = self._group(sightings, matches)
+        for fit in identify(bodies, markers, self._faces):
+            discs = [np.flatnonzero(self.catalogue.robot == fit.robot)[n] for n in fit.numbers]
+            born = _claim([markers[p] for p in fit.points], discs)
+            if self._bear(fit.robot, fit.R, fit.t, sightings, born, BIRTH):
+                matches = _joined(matches, born)
+        return self._with_singles(matches, aside)
 
-    def _with_singles(self, matches: Matches, sightings: Sightings) -> Matches:
+    def _group(self, sightings: Sightings, matches: Matches) -> list[Marker]:
+        """Markers out of the detections that nothing claims."""
+        free = np.setdiff1d(np.arange(len(sightings)), matches.sighting)
+        return group(self.optics, sightings, free, np.unique(2 * self.catalogue.radius))
+
+    def _without_singles(self, matches: Matches) -> tuple[Matches, Matches]:
+        kept = ~self._single[self.catalogue.robot[matches.disc]]
+        aside = Matches(matches.sighting[~kept], matches.disc[~kept])
+        return Matches(matches.sighting[kept], matches.disc[kept]), aside
+
+    def _with_singles(self, matches: Matches, aside: Matches) -> Matches:
         """Give back what robots of one marker had, except what a constellation proved to be its own."""
-        aside = self._set_aside
         stolen = np.isin(aside.sighting, matches.sighting)
         robbed = np.unique(aside.disc[stolen])
         for disc in robbed:
@@ -160,7 +148,7 @@ class Tracker:
         kept = ~np.isin(aside.disc, robbed)
         return _joined(matches, Matches(aside.sighting[kept], aside.disc[kept]))
 
-    def _find_singles(self, lost: list[int], markers: list[Marker], t_ns: int) -> list[tuple[int, Marker]]:
+    def _pair_singles(self, lost: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
         """Robots of one marker and theirs, where within reach there is one robot to one marker; else none."""
         within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost], bool)
         within = within.reshape(len(lost), len(markers))
@@ -211,83 +199,6 @@ class Tracker:
         mean = (to / np.linalg.norm(to, axis=1, keepdims=True)).sum(0)
         return mean / np.linalg.norm(mean)
 
-    # What is told.
-
-    def _report(self, instant: Instant, sightings: Sightings, matches: Matches, free: list[Marker]) -> Fused:
-        observations = matches.observations(sightings, self.catalogue)
-        error, _ = self.estimator.errors(self.states, observations)
-        squared = np.sum(error**2, 1)
-        poses = tuple(
-            self._pose(k, instant.t_ns, matches, observations, squared)
-            for k, status in enumerate(self.status)
-            if status is not None
-        )
-        markers = self._markers(instant.t_ns, matches, observations, free)
-        return Fused(instant.t_ns, poses, markers, self._usage(sightings, matches, free, squared))
-
-    def _pose(
-        self, k: int, t_ns: int, matches: Matches, observations: Observations, squared: Array
-    ) -> RobotPose:
-        mine = observations.discs.body == k
-        cameras = np.unique(observations.discs.camera[mine])
-        status = self.status[k]
-        assert status is not None
-        return RobotPose(
-            robot=self.names[k],
-            t_ns=t_ns,
-            state=status,
-            position=tuple(self.states.p[k].tolist()),
-            quaternion_wxyz=tuple(wxyz_from_rotation(self.states.R[k]).tolist()),
-            velocity=tuple(self.states.v[k].tolist()),
-            angular_velocity=tuple(self.states.omega[k].tolist()),
-            covariance=self.states.P[k].astype("<f4").tobytes(),
-            n_markers=len(np.unique(matches.disc[mine])),
-            cameras=tuple(self.optics.names[c] for c in cameras),
-            residual_px=float(np.sqrt(squared[mine].mean())) if mine.any() else None,
-        )
-
-    def _markers(
-        self, t_ns: int, matches: Matches, observations: Observations, free: list[Marker]
-    ) -> Markers:
-        """Labelled markers where their robots put them, then those that are nobody's."""
-        discs = np.unique(matches.disc)
-        owner = self.catalogue.robot[discs]
-        R, marker = self.states.R[owner], self.catalogue.marker[discs]
-        arm = -R @ skew(marker)
-        J = np.concatenate([arm, np.tile(np.eye(3), (len(discs), 1, 1))], 2)
-        labelled = J @ self.states.P[owner][:, :6, :6] @ J.transpose(0, 2, 1)
-        bits = [_bits(observations.discs.camera[matches.disc == d]) for d in discs]
-        none = np.full(len(free), -1)
-        position = [*(self.states.p[owner] + np.einsum("nij,nj->ni", R, marker)), *(m.position for m in free)]
-        covariance = [*labelled, *(m.covariance for m in free)]
-        normal = [*R[:, :, 2], *(np.full(3, np.nan) for _ in free)]
-        return Markers(
-            t_ns=t_ns,
-            robots=self.names,
-            camera_names=self.optics.names,
-            position=np.array(position).astype("<f8").tobytes(),
-            covariance=np.array(covariance).astype("<f4").tobytes(),
-            normal=np.array(normal).astype("<f4").tobytes(),
-            robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
-            marker=np.concatenate([self.catalogue.number[discs], none]).astype("<i4").tobytes(),
-            cameras=np.array([*bits, *(_bits(m.cameras) for m in free)], "<u8").tobytes(),
-        )
-
-    def _usage(
-        self, sightings: Sightings, matches: Matches, free: list[Marker], squared: Array
-    ) -> dict[str, CameraUse]:
-        used = np.isin(
-            np.arange(len(sightings)), np.concatenate([matches.sighting, *(m.sightings for m in free)])
-        )
-        n = len(self.optics.names)
-        taken = np.bincount(sightings.camera[used], minlength=n)
-        unused = np.bincount(sightings.camera[~used], minlength=n)
-        squares = np.bincount(sightings.camera[matches.sighting], squared, minlength=n)
-        return {
-            name: CameraUse(int(taken[k]), int(unused[k]), float(squares[k]))
-            for k, name in enumerate(self.optics.names)
-        }
-
 
 def _claim(markers: list[Marker], discs: list) -> Matches:
     counts = [len(marker.sightings) for marker in markers]
@@ -298,11 +209,3 @@ def _claim(markers: list[Marker], discs: list) -> Matches:
 
 def _joined(a: Matches, b: Matches) -> Matches:
     return Matches(np.concatenate([a.sighting, b.sighting]), np.concatenate([a.disc, b.disc]))
-
-
-def _free(sightings: Sightings, matches: Matches) -> Index:
-    return np.setdiff1d(np.arange(len(sightings)), matches.sighting)
-
-
-def _bits(cameras: Index) -> int:
-    return sum(1 << int(c) for c in np.unique(cameras))

@@ -14,7 +14,8 @@ from synthetic import Arena
 
 from fusion.instants import Frame, Instants
 from fusion.messages import RobotPose
-from fusion.tracker import Fused, Limits, Tracker
+from fusion.report import Fused
+from fusion.tracker import Limits, Tracker
 
 
 def fuse(arena: Arena, frames: list[Frame], limits: Limits | None = None) -> list[Fused]:

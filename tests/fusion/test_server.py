@@ -139,8 +139,9 @@ def test_a_calibration_that_arrives_is_applied_and_a_bad_one_is_not(tmp_path):
 
 def test_the_clock_is_answered(tmp_path):
     with serving(config(tmp_path)) as (_, client):
-        reply = next(r for r in client._session.get(KEYS.clock, timeout=DEADLINE_S) if r.ok)
-        t_ns = decode(reply.ok.payload.to_bytes(), ClockReply).t_ns
+        replies = client._session.get(KEYS.clock, timeout=DEADLINE_S)
+        data = next(reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
+        t_ns = decode(data, ClockReply).t_ns
         assert abs(t_ns - time.time_ns()) < 5e9
 
 
@@ -166,9 +167,9 @@ def test_poses_can_be_awaited_and_iterated(tmp_path):
         async def first():
             ready.set()
             async for pose in client.robot("a", DEADLINE_S):
-                return pose
+                return pose.robot
 
-        assert asyncio.run(first()).robot == "a"
+        assert asyncio.run(first()) == "a"
         send_later.join(DEADLINE_S)
 
 
