@@ -279,7 +279,7 @@ std::optional<Fit> refine(const ImageView& image, const Start& start) {
     const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
     // Perspective moves a circle's centre by its radius squared: the inner circle's image tells that of
     // radius nought.
-    const double to_disc = 1 / (p[kRatio] * p[kRatio] - 1);
+    const double to_disc = 1 / (1 - p[kRatio] * p[kRatio]);
     return Fit{.outer = {p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
                .covariance = *centre,
                .offset_x = to_disc * p[kOffsetX],
