@@ -19,15 +19,15 @@ def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-@pytest.mark.parametrize("diameter", [12, 20, 40])
+@pytest.mark.parametrize("diameter", [14, 24, 40])
 @pytest.mark.parametrize("tilt_deg", [0, 30, 50])
 @pytest.mark.parametrize("blur", [0.5, 1.0])
 def test_without_noise_only_rounding_remains(diameter: float, tilt_deg: float, blur: float):
     """Centre within 0.02 px (rounding to grey levels is noise of 0.29), axes within 1.5 %, ratio within 0.02."""
     for u, v in rng().uniform(50, 70, (3, 2)):
         disc = Disc((u + 20, v), diameter, np.radians(tilt_deg), turn=0.7)
-        if diameter * np.cos(disc.tilt) < 9:
-            continue
+        if diameter * np.cos(disc.tilt) < 5.5 + 8 * blur:
+            continue  # the card's margin, a seventh of this, drowns in the blur
         (found,) = Detector().detect(expose(render([disc], blur=blur), 0, rng()))
         centre, axes = outer_conic(disc, PRINCIPAL)
         assert np.abs(found.uv - centre).max() < 0.02
