@@ -10,8 +10,15 @@ from camera_node.pose import Array
 Picture = NDArray[np.float32]
 SIZE_M = 10.0  # the floor is a square around the world's origin
 PIXEL_M = 0.005
+FLOOR = 128.0
 WALL = 120.0  # grey level of all that is not floor
 SUBSAMPLES = 3
+
+
+def plain_floor() -> Picture:
+    """A floor of one grey level, (n, n)."""
+    n = round(SIZE_M / PIXEL_M)
+    return np.full((n, n), FLOOR, np.float32)
 
 
 def paint_floor(seed: int) -> Picture:
@@ -20,8 +27,8 @@ def paint_floor(seed: int) -> Picture:
     None of its marks is a roundel, though discs, letters and sheets of paper come close.
     """
     rng = np.random.default_rng(seed)
-    n = round(SIZE_M / PIXEL_M)
-    floor = np.full((n, n), 128, np.uint8)
+    floor = plain_floor().astype(np.uint8)
+    n = len(floor)
     floor[:: round(0.5 / PIXEL_M)] = floor[:, :: round(0.5 / PIXEL_M)] = 100
     for mark in (_paint_sheet, _paint_disc, _paint_letters, _paint_tape):
         for _ in range(14):
