@@ -38,7 +38,7 @@ def paint_floor(seed: int) -> Picture:
         rng.uniform(0.8, 1.15, (5, 5)).astype(np.float32), (n, n), interpolation=cv2.INTER_CUBIC
     )
     grain = rng.standard_normal((n, n), np.float32)
-    return floor * light * (1 + np.float32(0.04) * grain)
+    return np.asarray(floor * light * (1 + np.float32(0.04) * grain), np.float32)
 
 
 def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
