@@ -103,7 +103,7 @@ def main() -> None:
 def _program() -> None:
     arguments = sys.argv[1:]
     if arguments[:1] == ["detect"]:
-        from camera_node.detect import Detect
+        from camera_node.detect import Detect  # pyright: ignore[reportMissingImports] # comes with the detector
 
         tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
     else:
