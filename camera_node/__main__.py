@@ -100,14 +100,13 @@ def main() -> None:
     run(_program)
 
 
-def _program() -> None:
+def _program() -> int | None:
     arguments = sys.argv[1:]
     if arguments[:1] == ["detect"]:
-        from camera_node.detect import Detect  # pyright: ignore[reportMissingImports] # comes with the detector
+        from camera_node.detect import Detect
 
-        tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
-    else:
-        tyro.cli(Publish, prog="camera_node", args=arguments).run()
+        return tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
+    return tyro.cli(Publish, prog="camera_node", args=arguments).run()
 
 
 if __name__ == "__main__":
