@@ -101,19 +101,18 @@ def main() -> None:
     run(_program)
 
 
-def _program() -> None:
+def _program() -> int | None:
     arguments = sys.argv[1:]
     name = arguments[0] if arguments else ""
     if name == "detect":
         from camera_node.detect import Detect
 
-        tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
-    elif name == "print":
+        return tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
+    if name == "print":
         from camera_node.sheet import Sheet
 
-        tyro.cli(Sheet, prog="camera_node print", args=arguments[1:]).run()
-    else:
-        tyro.cli(Publish, prog="camera_node", args=arguments).run()
+        return tyro.cli(Sheet, prog="camera_node print", args=arguments[1:]).run()
+    return tyro.cli(Publish, prog="camera_node", args=arguments).run()
 
 
 if __name__ == "__main__":

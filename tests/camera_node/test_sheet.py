@@ -20,18 +20,15 @@ def test_a_printed_sheet_measures_what_it_says(tmp_path: Path):
     """A browser's picture of the sheet, at 96 pixels an inch, holds every roundel at its diameter and ratio."""
     if (chromium := shutil.which("chromium")) is None:
         pytest.skip("chromium is not installed")
-    (tmp_path / "sheet.svg").write_text(draw(Sheet(tmp_path / "sheet.svg", diameter=0.05))[0])
+    sheet = tmp_path / "sheet.svg"
+    text, count = draw(Sheet(sheet, diameter=0.05))
+    sheet.write_text(text)
     flags = "--headless --no-sandbox --disable-gpu --disable-background-networking --window-size=794,1123"
     picture = tmp_path / "sheet.png"
-    subprocess.run(
-        [chromium, *flags.split(), f"--screenshot={picture}", f"--user-data-dir={tmp_path / 'profile'}"]
-        + [(tmp_path / "sheet.svg").as_uri()],
-        check=True,
-        timeout=60,
-        capture_output=True,
-    )
+    places = [f"--screenshot={picture}", f"--user-data-dir={tmp_path / 'profile'}", sheet.as_uri()]
+    subprocess.run([chromium, *flags.split(), *places], check=True, timeout=60, capture_output=True)
     found = Detector().detect(read_grey(picture))
-    assert len(found) == draw(Sheet(tmp_path, diameter=0.05))[1] == 12
+    assert len(found) == count == 12
     # The curve's flattening in the browser and 8-bit grey levels stay below a tenth of a pixel.
     assert abs(found.axes_px - 50 * PX_PER_MM).max() < 0.1
     assert abs(found.ratio - 0.6).max() < 0.002
