@@ -56,7 +56,7 @@ double cube(double x) { return x * x * x; }
 Edge edge(const Symmetric& inverse, double r, double dx, double dy) {
     const double qx = inverse.xx * dx + inverse.xy * dy, qy = inverse.xy * dx + inverse.yy * dy;
     const double wx = inverse.xx * qx + inverse.xy * qy, wy = inverse.xy * qx + inverse.yy * qy;
-    const double f = std::hypot(qx, qy) + 1e-9, w = std::hypot(wx, wy) + 1e-9;
+    const double f = std::sqrt(qx * qx + qy * qy) + 1e-9, w = std::sqrt(wx * wx + wy * wy) + 1e-9;
     const double nx = wx / w, ny = wy / w, ux = qx / f, uy = qy / f;
     return {(f - r) * f / w,          -nx,          -ny,    -r * nx * ux,
             -r * (nx * uy + ny * ux), -r * ny * uy, -f / w, cube(f / w) * square(inverse.det()) / r};
@@ -190,14 +190,14 @@ class Solver {
             for (int i = 0; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
             p[kBlur] = std::max(p[kBlur], kMinBlur);
             if (!is_sane()) return false;
-            if (moved < kStep) return true;
+            if (moved < kStep) break;
         }
+        accumulate();
         return true;
     }
 
     /// Covariance of two neighbouring parameters at the solution; nothing where the equations are singular.
-    std::optional<Symmetric> covariance(Parameter first, Parameter second) {
-        accumulate();
+    std::optional<Symmetric> covariance(Parameter first, Parameter second) const {
         const Cholesky<kCount> factor(H_);
         if (!factor.positive()) return std::nullopt;
         Parameters ex{}, ey{};
