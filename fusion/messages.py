@@ -128,11 +128,3 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, State]
     faults: dict[str, int]
-
-
-class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """The calibration in force, as the text of its `rig.yaml`."""
-
-    version: int = VERSION
-    t_ns: int
-    yaml: str

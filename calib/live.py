@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A wand waved before live cameras: collect detections, put the rig."""
+
+import queue
+import time
+from collections import Counter
+
+import zenoh
+from rich.progress import BarColumn, Progress, TextColumn
+
+from calib.errors import CalibrationError
+from calib.messages import RigMessage
+from calib.rig import Rig, dump_rig
+from camera_node.messages import Detections, Keys, MessageError, decode, encode
+
+DELIVERY_S = 2.0  # for the rig to reach whoever listens
+
+
+def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[Detections], int]:
+    """Detections of all cameras of an arena for a while, with a line of progress; and the number of bad messages.
+
+    Raises:
+        CalibrationError: nothing came.
+    """
+    arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    subscriber = session.declare_subscriber(
+        Keys(arena).detections(), lambda sample: arrived.put(sample.payload.to_bytes())
+    )
+    messages, bad = [], 0
+    seen: Counter[str] = Counter()
+    columns = (TextColumn("wave the wand"), BarColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, transient=True) as progress:
+        task = progress.add_task("waiting for cameras", total=seconds)
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            try:
+                message = decode(arrived.get(timeout=min(left, 0.2)), Detections)
+                messages.append(message)
+                seen[message.camera] += len(message) > 0
+            except queue.Empty:
+                pass
+            except MessageError:
+                bad += 1
+            told = ", ".join(f"{name} {n}" for name, n in sorted(seen.items()))
+            progress.update(task, completed=seconds - left, description=told or "waiting for cameras")
+    subscriber.undeclare()
+    if not messages:
+        raise CalibrationError(
+            f"no detections on {Keys(arena).detections()} in {seconds:g} s ({bad} bad messages); "
+            "are the server and the cameras running, and --connect and --arena right?"
+        )
+    return messages, bad
+
+
+def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:
+    """Put the rig on its key; whether a subscriber was there to take it within two seconds."""
+    publisher = session.declare_publisher(Keys(arena).rig, reliability=zenoh.Reliability.RELIABLE)
+    end = time.monotonic() + DELIVERY_S
+    while not publisher.matching_status.matching and time.monotonic() < end:
+        time.sleep(0.02)
+    taken = bool(publisher.matching_status.matching)
+    publisher.put(encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+    publisher.undeclare()
+    return taken

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a calibration says of itself: to a person on the terminal, and in `rig.yaml`."""
+
+from collections import Counter
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+WORST = 5  # outliers that are listed one by one
+
+
+@dataclass(frozen=True, slots=True)
+class CameraReport:
+    """One placed camera: frames with the wand, those used, marker centres used and rejected, the RMS distance of seen
+    from expected centres, the expected error of its position along one axis, and why frames were left out."""
+
+    name: str
+    frames: int
+    frames_used: int
+    observations: int
+    outliers: int
+    residual_px: float
+    sigma_mm: float
+    left_out: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Outlier:
+    """A marker centre that the statistics rejected: `t_s` after the first instant, `off_px` from where it should be."""
+
+    camera: str
+    t_s: float
+    marker: int
+    off_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class WandReport:
+    """What a wand calibration says of itself.
+
+    `unplaced` holds the reason for each camera without a pose; `scale` is what residuals are over what the detector
+    claimed; lengths are those that the cameras measure less the wand file's, None without two markers; `metric` is
+    False where nothing gives the scale.
+    """
+
+    cameras: list[CameraReport]
+    unplaced: dict[str, str]
+    instants: int
+    scale: float
+    length_mean_mm: float | None
+    length_std_mm: float | None
+    outliers: list[Outlier]
+    metric: bool
+
+    @property
+    def residual_px(self) -> float:
+        """RMS distance of seen from expected centres, over all cameras."""
+        total = sum(row.observations for row in self.cameras)
+        return (sum(row.residual_px**2 * row.observations for row in self.cameras) / total) ** 0.5
+
+    def left_out(self) -> Counter[str]:
+        """Frames of placed cameras that were not used, by reason."""
+        return sum((Counter(row.left_out) for row in self.cameras), Counter())
+
+    def as_dict(self, command: str) -> dict[str, Any]:
+        """For the `calibration` map of `rig.yaml`."""
+        return {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": command,
+            "metric": self.metric,
+            "instants": self.instants,
+            "residual_px": round(self.residual_px, 4),
+            "wand_length_error_mm": _figures(self.length_mean_mm, self.length_std_mm),
+            "cameras": {
+                row.name: {
+                    "frames": row.frames_used,
+                    "observations": row.observations,
+                    "outliers": row.outliers,
+                    "residual_px": round(row.residual_px, 4),
+                    "sigma_mm": round(row.sigma_mm, 3),
+                }
+                for row in self.cameras
+            },
+            "left_out": dict(self.left_out()),
+            "unplaced": dict(self.unplaced),
+        }
+
+
+def _figures(mean: float | None, std: float | None) -> dict[str, float] | None:
+    return None if mean is None or std is None else {"mean": round(mean, 3), "std": round(std, 3)}
+
+
+def print_report(report: WandReport, console: Console) -> None:
+    """A table of the cameras, then what else a person has to know."""
+    unit = "mm" if report.metric else "mm at this scale"
+    table = Table("camera", "frames used", "markers", "rejected", "residual px", f"expected error {unit}")
+    for row in report.cameras:
+        figures = (f"{row.residual_px:.3f}", f"{row.sigma_mm:.2f}")
+        table.add_row(
+            row.name, f"{row.frames_used} of {row.frames}", str(row.observations), str(row.outliers), *figures
+        )
+    console.print(table)
+    for line in _remarks(report):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _remarks(report: WandReport) -> list[str]:
+    lines = [f"{report.instants} instants, residual {report.residual_px:.3f} px"]
+    if report.length_mean_mm is not None and report.length_std_mm is not None:
+        lines.append(
+            f"wand length as the cameras measure it: {report.length_mean_mm:+.2f} mm off in the mean, "
+            f"{report.length_std_mm:.2f} mm standard deviation"
+        )
+    if not report.metric:
+        lines.append(
+            "warning: one marker of unknown size gives no scale: the two cameras farthest apart "
+            "are set 1 m apart"
+        )
+    if left_out := report.left_out():
+        lines.append("frames left out: " + ", ".join(f"{n} {why}" for why, n in left_out.most_common()))
+    if report.outliers:
+        worst = ", ".join(
+            f"{o.camera} {o.t_s:.3f} s marker {o.marker} ({o.off_px:.1f} px)" for o in report.outliers[:WORST]
+        )
+        lines.append(f"{len(report.outliers)} marker centres rejected as outliers; the worst: {worst}")
+    lines += [f"warning: camera '{name}' has no pose: {why}" for name, why in report.unplaced.items()]
+    lines.append(
+        "world: z up as the cameras are mounted (upright), origin under the middle of the wave, z = 0 at its lowest"
+    )
+    return lines

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`python -m web`: watch an arena in the browser, or on one line a second; or start a simulated one with --demo."""
+
+import signal
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from camera_node.errors import run
+from camera_node.network import open_client
+from web.feed import Feed
+from web.tables import describe
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Watch an arena.
+
+    Attributes:
+        connect: Zenoh endpoints of the server.
+        arena: Name of the arena, as in the server's configuration.
+        zenoh_config: A Zenoh configuration file, for TLS or access control.
+        host: Address that the page is served on; 0.0.0.0 shows it to the whole network.
+        port: Port that the page is served on.
+        headless: One line a second instead of a page.
+        seconds: End after so long; of a demo, so long after calibration.
+        demo: Start a simulated arena, calibrate it by a wand wave, track its robots, and watch it.
+        scene: The demo's scene; arena.yaml, robots.yaml and wand.yaml lie beside it. The checkout's own by default.
+        listen: Zenoh endpoint of the demo's server, as tcp/127.0.0.1:7447; a free one by default.
+    """
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    arena: str = "arena"
+    zenoh_config: Path | None = None
+    host: str = "127.0.0.1"
+    port: int = 8080
+    headless: bool = False
+    seconds: float | None = None
+    demo: bool = False
+    scene: Path | None = None
+    listen: str | None = None
+
+
+def watch(options: Options, stop: threading.Event) -> None:
+    """Show the arena until `stop` is set."""
+    session = open_client(options.connect, options.zenoh_config)
+    try:
+        feed = Feed(session, options.arena)
+        if options.headless:
+            ended = False
+            while not ended:
+                ended = stop.wait(1.0)
+                print(describe(feed.latest()), flush=True)
+        else:
+            _show(feed, options, stop)
+    finally:
+        session.close()
+
+
+def _show(feed: Feed, options: Options, stop: threading.Event) -> None:
+    from web.view import View
+
+    view = View(feed, options.host, options.port)
+    print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
+    try:
+        view.run(stop)
+    finally:
+        view.close()
+
+
+def play(options: Options) -> int:
+    """Play the demo; returns its exit code."""
+    from web.demo import default_scene, run_demo
+    from web.view import check_port
+
+    if not options.headless:
+        check_port(options.host, options.port)
+    page = None if options.headless else (options.host, options.port)
+    return run_demo(options.scene or default_scene(), options.listen, page, options.seconds)
+
+
+def program() -> int | None:
+    options = tyro.cli(Options, prog="python -m web")
+    if options.demo:
+        return play(options)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    if options.seconds is not None:
+        threading.Timer(options.seconds, stop.set).start()
+    watch(options, stop)
+    return 0
+
+
+def main() -> None:
+    run(program)
+
+
+if __name__ == "__main__":
+    main()
