@@ -53,8 +53,9 @@ def locate(
     poses = [_pose(n, Q, diameter_m / 2) for n in _normals(Q)]
     uv = lens.project([position for position, _ in poses])
     odds = np.array([0.5, 0.5]) if offset is None else _odds(uv - roundel.uv, offset[0], offset[1])
-    first, second = (DiscPose(*poses[k], uv[k], float(odds[k])) for k in np.argsort(-odds, kind="stable"))
-    return first, second
+    first, second = np.argsort(-odds, kind="stable")
+    both = [DiscPose(p, n, at, float(odd)) for (p, n), at, odd in zip(poses, uv, odds, strict=True)]
+    return both[first], both[second]
 
 
 def _boundary(roundel: Roundel) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 FINE = 8
@@ -87,6 +87,7 @@ def render(
     return image if light is None else image * light
 
 
-def expose(image: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def expose(image: ArrayLike, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """An 8-bit image with Gaussian noise."""
-    return np.clip(np.rint(image + rng.normal(0, noise, image.shape)), 0, 255).astype(np.uint8)
+    grey = np.asarray(image, float)
+    return np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
