@@ -14,7 +14,13 @@ class Detector:
         min_contrast: float,
     ) -> None: ...
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One row a roundel: u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast, residual."""
+        """One row of 16 a roundel.
 
+        u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast, residual; then the disc's own centre:
+        offset_u, offset_v from the ellipse's, and their covariance uu, uv, vv.
+        """
+
+    @property
+    def saturated(self) -> float: ...
     @property
     def theta(self) -> float: ...

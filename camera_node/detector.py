@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The typed face of the native detector."""
 
+from collections.abc import Sequence
 from typing import Literal
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
 from camera_node.errors import ConfigError
 from camera_node.roundels import Roundels
+from camera_node.tracks import Tracks
+
+Array = NDArray[np.float64]
 
 
 class Detector:
@@ -20,6 +25,7 @@ class Detector:
         ratio_tolerance: how far a measured ratio may be from one of them.
         min_diameter_px, max_diameter_px: of the outer ellipse's major axis.
         min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
+        mask: polygons (N, 2) of pixels; a roundel whose centre lies in one is left out.
 
     Raises:
         ConfigError: a setting is out of its range.
@@ -34,6 +40,7 @@ class Detector:
         min_diameter_px: float = 8.0,
         max_diameter_px: float = 400.0,
         min_contrast: float = 25.0,
+        mask: Sequence[ArrayLike] = (),
     ) -> None:
         if detector != "paper":
             raise ConfigError(f"there is no detector '{detector}'; choose paper")
@@ -45,24 +52,57 @@ class Detector:
             raise ConfigError(
                 f"diameters of {min_diameter_px} to {max_diameter_px} px; give two in rising order in [6, 10000]"
             )
+        self._mask = [np.asarray(polygon, np.float32) for polygon in mask]
+        if any(p.ndim != 2 or p.shape[1] != 2 or len(p) < 3 or not np.isfinite(p).all() for p in self._mask):
+            raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
         if not 5 <= min_contrast <= 250:
             raise ConfigError(f"min_contrast is {min_contrast}; give grey levels in [5, 250]")
         self._core = _core.Detector(
             list(inner_ratios), ratio_tolerance, min_diameter_px, max_diameter_px, min_contrast
         )
 
+        self._tracks = Tracks()
+        self._offsets = np.empty((0, 5))
+
     @property
     def threshold(self) -> float:
         """The paper's theta, grey levels."""
         return self._core.theta
 
+    @property
+    def saturated(self) -> float:
+        """Share of the last frame's pixels that are 250 or brighter."""
+        return self._core.saturated
+
+    def disc_offsets(self) -> tuple[Array, Array]:
+        """Of the last frame's roundels, in their order: where the discs' own centres project, from `uv`.
+
+        Measured by the inner ellipse's place in the outer one.
+
+        Returns:
+            (N, 2) offsets, pixels, and (N, 2, 2) their covariance.
+        """
+        return self._offsets[:, :2], self._offsets[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+
     def detect(self, image: NDArray[np.uint8]) -> Roundels:
-        """All roundels of a grey image (h, w), uint8."""
+        """All roundels of a grey image (h, w), uint8.
+
+        Raises:
+            ValueError: the array is no grey image.
+        """
         if image.dtype != np.uint8 or image.ndim != 2:
             raise ValueError(f"a grey image (h, w) of uint8 is needed, got {image.dtype} {image.shape}")
-        if image.strides[1] != 1:
+        if image.strides[1] != 1 and image.size:
             image = np.ascontiguousarray(image)
         table = self._core.detect(image)
+        table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
+        self._offsets = table[:, 11:]
+        uv, axes = table[:, :2], table[:, 5:7]
         cov = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        track = self._tracks.follow(uv, axes[:, 0])
         none = np.full(len(table), -1, np.int32)
-        return Roundels(table[:, :2], cov, table[:, 5:7], table[:, 7], table[:, 8], table[:, 9], none, none)
+        return Roundels(uv, cov, axes, table[:, 7], table[:, 8], table[:, 9], none, track)
+
+    def _is_masked(self, uv: Array) -> bool:
+        at = (float(uv[0]), float(uv[1]))
+        return any(cv2.pointPolygonTest(polygon, at, False) >= 0 for polygon in self._mask)

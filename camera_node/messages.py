@@ -139,12 +139,28 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     saturated: float  # share of pixels at the upper end, 0 to 1
     exposure_us: float | None = None
     gain: float | None = None
-    clock_offset_ms: float | None = (
-        None  # server's time less this machine's; None until a round trip succeeded
-    )
-    clock_error_ms: float | None = None  # half of the best round trip
+    # The server's time less this machine's, and a bound of its error; None until a round trip succeeded.
+    clock_offset_ms: float | None = None
+    clock_error_ms: float | None = None
     temperature_c: float | None = None
     advice: str = ""  # "too dark", "saturated", or nothing
+    refused: int = 0  # requests for a snapshot or settings that were refused since the node started
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What can be changed while a camera runs. A field that is None is left as it is, or is not known to the camera.
+
+    `mask` lists rectangles [u0, v0, u1, v1] of raw pixels in which roundels are ignored; the others are a camera's
+    and `Detector`'s settings of these names.
+    """
+
+    version: int = VERSION
+    exposure_us: float | None = None
+    gain: float | None = None
+    mask: tuple[tuple[float, float, float, float], ...] | None = None
+    min_contrast: float | None = None
+    min_diameter_px: float | None = None
+    max_diameter_px: float | None = None
 
 
 class ClockReply(msgspec.Struct, frozen=True):

@@ -2,12 +2,20 @@
 """Zenoh sessions with explicit endpoints: the server is a router that listens, everybody else connects to it."""
 
 import json
-from collections.abc import Sequence
+import logging
+import re
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
+
+log = logging.getLogger("camera_node.network")
+
+PATIENCE_S = 3.0  # how long the server may take to be seen before its absence is told
+RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
@@ -15,54 +23,62 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
 
     Raises:
         NetworkError: an endpoint is taken or is none.
+        ConfigError: the Zenoh configuration is missing or broken.
     """
-    config = _config(zenoh_config)
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    config.insert_json5("listen/exit_on_failure", "true")
+    # A listening timeout other than 0 would hide that the port is taken.
+    options = {"listen/endpoints": list(listen), "listen/timeout_ms": 0, "listen/exit_on_failure": True}
     try:
-        return zenoh.open(config)
+        return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
-        where = " ".join(listen)
         raise NetworkError(
-            f"can't listen on {where}: is another server running there? Stop it or choose another port "
-            f"with --listen ({_brief(error)})"
+            f"can't listen on {' '.join(listen)}: is another server running there? Stop it or choose another "
+            f"port with --listen, written as tcp/0.0.0.0:7447 ({_brief(error)})"
         ) from None
 
 
 def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
     """A session that opens at once and keeps trying to reach the router, now and after every loss.
 
-    It is a peer that listens nowhere: unlike a Zenoh client it opens while no router answers.
+    It is a Zenoh router that listens nowhere. A Zenoh client does not open while no router answers, and what a Zenoh
+    peer publishes is not relayed by a router to other peers (measured with 1.10). What is put while the router is
+    away is dropped at once.
 
     Raises:
         NetworkError: an endpoint is none.
+        ConfigError: the Zenoh configuration is missing or broken.
     """
-    config = _config(zenoh_config)
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("listen/endpoints", "[]")
-    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
-    config.insert_json5("connect/timeout_ms", "0")
-    config.insert_json5("connect/exit_on_failure", "false")
-    config.insert_json5(
-        "connect/retry",
-        '{"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5}',
-    )
+    options = {
+        "listen/endpoints": [],
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": -1,  # 0 would mean one attempt
+        "connect/exit_on_failure": False,
+        "connect/retry": RETRY,
+    }
     try:
-        return zenoh.open(config)
+        return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
         raise NetworkError(
             f"can't connect to {' '.join(connect)}: write an endpoint as tcp/host:7447 ({_brief(error)})"
         ) from None
 
 
-def _config(path: Path | None) -> zenoh.Config:
-    """The user's Zenoh configuration, or the default, with scouting off unless the user's file turns it on."""
-    if path is None:
-        config = zenoh.Config()
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("scouting/gossip/enabled", "false")
-        return config
+def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
+    """The user's Zenoh configuration or the default, with the program's own options over it.
+
+    Scouting stays off unless the user's file turns it on.
+    """
+    config = _read(path) if path else zenoh.Config()
+    for key in ("scouting/multicast/enabled", "scouting/gossip/enabled"):
+        if config.get_json(key) == "null":
+            config.insert_json5(key, "false")
+    if config.get_json("scouting/delay") == "null":
+        config.insert_json5("scouting/delay", "0")  # opening would wait for what scouting finds
+    for key, value in {"mode": "router", **options}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _read(path: Path) -> zenoh.Config:
     if not path.is_file():
         raise ConfigError(f"{path} does not exist; check the path of the Zenoh configuration")
     try:
@@ -72,4 +88,30 @@ def _config(path: Path | None) -> zenoh.Config:
 
 
 def _brief(error: Exception) -> str:
-    return str(error).splitlines()[0][:160]
+    """Zenoh's message without the places in its sources."""
+    return " ".join(re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).split())[:160]
+
+
+class ServerWatch:
+    """Tells once that the server is away, and once that it is back; by its liveliness token."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._present, self._told = False, False
+        self._opened = time.monotonic()
+        self._subscriber = session.liveliness().declare_subscriber(key, self._change, history=True)
+
+    def tell_absence(self) -> None:
+        """Called now and then: a server that was not seen since the start is told of once."""
+        if not self._present and not self._told and time.monotonic() - self._opened > PATIENCE_S:
+            self._told = True
+            log.warning("the server is away; what is seen meanwhile is lost, and it is tried on")
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+
+    def _change(self, sample: zenoh.Sample) -> None:
+        self._present = sample.kind == zenoh.SampleKind.PUT
+        if self._present and self._told:
+            log.warning("the server is there again")
+            self._told = False
+        self._opened = time.monotonic()

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where frames come from."""
+"""Where frames come from: recordings here, cameras in `device`, a rendered arena in `simulation`."""
 
+import csv
+import re
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.errors import CameraError
+from camera_node.errors import CameraError, ConfigError
 
 Grey = NDArray[np.uint8]
 
@@ -25,11 +29,70 @@ class Frame:
 
 
 class Source(Protocol):
-    """A camera, a file or a simulation. Iterating ends where the source ends; a live camera's never does."""
+    """A camera, a file or a simulation. Iterating ends where the source ends; a live camera's ends at `close`."""
 
     def __iter__(self) -> Iterator[Frame]: ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """End the iteration, which may be another thread's, and release what is held."""
+        ...
+
+
+@dataclass(frozen=True)
+class SourceSettings:
+    """How a source is opened; each kind of source takes what it knows.
+
+    Attributes:
+        width, height: of a camera's images, pixels; a camera's own choice unless given.
+        fps: frames a second of a camera, or of a video without `timestamps.csv`.
+        exposure_us: a camera's exposure, microseconds; automatic unless given.
+        gain: a camera's gain, in the driver's units.
+        fourcc: a camera's pixel format, such as MJPG or YUYV.
+        scene: the simulated arena's file.
+        name: the camera's name, by which a simulation knows it.
+        epoch_ns: the Unix time of a simulation's or a recording's time 0.
+        pace: whether recorded frames come when they are due, or as fast as they can be read.
+        stamps: whether recorded frames keep their times, or are moved to now (or by `epoch_ns`, where given).
+    """
+
+    width: int | None = None
+    height: int | None = None
+    fps: float | None = None
+    exposure_us: float | None = None
+    gain: float | None = None
+    fourcc: str | None = None
+    scene: Path | None = None
+    name: str = "cam0"
+    epoch_ns: int | None = None
+    pace: Literal["recorded", "fast"] = "recorded"
+    stamps: Literal["recorded", "now"] = "recorded"
+
+
+def open_source(text: str, settings: SourceSettings) -> Source:
+    """The source that `--source` names: `sim`, a folder, a video file, or a camera by number, path or name.
+
+    Raises:
+        CameraError: there is no such source, or it does not open.
+        ConfigError: a simulation without a scene.
+    """
+    if text == "sim":
+        return _open_simulation(settings)
+    if Path(text).is_dir():
+        return Replay(FolderSource(Path(text)), settings)
+    if Path(text).is_file():
+        return Replay(VideoSource(Path(text), settings.fps), settings)
+    from camera_node.device import DeviceSource, find_device
+
+    return DeviceSource(find_device(text), settings)
+
+
+def _open_simulation(settings: SourceSettings) -> Source:
+    if settings.scene is None:
+        raise ConfigError("--source sim needs an arena: add --scene FILE, such as configs/demo/scene.yaml")
+    from camera_node.simulation import SimulatedCamera
+
+    epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
+    return SimulatedCamera(settings.scene, settings.name, epoch_ns)
 
 
 class FolderSource:
@@ -40,7 +103,7 @@ class FolderSource:
         if not folder.is_dir():
             raise CameraError(f"{folder} is no folder; frames are expected as {folder}/<t_ns>.png or .jpg")
         files = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
-        if bad := [path.name for path in files if not path.stem.isdigit()]:
+        if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,18}", path.stem)]:
             raise CameraError(
                 f"{folder / min(bad)} is not named by its capture time in nanoseconds, as <t_ns>.png"
             )
@@ -58,6 +121,105 @@ class FolderSource:
         pass
 
 
+class VideoSource:
+    """A video file. Its times are those of `timestamps.csv` beside it, else the frames come at a steady rate."""
+
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        """Raises CameraError where OpenCV can't read the file, or its times are unknown or don't fit."""
+        self.path = path
+        video = self._open()
+        fps = fps or video.get(cv2.CAP_PROP_FPS)
+        video.release()
+        self.times = read_timestamps(path)
+        if self.times is None and not 0 < fps < 1e6:
+            raise CameraError(f"{path} does not say its frames a second; give --fps")
+        self.period_ns = 1e9 / fps if fps > 0 else 0.0
+
+    def _open(self) -> cv2.VideoCapture:
+        video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        if not video.isOpened():
+            raise CameraError(f"{self.path} is no video that OpenCV reads, no folder of frames and no camera")
+        return video
+
+    def __iter__(self) -> Iterator[Frame]:
+        video = self._open()
+        try:
+            k = 0
+            while (image := video.read()[1]) is not None:
+                yield Frame(grey(image), self._time(k))
+                k += 1
+        finally:
+            video.release()
+
+    def _time(self, k: int) -> int:
+        if self.times is None:
+            return round(k * self.period_ns)
+        if k >= len(self.times):
+            raise CameraError(f"{self.path} has more than the {len(self.times)} frames in its timestamps.csv")
+        return self.times[k]
+
+    def close(self) -> None:
+        pass
+
+
+def read_timestamps(video: Path) -> list[int] | None:
+    """The times (ns) of a video's frames from `timestamps.csv` beside it; None where there is no such file.
+
+    The columns `frame_time` (seconds) and `cam_id` (the video's name, or the number it ends with) are used; without
+    a `cam_id` the file speaks of one camera.
+
+    Raises:
+        CameraError: the file is broken or has no row of this video's.
+    """
+    path = video.with_name("timestamps.csv")
+    if not path.is_file():
+        return None
+    number = re.search(r"\d*$", video.stem)
+    ours = {video.stem, number.group() if number else "", None}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            times = [
+                round(float(row["frame_time"]) * 1e9)
+                for row in csv.DictReader(file)
+                if row.get("cam_id") in ours
+            ]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise CameraError(f"{path} needs the columns cam_id and frame_time, in seconds") from None
+    if not times:
+        raise CameraError(f"{path} has no row whose cam_id is that of {video.name}")
+    return sorted(times)
+
+
+class Replay:
+    """A recording delivered at its own pace or as fast as it is read, with its own times or moved to now."""
+
+    def __init__(self, recording: Source, settings: SourceSettings) -> None:
+        self.recording, self.settings = recording, settings
+        self._closed = threading.Event()
+
+    def __iter__(self) -> Iterator[Frame]:
+        begun, lead = time.time_ns(), None
+        for frame in self.recording:
+            if lead is None:
+                lead = self._lead(frame.t_ns, begun)
+            due = lead + frame.t_ns
+            wait_s = (due - time.time_ns()) / 1e9
+            if self._closed.wait(max(0.0, wait_s) if self.settings.pace == "recorded" else 0.0):
+                return
+            stamp = due if self.settings.stamps == "now" else frame.t_ns
+            yield Frame(frame.image, stamp, frame.exposure_us)
+
+    def _lead(self, first_ns: int, now_ns: int) -> int:
+        """What to add to a recorded time to have the time at which the frame is due."""
+        if self.settings.stamps == "now" and self.settings.epoch_ns is not None:
+            return self.settings.epoch_ns
+        return now_ns - first_ns
+
+    def close(self) -> None:
+        self._closed.set()
+        self.recording.close()
+
+
 def read_grey(path: Path) -> Grey:
     """The grey image (h, w) uint8 of a file.
 
@@ -69,4 +231,10 @@ def read_grey(path: Path) -> Grey:
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
     if image is None:
         raise CameraError(f"{path} is no image that OpenCV reads; give a PNG or JPEG file")
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def grey(image: NDArray) -> Grey:
+    """The grey levels (h, w) of a grey or BGR image."""
+    image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image, np.uint8)

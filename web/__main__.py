@@ -26,6 +26,9 @@ class Options:
         port: Port that the page is served on.
         headless: One line a second instead of a page.
         seconds: End after so long; of a demo, so long after calibration.
+        demo: Start a simulated arena, calibrate it by a wand wave, track its robots, and watch it.
+        scene: The demo's scene; arena.yaml, robots.yaml and wand.yaml lie beside it. The checkout's own by default.
+        listen: Zenoh endpoint of the demo's server, as tcp/127.0.0.1:7447; a free one by default.
     """
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -35,6 +38,9 @@ class Options:
     port: int = 8080
     headless: bool = False
     seconds: float | None = None
+    demo: bool = False
+    scene: Path | None = None
+    listen: str | None = None
 
 
 def watch(options: Options, stop: threading.Event) -> None:
@@ -43,7 +49,9 @@ def watch(options: Options, stop: threading.Event) -> None:
     try:
         feed = Feed(session, options.arena)
         if options.headless:
-            while not stop.wait(1.0):
+            ended = False
+            while not ended:
+                ended = stop.wait(1.0)
                 print(describe(feed.latest()), flush=True)
         else:
             _show(feed, options, stop)
@@ -62,8 +70,21 @@ def _show(feed: Feed, options: Options, stop: threading.Event) -> None:
         view.close()
 
 
+def play(options: Options) -> int:
+    """Play the demo; returns its exit code."""
+    from web.demo import default_scene, run_demo
+    from web.view import check_port
+
+    if not options.headless:
+        check_port(options.host, options.port)
+    page = None if options.headless else (options.host, options.port)
+    return run_demo(options.scene or default_scene(), options.listen, page, options.seconds)
+
+
 def program() -> int | None:
     options = tyro.cli(Options, prog="python -m web")
+    if options.demo:
+        return play(options)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     if options.seconds is not None:

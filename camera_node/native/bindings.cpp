@@ -11,20 +11,22 @@ using Grey = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
 using Table = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 
 static roundel::ImageView view(const Grey& image) {
+    if (image.size() == 0) return {nullptr, 0, 0, 0};
     if (image.shape(1) > 1 && image.stride(1) != 1) throw nb::value_error("image rows must be contiguous");
     return {image.data(), int(image.shape(1)), int(image.shape(0)), ptrdiff_t(image.stride(0))};
 }
 
 /// One row a roundel, in the order that `_core.pyi` states.
 static Table table(const std::vector<roundel::Fit>& fits) {
-    constexpr size_t kColumns = 11;
+    constexpr size_t kColumns = 16;
     auto* rows = new double[fits.size() * kColumns + 1];
     const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
     double* to = rows;
     for (const auto& f : fits)
         for (const double value :
              {f.outer.x, f.outer.y, f.covariance.xx, f.covariance.xy, f.covariance.yy, f.outer.major,
-              f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.residual})
+              f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.residual, f.offset_x, f.offset_y,
+              f.offset_covariance.xx, f.offset_covariance.xy, f.offset_covariance.yy})
             *to++ = value;
     return Table(rows, {fits.size(), kColumns}, owner);
 }
@@ -63,5 +65,6 @@ NB_MODULE(_core, m) {
                 return table(fits);
             },
             nb::arg("image").noconvert())
+        .def_prop_ro("saturated", &roundel::Detector::saturated)
         .def_prop_ro("theta", &roundel::Detector::theta);
 }

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <optional>
 
 namespace roundel {
@@ -42,21 +43,44 @@ bool is_roundel(const Fit& fit, const Settings& settings) {
            fit.outer.major >= settings.min_diameter && fit.outer.major <= settings.max_diameter;
 }
 
+/// Whether two more dark rings lie around a roundel, which makes it a bullseye. One may be a plate that it
+/// stands on, or the line that its card was cut along.
+bool is_bullseye(const Fit& fit, const std::vector<Segment>& around) {
+    const Ellipse& e = fit.outer;
+    return std::count_if(around.begin(), around.end(), [&](const Segment& s) {
+               const double x = (s.left + s.right) / 2.0, y = (s.top + s.bottom) / 2.0;
+               const double side = std::max(s.width(), s.height());
+               return std::hypot(x - e.x, y - e.y) < 0.15 * e.major && side > 1.2 * e.major &&
+                      side < 4 * e.major;
+           }) >= 2;
+}
+
+/// The dark segments large enough to be a ring around a roundel.
+std::vector<Segment> large_dark(const std::vector<Segment>& segments, const Settings& settings) {
+    std::vector<Segment> large;
+    std::copy_if(segments.begin(), segments.end(), std::back_inserter(large), [&](const Segment& s) {
+        return s.dark && std::max(s.width(), s.height()) > settings.min_diameter;
+    });
+    return large;
+}
+
 }  // namespace
 
 std::vector<Fit> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     std::vector<Fit> found;
     if (image.width < 3 || image.height < 3) return found;
+    saturated_ = saturated_share(image);
     const auto theta = uint8_t(std::lround(std::clamp(theta_.value(), 1.0, 255.0)));
     const Segments segments = grow_segments(image, local_threshold(image, settings_.min_contrast, theta));
+    const std::vector<Segment> around = large_dark(segments.list, settings_);
     for (const Pair& pair : find_pairs(segments, image.width, image.height, settings_)) {
         if (found.size() == kMaxRoundels) break;
         const double own =
             (mean_level(image, segments, pair.dark) + mean_level(image, segments, pair.bright)) / 2;
         const auto start = rethreshold(image, segments.list[size_t(pair.dark)], own, settings_);
         const auto fit = start ? refine(image, *start) : std::nullopt;
-        if (fit && is_roundel(*fit, settings_)) found.push_back(*fit);
+        if (fit && is_roundel(*fit, settings_) && !is_bullseye(*fit, around)) found.push_back(*fit);
     }
     update_theta(found);
     return found;

@@ -18,12 +18,15 @@ class Detector {
     std::vector<Fit> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
+    /// Share of the last frame's pixels at the upper end of the scale.
+    double saturated() const { return saturated_; }
 
   private:
     void update_theta(const std::vector<Fit>& found);
 
     Settings settings_;
     Theta theta_;
+    double saturated_ = 0;
     std::mutex mutex_;
 };
 

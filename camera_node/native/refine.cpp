@@ -36,6 +36,7 @@ constexpr int kMaxPixels = 1200;  // larger roundels are sampled on a coarser gr
 constexpr int kMaxIterations = 12;
 constexpr double kStep = 1e-3;     // pixels: a smaller step ends the iteration
 constexpr double kNoiseFloor = 1;  // grey levels
+constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kTukey = 6;       // standard deviations from which on a pixel does not count
 constexpr double kCardRatio = 9.0 / 7;
 
@@ -46,28 +47,36 @@ struct Pixel {
 /// Signed distance of a point to the ellipse centre + r A u, |u| = 1, to first order (positive outside), and
 /// its derivatives by the centre, by A = [[xx, xy], [xy, yy]] and by r.
 struct Edge {
-    double distance, by_x, by_y, by_axx, by_axy, by_ayy, by_r;
+    double distance, by_x, by_y, by_axx, by_axy, by_ayy, by_r, curvature;
 };
+
+double square(double x) { return x * x; }
+double cube(double x) { return x * x * x; }
 
 Edge edge(const Symmetric& inverse, double r, double dx, double dy) {
     const double qx = inverse.xx * dx + inverse.xy * dy, qy = inverse.xy * dx + inverse.yy * dy;
     const double wx = inverse.xx * qx + inverse.xy * qy, wy = inverse.xy * qx + inverse.yy * qy;
     const double f = std::hypot(qx, qy) + 1e-9, w = std::hypot(wx, wy) + 1e-9;
     const double nx = wx / w, ny = wy / w, ux = qx / f, uy = qy / f;
-    return {(f - r) * f / w, -nx, -ny, -r * nx * ux, -r * (nx * uy + ny * ux), -r * ny * uy, -f / w};
+    return {(f - r) * f / w,          -nx,          -ny,    -r * nx * ux,
+            -r * (nx * uy + ny * ux), -r * ny * uy, -f / w, cube(f / w) * square(inverse.det()) / r};
 }
 
-/// The share of the inside that a pixel sees at a distance from a blurred edge, and its derivative.
+/// The share of the inside that a pixel sees near a blurred edge, and its derivatives by distance and by
+/// blur.
 struct Step {
-    double inside, slope;
+    double inside, slope, by_blur;
 };
 
-Step step(double distance, double blur) {
-    const double t = distance / blur;
-    if (std::abs(t) > 5) return {t < 0 ? 1.0 : 0.0, 0};
-    return {std::erfc(t / std::numbers::sqrt2) / 2,
-            -std::exp(-t * t / 2) / (blur * std::sqrt(2 * std::numbers::pi))};
+/// Blur moves the half level of a curved edge towards its centre of curvature by curvature blur^2 / 2.
+Step step(const Edge& edge, double blur) {
+    const double shift = edge.curvature * blur * blur / 2, t = (edge.distance + shift) / blur;
+    if (std::abs(t) > 5) return {t < 0 ? 1.0 : 0.0, 0, 0};
+    const double slope = -std::exp(-t * t / 2) / (blur * std::sqrt(2 * std::numbers::pi));
+    return {std::erfc(t / std::numbers::sqrt2) / 2, slope, slope * (shift - edge.distance) / blur};
 }
+
+Symmetric scale(const Symmetric& m, double by) { return {by * m.xx, by * m.xy, by * m.yy}; }
 
 Symmetric invert(const Parameters& p) {
     const Symmetric A{p[kAxx], p[kAxy], p[kAyy]};
@@ -89,8 +98,7 @@ class Model {
         const Edge inner = edge(inverse_, p_[kRatio], dx - p_[kOffsetX], dy - p_[kOffsetY]);
         const Edge card =
             edge(inverse_, p_[kCard], dx - card_shift_ * p_[kOffsetX], dy - card_shift_ * p_[kOffsetY]);
-        const Step o = step(outer.distance, p_[kBlur]), i = step(inner.distance, p_[kBlur]),
-                   c = step(card.distance, p_[kBlur]);
+        const Step o = step(outer, p_[kBlur]), i = step(inner, p_[kBlur]), c = step(card, p_[kBlur]);
         const double fall = p_[kDark] - p_[kBright], drop = p_[kGround] - p_[kBright];
         const double by_o = fall * o.slope, by_i = -fall * i.slope, by_c = -drop * c.slope;
         J[kX] = by_o * outer.by_x + by_i * inner.by_x + by_c * card.by_x;
@@ -104,7 +112,7 @@ class Model {
         J[kBright] = c.inside - o.inside + i.inside;
         J[kDark] = o.inside - i.inside;
         J[kGround] = 1 - c.inside;
-        J[kBlur] = -(by_o * outer.distance + by_i * inner.distance + by_c * card.distance) / p_[kBlur];
+        J[kBlur] = fall * (o.by_blur - i.by_blur) - drop * c.by_blur;
         J[kCard] = by_c * card.by_r;
         return p_[kBright] + fall * J[kDark] + drop * J[kGround];
     }
@@ -132,7 +140,7 @@ Parameters begin(const Start& s) {
 Parameters prior_information() {
     Parameters w{};
     w[kRatio] = 1 / (0.3 * 0.3), w[kOffsetX] = w[kOffsetY] = 1.0;
-    w[kGround] = 1 / (200.0 * 200), w[kBlur] = 1 / (1.0 * 1.0), w[kCard] = 1 / (0.15 * 0.15);
+    w[kGround] = 1 / (100.0 * 100), w[kBlur] = 1 / (1.0 * 1.0), w[kCard] = 1 / (0.05 * 0.05);
     return w;
 }
 
@@ -150,6 +158,7 @@ std::vector<Pixel> select_pixels(const ImageView& image, const Parameters& p, co
     for (int y = top; y <= bottom; y += grid)
         for (int x = left; x <= right; x += grid) {
             const double dx = x - p[kX], dy = y - p[kY];
+            if (edge(inverse, kCardRatio, dx, dy).distance > 0) continue;
             if (std::abs(edge(inverse, 1, dx, dy).distance) < kBand ||
                 std::abs(edge(inverse, p[kRatio], dx, dy).distance) < kBand)
                 pixels.push_back({double(x), double(y), double(image.row(y)[x])});
@@ -179,22 +188,22 @@ class Solver {
             double moved = 0;
             for (int i = 0; i < kCount; ++i) p[i] += delta[i];
             for (int i = 0; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
+            p[kBlur] = std::max(p[kBlur], kMinBlur);
             if (!is_sane()) return false;
             if (moved < kStep) return true;
         }
         return true;
     }
 
-    /// Covariance of the centre at the solution.
-    std::optional<Symmetric> covariance() {
+    /// Covariance of two neighbouring parameters at the solution; nothing where the equations are singular.
+    std::optional<Symmetric> covariance(Parameter first, Parameter second) {
         accumulate();
         const Cholesky<kCount> factor(H_);
         if (!factor.positive()) return std::nullopt;
         Parameters ex{}, ey{};
-        ex[kX] = ey[kY] = 1;
+        ex[first] = ey[second] = noise_ * noise_;
         const Parameters x = factor.solve(ex), y = factor.solve(ey);
-        const double variance = noise_ * noise_;
-        return Symmetric{variance * x[kX], variance * x[kY], variance * y[kY]};
+        return Symmetric{x[first], x[second], y[second]};
     }
 
     double residual() const { return rms_; }
@@ -220,7 +229,7 @@ class Solver {
             }
         }
         rms_ = std::sqrt(squares / double(pixels_.size()));
-        noise_ = std::max(kNoiseFloor, std::sqrt(weighted / std::max(1.0, weights - kCount)));
+        noise_ = std::max(kNoiseFloor, std::sqrt(weighted / std::max(1.0, weights - double(kCount))));
         add_prior();
         update_scale();
     }
@@ -246,8 +255,7 @@ class Solver {
         const double area = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
         return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * size && p[kAxx] > 0 &&
                std::sqrt(std::max(area, 0.0)) > 0.7 * size && std::sqrt(std::max(area, 0.0)) < 1.4 * size &&
-               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] > 0.2 && p[kBlur] < 3 + 0.1 * size &&
-               p[kCard] > 1;
+               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * size && p[kCard] > 1;
     }
 
     const std::vector<Pixel>& pixels_;
@@ -266,18 +274,24 @@ std::optional<Fit> refine(const ImageView& image, const Start& start) {
     if (pixels.size() < 2 * kCount) return std::nullopt;
     Solver solver(pixels, first);
     if (!solver.solve()) return std::nullopt;
-    const auto covariance = solver.covariance();
-    if (!covariance) return std::nullopt;
+    const auto centre = solver.covariance(kX, kY), offset = solver.covariance(kOffsetX, kOffsetY);
+    if (!centre || !offset) return std::nullopt;
     const Parameters& p = solver.p;
     const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
-    return Fit{{p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
-               *covariance,
-               p[kRatio],
-               p[kCard],
-               p[kDark],
-               p[kBright],
-               p[kBlur],
-               solver.residual()};
+    // Perspective moves a circle's centre by its radius squared: the inner circle's image tells that of
+    // radius nought.
+    const double to_disc = 1 / (1 - p[kRatio] * p[kRatio]);
+    return Fit{.outer = {p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
+               .covariance = *centre,
+               .offset_x = to_disc * p[kOffsetX],
+               .offset_y = to_disc * p[kOffsetY],
+               .offset_covariance = scale(*offset, to_disc * to_disc),
+               .ratio = p[kRatio],
+               .card = p[kCard],
+               .dark = p[kDark],
+               .bright = p[kBright],
+               .blur = p[kBlur],
+               .residual = solver.residual()};
 }
 
 }  // namespace roundel

@@ -16,12 +16,14 @@ struct Start {
 /// A roundel fitted to the grey levels around its edges.
 struct Fit {
     Ellipse outer;
-    Symmetric covariance;  // of the centre, square pixels
-    double ratio;          // inner over outer diameter
-    double card;           // the white card's over the outer diameter, where the card's edge is near
-    double dark, bright;   // grey levels
-    double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double residual;       // RMS over all pixels used, grey levels
+    Symmetric covariance;         // of the centre, square pixels
+    double offset_x, offset_y;    // from the ellipse's centre to where the disc's own centre projects, pixels
+    Symmetric offset_covariance;  // square pixels
+    double ratio;                 // inner over outer diameter
+    double card;                  // the white card's over the outer diameter, where the card's edge is near
+    double dark, bright;          // grey levels
+    double blur;      // standard deviation of the edges' spread, the pixel's own width included, pixels
+    double residual;  // RMS over all pixels used, grey levels
 };
 
 /// Fits a photometric model of a roundel by Gauss-Newton on the pixels within two of its edges: a bright

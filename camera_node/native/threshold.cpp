@@ -23,6 +23,17 @@ Levels class_means(const ImageView& image, uint8_t theta) {
             bright_count ? double(sum - dark_sum) / double(bright_count) : double(theta), dark_count};
 }
 
+double saturated_share(const ImageView& image) {
+    size_t count = 0;
+    for (int y = 0; y < image.height; ++y) {
+        const uint8_t* row = image.row(y);
+        unsigned in_row = 0;
+        for (int x = 0; x < image.width; ++x) in_row += row[x] >= 250;
+        count += in_row;
+    }
+    return double(count) / (double(image.width) * image.height);
+}
+
 void Theta::settle(double dark, double bright) {
     value_ = (dark + bright) / 2;
     steps_ = 1;

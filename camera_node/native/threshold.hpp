@@ -18,6 +18,9 @@ struct Levels {
 /// A class without pixels has the mean `theta`.
 Levels class_means(const ImageView& image, uint8_t theta);
 
+/// Share of the pixels that are 250 or brighter.
+double saturated_share(const ImageView& image);
+
 /// The paper's threshold theta, kept from frame to frame (Faigl et al., Section III-B).
 class Theta {
   public:

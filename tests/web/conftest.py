@@ -42,7 +42,9 @@ class Played:
     def put(self, key: str, data: bytes) -> None:
         self.session.put(key, data)
 
-    def pose(self, robot: str, position: tuple[float, float, float], state: State = "tracked") -> None:
+    def pose(
+        self, robot: str, position: tuple[float, float, float], state: State = "tracked", key: str = ""
+    ) -> None:
         message = RobotPose(
             robot=robot,
             t_ns=time.time_ns(),
@@ -55,7 +57,7 @@ class Played:
             n_markers=3,
             latency=Latency(camera_ms=3.0, network_ms=0.2, wait_ms=4.0, fuse_ms=0.5, total_ms=7.7),
         )
-        self.put(self.keys.robot_pose(robot), encode(message))
+        self.put(self.keys.robot_pose(key or robot), encode(message))
 
     def markers(self, positions: list[tuple[float, float, float]]) -> None:
         n = len(positions)
@@ -66,8 +68,8 @@ class Played:
             position=np.array(positions, "<f8").tobytes(),
             covariance=np.zeros((n, 9), "<f4").tobytes(),
             normal=np.full((n, 3), np.nan, "<f4").tobytes(),
-            robot=np.array([0] + [-1] * (n - 1), "<i4").tobytes(),
-            marker=np.array([0] + [-1] * (n - 1), "<i4").tobytes(),
+            robot=np.array([0] * min(n, 1) + [-1] * (n - 1), "<i4").tobytes(),
+            marker=np.array([0] * min(n, 1) + [-1] * (n - 1), "<i4").tobytes(),
             cameras=np.ones(n, "<u8").tobytes(),
         )
         self.put(self.keys.markers, encode(message))

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What panel and status line say."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from conftest import Played, wait_for
+
+from web.coverage import Coverage
+from web.feed import Feed, Latest, Seen
+from web.tables import STALE_S, describe, describe_server, tabulate_cameras, tabulate_robots
+from web.trails import LENGTH, Trails, fade
+
+
+def test_the_tables_show_what_was_sent(played: Played, feed: Feed):
+    """Each figure stands in its column, and the covariance as millimetres."""
+    played.pose("rover", (0.5, -0.25, 0.125))
+    played.camera("north", advice="too dark")
+    played.status()
+    wait_for(lambda: (x := feed.latest()).poses and x.cameras and x.status)
+    latest = feed.latest()
+    assert tabulate_robots(latest).rows == [("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")]
+    cells = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1", "too dark")
+    assert tabulate_cameras(latest).rows == [cells]
+
+
+def test_names_are_escaped():
+    """A camera's name can't bring a script into the page."""
+    status = {"<script>": Seen(None, -1e9)}
+    html = tabulate_cameras(Latest(cameras=status)).html()
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html
+
+
+def test_a_silent_robot_is_away(played: Played, feed: Feed):
+    """A pose that is too old tells no state, whatever it says."""
+    played.pose("rover", (0, 0, 0))
+    wait_for(lambda: feed.latest().poses)
+    latest = feed.latest()
+    latest.poses["rover"] = replace(latest.poses["rover"], at=time.monotonic() - 2 * STALE_S)
+    assert tabulate_robots(latest).rows[0][1] == "away"
+    assert tabulate_robots(latest).hues == ["bad"]
+
+
+def test_the_status_line_of_nothing():
+    """An empty arena is told as one, on one line."""
+    assert describe(Latest()) == "no server answers yet | no camera | 0 placed | no robot | 0 faults"
+
+
+def test_a_server_that_left_is_told(played: Played, feed: Feed):
+    """Old figures are not shown as present ones."""
+    token = played.session.liveliness().declare_token(played.keys.fusion_alive)
+    played.status()
+    wait_for(lambda: feed.latest().status and feed.latest().server_alive)
+    assert describe_server(feed.latest()).startswith("30 instants/s, latency 7.7 ms")
+    token.undeclare()
+    wait_for(lambda: not feed.latest().server_alive)
+    assert describe_server(feed.latest()) == "the server is away"
+
+
+def test_coverage_counts_cells_and_ignores_the_outside(played: Played, feed: Feed):
+    """A detection at every cell's middle covers all; one outside the image covers nothing."""
+    grid = (np.arange(8) + 0.5) / 8
+    played.detections("north", [(640 * u - 0.5, 480 * v - 0.5) for u in grid for v in grid])
+    played.detections("east", [(-5.0, 10.0), (639.6, 10.0), (1e4, 1e4)])
+    wait_for(lambda: len(feed.latest().coverage) == 2)
+    coverage = feed.latest().coverage
+    assert coverage["north"].share == 1.0
+    assert coverage["east"].share == 0.0
+    assert coverage["north"].image().shape == (120, 160, 3)
+
+
+def test_coverage_of_an_odd_image():
+    """A line of pixels has a picture too."""
+    assert Coverage(32768, 1).image().shape == (1, 160, 3)
+    assert Coverage(1, 32768).image().shape == (640, 160, 3)
+
+
+def test_trails_are_bounded_and_end_at_the_robot():
+    """However long it drives, a trail has as many points; its last one is where the robot is."""
+    trails = Trails()
+    for k in range(5 * LENGTH):
+        trails.add("rover", (k, 0.0, 0.0))
+    trails.add("drone", (0.0, 1.0, 0.0))
+    segments = trails.segments(["rover", "drone"])
+    assert segments.shape == (2 * (LENGTH - 1), 2, 3)
+    assert segments[LENGTH - 2, 1].tolist() == [5 * LENGTH - 1, 0.0, 0.0]
+    assert (segments[1 : LENGTH - 1, 0] == segments[: LENGTH - 2, 1]).all(), "a trail is one line"
+    assert (segments[LENGTH - 1 :] == [0.0, 1.0, 0.0]).all()
+
+
+def test_fading_ends_in_the_robots_colour():
+    """From the background to the robot's own."""
+    colours = fade(np.array([[10, 200, 30], [0, 0, 255]], np.uint8), (5, 5, 5))
+    assert colours.shape == (2 * (LENGTH - 1), 2, 3)
+    assert colours[0, 0].tolist() == [5, 5, 5]
+    assert colours[LENGTH - 2, 1].tolist() == [10, 200, 30]
