@@ -25,9 +25,9 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     arena: str = "arena"
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    zenoh: Path | None = None
-    rig: Path | None = None
-    robots: Path = Path("robots.yaml")
+    zenoh: str | None = None
+    rig: str | None = None
+    robots: str = "robots.yaml"
     rate_hz: float | None = None
     limits: Limits = Limits()
 
@@ -48,14 +48,17 @@ def load_arena(path: Path) -> ArenaConfig:
     """
     config = load_yaml(path, ArenaConfig)
     found = {
-        name: path.parent / value for name in ("rig", "robots", "zenoh") if (value := getattr(config, name))
+        name: str(path.parent / value)
+        for name in ("rig", "robots", "zenoh")
+        if (value := getattr(config, name))
     }
     return override(config, **found)
 
 
 def override(config: ArenaConfig, **settings) -> ArenaConfig:
     """The config with those settings that are not None."""
+    given = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
     try:
-        return msgspec.structs.replace(config, **{k: v for k, v in settings.items() if v is not None})
+        return msgspec.structs.replace(config, **given)
     except ValueError as error:
         raise ConfigError(str(error)) from None

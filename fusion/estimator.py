@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Discs, Optics, measured_outlines
+from fusion.optics import Discs, Optics, measured_outlines, place
 from fusion.state import THETA, States, forget_turn, predict
 
 Array = NDArray[np.float64]
@@ -122,18 +122,18 @@ class Estimator:
     def _linearise(self, states: States, observations: Observations) -> _Rows:
         views = self.optics.view(states, observations.discs)
         L = np.linalg.cholesky(observations.cov)
-        A: Array = np.linalg.solve(L, views.jacobian)
-        b: Array = np.linalg.solve(L, (observations.uv - views.uv)[:, :, None])[:, :, 0]
+        A = np.asarray(np.linalg.solve(L, views.jacobian), float)
+        b = np.asarray(np.linalg.solve(L, (observations.uv - views.uv)[:, :, None]), float)[:, :, 0]
         known = np.isfinite(b).all(1)
         rows = _Rows(observations.discs.body[known], A[known], b[known])
-        shaped = self.single[observations.discs.body] & np.isfinite(observations.axes_px).all(1) & known
+        shaped = _needs_shapes(observations.discs) & np.isfinite(observations.axes_px).all(1) & known
         if not shaped.any():
             return rows
         shapes = self._linearise_shapes(states, observations.select(shaped))
         return _Rows(*(np.concatenate([getattr(rows, f), getattr(shapes, f)]) for f in rows.__slots__))
 
     def _linearise_shapes(self, states: States, seen: Observations) -> _Rows:
-        """How an outline is stretched tells a single marker's normal; its size, prone to blur, is left out."""
+        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
         e, turned = self._stretch(states, seen, np.zeros(3)), []
         for axis in np.eye(3)[:2]:
             turned.append((self._stretch(states, seen, STEP * axis) - e) / STEP)
@@ -146,9 +146,9 @@ class Estimator:
         """(N, 2) measured outline relative to the predicted one, bodies turned a little: its two shears."""
         delta = np.zeros((len(states), 12))
         delta[:, THETA] = turn
-        R = states.moved(delta).R[seen.discs.body]
-        centre = states.p[seen.discs.body] + states.v[seen.discs.body] * seen.discs.tau[:, None]
-        expected = self.optics.outlines(seen.discs.camera, centre, R[:, :, 2], seen.discs.radius)
+        _, _, normal, _ = place(states.moved(delta), seen.discs)
+        _, _, _, centre = place(states, seen.discs)
+        expected = self.optics.outlines(seen.discs.camera, centre, normal, seen.discs.radius)
         return shears(measured_outlines(seen.axes_px, seen.angle_rad), expected)
 
     @staticmethod
@@ -168,6 +168,13 @@ class Estimator:
         now = graph.eliminateSequential(ORDERING).at(1)
         root = np.linalg.inv(now.R())
         return root @ now.d(), root @ root.T
+
+
+def _needs_shapes(discs: Discs) -> NDArray[np.bool_]:
+    """(N,) discs of bodies of which fewer than three markers are seen."""
+    places = np.unique(np.column_stack([discs.body, discs.marker]), axis=0)
+    seen = np.bincount(places[:, 0].astype(np.intp), minlength=1)
+    return seen[discs.body] < 3
 
 
 def shears(measured: Array, expected: Array) -> Array:

@@ -62,8 +62,11 @@ def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -
     if not len(points):
         return []
     near, miss = _support(rays, points)
+    found = near.any(1)
+    near, miss, points = near[found], miss[found], points[found]
+    mean_miss = np.where(near, miss, 0).sum(1) / near.sum(1)
     markers, free = [], np.ones(len(rows), bool)
-    for k in np.lexsort((np.nanmean(np.where(near, miss, np.nan), 1), -near.sum(1))):
+    for k in np.lexsort((mean_miss, -near.sum(1))):
         members = np.flatnonzero(near[k])
         if free[members].all():
             markers.append(_triangulate(rays, members, points[k], rows))

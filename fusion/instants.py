@@ -11,6 +11,7 @@ from camera_node.messages import Detections
 from camera_node.roundels import Roundels
 
 LEARN_FRAMES = 8  # of one camera, from which its rate is learnt
+DEFAULT_NS = 33_333_333  # the period where no camera sent two frames
 GONE_NS = 500_000_000  # a camera silent for so long is not waited for
 MAX_GAP_NS = 2_000_000_000  # a longer silence of all cameras starts a new row of instants
 
@@ -63,6 +64,7 @@ class Instants:
     def __init__(self, period_ns: int | None = None, lateness_ns: int = 30_000_000) -> None:
         """Start empty; without `period_ns` the rate is that of the fastest camera, learnt from its first frames."""
         self.period_ns = period_ns
+        self._learns = period_ns is None
         self.lateness_ns = lateness_ns
         self._cameras: dict[str, _Camera] = {}
         self._waiting: list[Frame] = []
@@ -119,12 +121,25 @@ class Instants:
         if not self._waiting:
             return
         if not self.period_ns:
-            intervals = [c.interval_ns for c in self._cameras.values() if c.interval_ns > 0]
-            self.period_ns = min(intervals, default=33_333_333)
+            self.period_ns = self._fastest_ns() or DEFAULT_NS
         first = min(frame.t_ns for frame in self._waiting)
         middle = min(self._waiting, key=lambda frame: (frame.camera, frame.t_ns)).t_ns
         end = middle + self.period_ns // 2
         self._end_ns = end - (end - first - 1) // self.period_ns * self.period_ns
+
+    def _fastest_ns(self) -> int:
+        """The interval of the fastest camera that lives, 0 where none is known."""
+        live = (
+            c.interval_ns
+            for c in self._cameras.values()
+            if c.times and c.times[-1] > self._newest_ns - GONE_NS
+        )
+        return min((interval for interval in live if interval > 0), default=0)
+
+    def _has_changed(self, period_ns: int) -> bool:
+        """Whether cameras keep another rhythm than they did: in dim light, or on a busy machine."""
+        fastest = self._fastest_ns()
+        return fastest > 0 and not 0.75 < fastest / period_ns < 1.33
 
     def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[Instant]:
         """Cut what is due; without frames to come, go on for `silence_ns` so that robots are known to be lost."""
@@ -137,6 +152,8 @@ class Instants:
                 self._start()
                 continue
             closed.append(self._cut(self._end_ns, self.period_ns))
+            if self._learns and self._has_changed(self.period_ns):
+                self.period_ns = self._fastest_ns()
             self._end_ns += self.period_ns
         return closed
 

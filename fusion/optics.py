@@ -73,7 +73,7 @@ class Optics:
 
     def view(self, states: States, discs: Discs) -> Views:
         """See `Views`."""
-        R, arm, normal, centre = _place(states, discs)
+        R, arm, normal, centre = place(states, discs)
         R_cw = self.R_cam_world[discs.camera]
         to_disc = centre - self.centres[discs.camera]
         c, n = _rotate(R_cw, to_disc), _rotate(R_cw, normal)
@@ -123,7 +123,7 @@ def measured_outlines(axes_px: Array, angle_rad: Array) -> Array:
     return U @ (U.transpose(0, 2, 1) * (axes_px[:, :, None] / 2) ** 2)
 
 
-def _place(states: States, discs: Discs) -> tuple[Array, Array, Array, Array]:
+def place(states: States, discs: Discs) -> tuple[Array, Array, Array, Array]:
     """At each disc's own time: the body's rotation, and in the world the disc's arm, normal and centre."""
     body, tau = discs.body, discs.tau[:, None]
     R = exp_so3(states.omega[body] * tau) @ states.R[body]

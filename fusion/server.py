@@ -10,6 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import yaml
@@ -43,11 +44,11 @@ class Server:
     def __init__(self, config: ArenaConfig) -> None:
         self.config = config
         self.keys = Keys(config.arena)
-        self.robots = load_robots(config.robots)
+        self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
         self._rig: Rig | None = None
         self._tracker: Tracker | None = None
-        self._apply(load_rig(config.rig) if config.rig else None)
+        self._apply(load_rig(Path(config.rig)) if config.rig else None)
         self._messages: queue.Queue[tuple[Callable[[bytes, str, int], None], bytes, str, int]] = queue.Queue(
             QUEUE
         )
@@ -56,7 +57,9 @@ class Server:
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
-            self.session = stack.enter_context(open_router(self.config.listen, self.config.zenoh))
+            self.session = stack.enter_context(
+                open_router(self.config.listen, Path(self.config.zenoh) if self.config.zenoh else None)
+            )
             self._declare(stack)
             self._closing = stack.pop_all()
         log.info("arena '%s' listens on %s", self.config.arena, " ".join(self.config.listen))

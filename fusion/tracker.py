@@ -28,7 +28,7 @@ BIRTH_S = 1e-3  # the motion model needs a time to act over, however short
 BIRTH_ITERATIONS = 6
 MAX_CHI2 = 8.0  # mean squared Mahalanobis error of a birth, with SLACK_PX for the calibration
 SLACK_PX = 0.7
-HINT_SIGMA_M = 0.3  # of `start_m`
+HINT_SIGMA_M = 0.1  # of `start_m`
 REACH = 16.3  # chi-square with 3 degrees, one in a thousand: where a lost single marker may be found again
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 

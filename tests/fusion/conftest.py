@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Running frames through the tracker."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from synthetic import Arena
+
+from fusion.instants import Frame, Instants
+from fusion.messages import RobotPose
+from fusion.tracker import Fused, Limits, Tracker
+
+
+def fuse(arena: Arena, frames: list[Frame], limits: Limits | None = None) -> list[Fused]:
+    """All instants of the frames."""
+    tracker, instants = Tracker(arena.cameras, arena.robots, limits), Instants(33_333_333)
+    closed = []
+    for frame in frames:
+        instants.add(frame)
+        closed += instants.take(frame.t_ns)
+    return [tracker.fuse(instant) for instant in (*closed, *instants.finish())]
+
+
+def poses_of(fused: list[Fused], robot: str) -> list[RobotPose]:
+    """The robot's poses, whatever their state."""
+    return [pose for instant in fused for pose in instant.poses if pose.robot == robot]
+
+
+def errors(arena: Arena, poses: list[RobotPose]) -> np.ndarray:
+    """(N, 6) rotation (body) and position errors of poses."""
+    from camera_node.pose import rotation_from_wxyz
+
+    rows = []
+    for pose in poses:
+        R, p = arena.truth(pose.robot, pose.t_ns)
+        E = R.T @ rotation_from_wxyz(pose.quaternion_wxyz)
+        rows.append([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1], *2 * (pose.position - p)])
+    return np.array(rows).reshape(-1, 6) / 2
+
+
+@pytest.fixture
+def run_arena() -> Callable[..., tuple[list[Fused], Callable[[str], list[RobotPose]]]]:
+    """`run_arena(arena, n)`: the fused instants of n frames a camera, and a function robot -> its poses."""
+
+    def run(arena: Arena, n: int = 30, limits: Limits | None = None):
+        fused = fuse(arena, arena.frames(n), limits)
+        return fused, lambda robot: poses_of(fused, robot)
+
+    return run

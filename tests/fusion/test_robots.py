@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Robots that nothing could tell apart are refused, with the reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.errors import ConfigError
+from fusion.errors import FusionError
+from fusion.robots import Robot, load_robots, require_distinct
+
+ROOT = Path(__file__).resolve().parents[2]
+SQUARE = ((0.1, 0.1, 0.0), (-0.1, 0.1, 0.0), (-0.1, -0.1, 0.0), (0.1, -0.1, 0.0))
+SCALENE = ((0.15, 0.0, 0.0), (-0.13, 0.14, 0.0), (-0.03, -0.14, 0.0))
+
+
+def polygon(n: int) -> tuple:
+    a = 2 * np.pi * np.arange(n) / n
+    return tuple(map(tuple, np.column_stack([0.15 * np.cos(a), 0.15 * np.sin(a), 0 * a]).tolist()))
+
+
+@pytest.mark.parametrize("markers", [polygon(3), SQUARE, polygon(5)])
+def test_a_constellation_that_looks_the_same_when_turned_is_refused(markers):
+    with pytest.raises(
+        FusionError, match=r"'a' looks the same when turned.*move a marker until.*10 mm or more"
+    ):
+        require_distinct({"a": Robot(diameter_m=0.1, markers=markers)})
+
+
+def test_robots_too_alike_are_refused_and_other_sizes_are_not():
+    a = Robot(diameter_m=0.1, markers=SCALENE)
+    moved = tuple((x + 0.002, y, z) for x, y, z in SCALENE)
+    with pytest.raises(FusionError, match="'a' and 'b' are too alike"):
+        require_distinct({"a": a, "b": Robot(diameter_m=0.1, markers=moved)})
+    require_distinct({"a": a, "b": Robot(diameter_m=0.14, markers=moved)})
+
+
+def test_a_mirror_symmetry_is_harmless_for_the_print_faces_one_way():
+    require_distinct({"a": Robot(diameter_m=0.1, markers=((0.2, 0, 0), (0, 0.1, 0), (0, -0.1, 0)))})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("robots: {}", "declares no robot"),
+        ("robots: {a: {diameter_m: 0.1, colour: red}}", "colour"),
+        ("robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [1, 0, 0]]}}", "third"),
+        ("robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [1, 0, 0], [2, 0, 0]]}}", "one line"),
+        ("robots: {'a/b': {diameter_m: 0.1}}", "can't name a robot"),
+    ],
+)
+def test_what_is_no_robot_is_said(tmp_path, text, said):
+    path = tmp_path / "robots.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        load_robots(path)
+
+
+@pytest.mark.parametrize("name", ["configs/robots.yaml", "configs/demo/robots.yaml"])
+def test_the_examples_work(name):
+    assert load_robots(ROOT / name)

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Properties of tracking: exact without noise, honest with it, nobody swapped, nothing guessed."""
+
+import numpy as np
+import pytest
+from conftest import errors, fuse
+from synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
+
+from fusion.instants import Frame
+from fusion.tracker import Limits
+
+TIGHT = Limits(sigma_floor_px=1e-3)
+MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), tilt=(0.1, -0.2, 0.4))
+
+
+@pytest.mark.parametrize("motion", [line((0.3, 0.1, 0.2), tilt=(0.2, 0.1, 0.5)), MOVING])
+def test_exact_without_noise_though_cameras_run_free(run_arena, motion):
+    """Uniform motion is in the model, so what remains after the start is linearisation and the lens over a disc:
+    a distorted ellipse's centre is 1e-3 px off."""
+    arena = Arena({"a": TRIANGLE}, {"a": motion})
+    _, poses = run_arena(arena, limits=TIGHT)
+    late = poses("a")[10:]
+    error = errors(arena, late)
+    assert len(late) >= 19
+    assert np.abs(error[:, 3:]).max() < 5e-5
+    assert np.abs(error[:, :3]).max() < 5e-4
+    _, p = arena.truth("a", late[-1].t_ns)
+    velocity = (arena.truth("a", late[-1].t_ns + 10**6)[1] - p) / 1e-3
+    assert np.abs(late[-1].velocity - velocity).max() < 0.01
+
+
+def test_free_running_cameras_cost_nothing(run_arena):
+    """With the same noise, the accuracy of cameras that fire apart is that of cameras that fire together."""
+    rms = []
+    for phases in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.27, -0.41, 0.38)):
+        arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.05, phases=phases)
+        _, poses = run_arena(arena, 40)
+        rms.append(np.sqrt((errors(arena, poses("a")[5:])[:, 3:] ** 2).sum(1).mean()))
+    assert rms[1] < 2 * rms[0]
+    assert rms[1] < 1e-3
+
+
+def test_published_covariance_is_honest():
+    """Squared Mahalanobis errors of the last of several instants follow chi-square with 6 degrees: the mean of 60
+    runs is 6 +- 4 sqrt(12 / 60)."""
+    squares, positions = [], []
+    for seed in range(60):
+        arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.1, seed=seed)
+        pose = fuse(arena, arena.frames(5), Limits(sigma_floor_px=1e-3))[-2].poses[0]
+        e, P = errors(arena, [pose])[0], pose.covariance_matrix
+        squares.append(e @ np.linalg.solve(P[:6, :6], e))
+        positions.append(e[3:] @ np.linalg.solve(P[3:6, 3:6], e[3:]))
+    assert np.mean(squares) == pytest.approx(6, abs=4 * np.sqrt(12 / 60))
+    assert np.mean(positions) == pytest.approx(3, abs=4 * np.sqrt(6 / 60))
+
+
+def test_several_robots_are_found_at_once_among_false_detections(run_arena):
+    arena = Arena(
+        {"a": TRIANGLE, "b": WIDE},
+        {"a": line((-0.5, 0.3, 0.15), (0.3, 0, 0)), "b": line((0.5, -0.2, 0.6), (0, 0.3, 0))},
+        sigma_px=0.05,
+        distractors=4,
+    )
+    fused, poses = run_arena(arena)
+    for robot in "ab":
+        assert len(poses(robot)) >= len(fused) - 2
+        assert np.abs(errors(arena, poses(robot)[3:])[:, 3:]).max() < 3e-3
+
+
+def test_crossing_robots_are_not_swapped(run_arena):
+    """They pass over each other 0.3 m apart, so that each hides among the other's markers in some images."""
+    arena = Arena(
+        {"a": TRIANGLE, "b": WIDE, "c": SINGLE},
+        {
+            "a": line((-0.6, 0.0, 0.15), (1.2, 0, 0)),
+            "b": line((0.6, 0.05, 0.45), (-1.2, 0, 0)),
+            "c": line((-0.1, 0.6, 0.8), (0, -1.2, 0)),
+        },
+        sigma_px=0.05,
+    )
+    _, poses = run_arena(arena)
+    for robot in "abc":
+        assert len(poses(robot)) >= 26
+        assert np.abs(errors(arena, poses(robot)[3:])[:, 3:]).max() < 5e-3
+
+
+def test_a_hidden_robot_coasts_is_lost_and_comes_back(run_arena):
+    arena = Arena(
+        {"a": TRIANGLE},
+        {"a": line((0.0, 0.0, 0.2), (0.2, 0, 0))},
+        sigma_px=0.05,
+        hidden=lambda robot, marker, t: 0.5 < t < 1.2,
+    )
+    _, poses = run_arena(arena, 60)
+    states = [pose.state for pose in poses("a")]
+    order = [state for k, state in enumerate(states) if k == 0 or states[k - 1] != state]
+    assert order == ["tracked", "coasting", "lost", "tracked"]
+    lost = [p for p in poses("a") if p.state == "lost"]
+    grown = [np.trace(p.covariance_matrix[3:6, 3:6]) for p in lost]
+    assert (np.diff(grown) > 0).all()
+    assert np.abs(errors(arena, poses("a")[-5:])[:, 3:]).max() < 3e-3
+
+
+def test_two_visible_markers_keep_a_constellation_tracked(run_arena):
+    arena = Arena(
+        {"a": TRIANGLE},
+        {"a": line((0.0, 0.0, 0.2), (0.3, 0.1, 0), (0, 0, 0.5))},
+        sigma_px=0.05,
+        hidden=lambda robot, marker, t: marker == 1 and t > 0.4,
+    )
+    _, poses = run_arena(arena, 40)
+    late = poses("a")[-10:]
+    assert {(pose.state, pose.n_markers) for pose in late} == {("tracked", 2)}
+    assert np.abs(errors(arena, late)[:, 3:]).max() < 5e-3
+
+
+def test_two_of_three_markers_find_no_robot(run_arena):
+    arena = Arena(
+        {"a": TRIANGLE}, {"a": line((0, 0, 0.2))}, sigma_px=0.05, hidden=lambda robot, marker, t: marker == 1
+    )
+    fused, poses = run_arena(arena, 10)
+    assert poses("a") == []
+    assert (fused[5].markers.robot_index() == -1).sum() == 2
+
+
+def test_a_single_marker_has_a_place_and_a_normal_and_says_that_its_turn_is_unknown(run_arena):
+    arena = Arena(
+        {"c": SINGLE}, {"c": line((0.1, 0.2, 0.3), (0.5, 0, 0), tilt=(0.35, -0.1, 0))}, sigma_px=0.03
+    )
+    _, poses = run_arena(arena)
+    late = poses("c")[10:]
+    assert np.abs(errors(arena, late)[:, 3:]).max() < 3e-3
+    from camera_node.pose import rotation_from_wxyz
+
+    for pose in late:
+        true, got = arena.truth("c", pose.t_ns)[0][:, 2], rotation_from_wxyz(pose.quaternion_wxyz)[:, 2]
+        assert np.degrees(np.arccos(np.clip(true @ got, -1, 1))) < 6
+        assert pose.covariance_matrix[2, 2] > 9
+
+
+def test_single_markers_that_nothing_tells_apart_stay_unlabelled(run_arena):
+    arena = Arena({"c": SINGLE, "d": SINGLE}, {"c": line((0.3, 0, 0.2)), "d": line((-0.3, 0, 0.2))})
+    fused, poses = run_arena(arena, 8)
+    assert poses("c") == poses("d") == []
+    assert len(fused[4].markers) == 2
+
+
+def test_a_known_start_tells_single_markers_apart(run_arena):
+    robots = {
+        "c": SINGLE.__class__(diameter_m=0.12, start_m=(0.3, 0.0, 0.2)),
+        "d": SINGLE.__class__(diameter_m=0.12, start_m=(-0.3, 0.0, 0.2)),
+    }
+    arena = Arena(robots, {"c": line((0.35, 0, 0.2)), "d": line((-0.3, 0.1, 0.2))}, sigma_px=0.05)
+    _, poses = run_arena(arena, 8)
+    assert np.abs(errors(arena, poses("c") + poses("d"))[:, 3:]).max() < 3e-3
+
+
+def test_detections_without_axes_are_enough(run_arena):
+    """As out of observations.csv: geometry alone matches the views."""
+    arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.05)
+    frames = []
+    for frame in arena.frames(20):
+        roundels = frame.roundels
+        bare = type(roundels).from_points(roundels.uv, 0.3)
+        frames.append(Frame(frame.camera, frame.t_ns, bare))
+    fused = fuse(arena, frames)
+    tracked = [pose for instant in fused for pose in instant.poses]
+    assert len(tracked) >= 17
+    assert np.abs(errors(arena, tracked[3:])[:, 3:]).max() < 5e-3
