@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command line: `python -m fusion` is the live server, `python -m fusion run` fuses a recording."""
+
+import logging
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from camera_node.errors import run
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Fuse what an arena's cameras publish into robot poses, until stopped; holds the arena's Zenoh router.
+
+    For recordings: python -m fusion run --help
+    """
+
+    config: Path | None = None
+    """arena.yaml; the options below override it."""
+    arena: str | None = None
+    """The arena's name, the first part of all Zenoh keys."""
+    listen: tuple[str, ...] | None = None
+    """Zenoh endpoints to listen on, such as tcp/0.0.0.0:7447."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+    rig: Path | None = None
+    """rig.yaml; without one the server waits for a calibration to be published."""
+    robots: Path | None = None
+    """robots.yaml."""
+    rate_hz: float | None = None
+    """Instants a second; those of the fastest camera unless given."""
+
+    def run(self) -> int:
+        """Serve until Ctrl-C or SIGTERM."""
+        from dataclasses import asdict
+
+        from fusion.config import ArenaConfig, load_arena, override
+        from fusion.server import Server
+
+        settings = asdict(self)
+        path = settings.pop("config")
+        config = override(load_arena(path) if path else ArenaConfig(), **settings)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            with Server(config) as server:
+                server.run()
+        except KeyboardInterrupt:
+            pass
+        return 0
+
+
+def main() -> None:
+    """The entry point of `roundel-fusion`."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
+    run(_program)
+
+
+def _program() -> int:
+    arguments = sys.argv[1:]
+    if arguments[:1] == ["run"]:
+        from fusion.offline import run as run_offline
+
+        return tyro.cli(run_offline, prog="fusion run", args=arguments[1:])
+    return tyro.cli(Serve, prog="fusion", args=arguments).run()
+
+
+if __name__ == "__main__":
+    main()

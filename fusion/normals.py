@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which way a single marker faces: the normal that explains the outlines of all views at once."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.association import Sightings
+from fusion.estimator import AXIS_SIGMA_PX, shears
+from fusion.grouping import Marker
+from fusion.optics import Optics, measured_outlines
+
+Array = NDArray[np.float64]
+DIRECTIONS = 600  # over the sphere, about 9 degrees apart: the estimator does the rest
+CLEARLY = 9.0  # chi-square by which a normal elsewhere must be worse
+ELSEWHERE = np.cos(np.radians(40))
+
+
+def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: float) -> Array | None:
+    """The unit normal (3,) in the world, or None where the views do not settle it."""
+    seen = sightings.select(marker.sightings)
+    seen = seen.select(np.flatnonzero(np.isfinite(seen.axes_px).all(1)))
+    normals = fibonacci_sphere(DIRECTIONS)
+    to = optics.centres[seen.camera] - marker.position
+    normals = normals[(normals @ to.T > 0).all(1)]
+    if not len(seen) or not len(normals):
+        return None
+    n, v = len(normals), len(seen)
+    expected = optics.outlines(
+        np.tile(seen.camera, n),
+        np.tile(marker.position, (n * v, 1)),
+        np.repeat(normals, v, 0),
+        np.full(n * v, radius),
+    )
+    measured = np.tile(measured_outlines(seen.axes_px, seen.angle_rad), (n, 1, 1))
+    sigma = 2 * AXIS_SIGMA_PX / seen.axes_px[:, 1]
+    chi2 = ((shears(measured, expected).reshape(n, v, 2) / sigma[:, None]) ** 2).sum((1, 2))
+    best = int(np.argmin(chi2))
+    elsewhere = chi2[normals @ normals[best] < ELSEWHERE]
+    return normals[best] if not len(elsewhere) or elsewhere.min() > chi2[best] + CLEARLY else None
+
+
+def fibonacci_sphere(n: int) -> Array:
+    """(n, 3) unit vectors spread evenly (Gonzalez 2010)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    r = np.sqrt(1 - z * z)
+    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+def rotation_to(normal: Array) -> Array:
+    """The (3, 3) rotation of least angle that brings +z to `normal` (3,)."""
+    x, y, z = normal
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    V = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
+    return np.eye(3) + V + V @ V / (1 + z)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Robots as people declare them in `robots.yaml`; those that nothing could tell apart are refused.
+
+A constellation is known by the distances between its markers. A labelling that only a mirror could bring about is
+harmless: it would turn the printed sides away from the cameras.
+"""
+
+from collections.abc import Iterator
+from itertools import combinations, permutations
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.body import Body
+from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
+from fusion.errors import FusionError
+
+Array = NDArray[np.float64]
+DISTINCT_M = 0.010  # two labellings must differ by this in some distance: several sigma of a triangulated one
+SIZES_DIFFER = 1.25  # diameters in this ratio are told apart by apparent size
+MAX_MARKERS = 7  # keeps the comparison of all labellings at load, and the search live, in milliseconds
+MANOEUVRE_S = 0.1  # how long an acceleration lasts, to turn its size into the density of white noise
+
+
+class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How violently a robot moves: typical accelerations, each lasting about `MANOEUVRE_S`."""
+
+    acceleration_m_s2: float
+    angular_acceleration_rad_s2: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.acceleration_m_s2 < 1e4 and 0 < self.angular_acceleration_rad_s2 < 1e5):
+            raise ValueError("accelerations of a motion must be above 0")
+
+    @property
+    def densities(self) -> tuple[float, float]:
+        """Power spectral densities of white acceleration: angular rad^2/s^3, linear m^2/s^3."""
+        return (
+            self.angular_acceleration_rad_s2**2 * MANOEUVRE_S,
+            self.acceleration_m_s2**2 * MANOEUVRE_S,
+        )
+
+
+MOTIONS = {"ground": Motion(3.0, 15.0), "aerial": Motion(10.0, 40.0)}
+
+
+class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A body that moves.
+
+    Attributes:
+        motion: `aerial` (also what a hand does), the calmer `ground`, or the accelerations themselves.
+        start_m: roughly where a robot of one marker stands at first; what tells such robots of one size apart.
+    """
+
+    motion: Literal["ground", "aerial"] | Motion = "aerial"
+    start_m: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.markers) > MAX_MARKERS:
+            raise ValueError(f"a robot has {MAX_MARKERS} markers at the most")
+        if len(self.markers) > 1 and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2:
+            raise ValueError(
+                "markers on one line (or only two) leave the turn about it unknown; "
+                "place a third 20 mm or more off the line, or use a single marker"
+            )
+
+    @property
+    def is_single(self) -> bool:
+        return len(self.markers) == 1
+
+    @property
+    def densities(self) -> tuple[float, float]:
+        """Those of its motion: see `Motion.densities`."""
+        return (MOTIONS[self.motion] if isinstance(self.motion, str) else self.motion).densities
+
+
+class _Robots(msgspec.Struct, forbid_unknown_fields=True):
+    robots: dict[str, Robot]
+
+
+def load_robots(path: Path) -> dict[str, Robot]:
+    """Read `robots.yaml`.
+
+    Raises:
+        ConfigError: the file is missing or broken, or declares no robot.
+        FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
+    """
+    robots = load_yaml(path, _Robots).robots
+    if not robots:
+        raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
+    if bad := [name for name in robots if not name or set(name) & set("/*$#? ")]:
+        raise ConfigError(f"{path}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
+    require_distinct(robots, str(path))
+    return robots
+
+
+def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:
+    """Raise FusionError if a robot looks the same when turned, or two robots can't be told apart."""
+    for name, robot in robots.items():
+        if fault := _likeness(robot, robot):
+            raise FusionError(f"{where}: robot '{name}' looks the same when turned: {fault}")
+    for (name_a, a), (name_b, b) in combinations(robots.items(), 2):
+        if max(a.diameter_m, b.diameter_m) > SIZES_DIFFER * min(a.diameter_m, b.diameter_m):
+            continue
+        if a.is_single or b.is_single:
+            continue
+        small, large = (a, b) if len(a.markers) <= len(b.markers) else (b, a)
+        if fault := _likeness(small, large):
+            raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are too alike: {fault}")
+
+
+def distances(points: Array) -> Array:
+    """(M, M) distances between points (M, 3)."""
+    return np.linalg.norm(points[:, None] - points[None], axis=2)
+
+
+def align(a: Array, b: Array) -> tuple[Array, Array]:
+    """The rotation (3, 3) and translation (3,) that bring points a (M, 3) nearest to b (Kabsch 1976)."""
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    U, _, Vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    return R, mean_b - R @ mean_a
+
+
+def _likeness(small: Robot, large: Robot) -> str | None:
+    """How `small` could be taken for markers of `large`, in another order if they are the same robot."""
+    D, E = distances(small.points), distances(large.points)
+    for order in _labellings(small, large):
+        worst = np.abs(D - E[np.ix_(order, order)])
+        if worst.max() < DISTINCT_M and align(small.points, large.points[list(order)])[0][2, 2] > 0:
+            return _explain(D, E, order, worst)
+    return None
+
+
+def _labellings(small: Robot, large: Robot) -> Iterator[tuple[int, ...]]:
+    orders = permutations(range(len(large.markers)), len(small.markers))
+    same = tuple(range(len(small.markers)))
+    return (order for order in orders if not (small is large and order == same))
+
+
+def _explain(D: Array, E: Array, order: tuple[int, ...], worst: Array) -> str:
+    i, j = np.unravel_index(np.argmax(worst), worst.shape)
+    a, b = sorted((order[i], order[j]))
+    return (
+        f"the distance of markers {i} and {j} ({D[i, j] * 1e3:.1f} mm) and that of {a} and {b} "
+        f"({E[a, b] * 1e3:.1f} mm) differ most of all, by {worst[i, j] * 1e3:.1f} mm; move a marker until "
+        f"they differ by {DISTINCT_M * 1e3:.0f} mm or more"
+    )

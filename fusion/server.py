@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The live server: the arena's router and clock; detections in, robot poses out.
+
+Zenoh's callbacks only enqueue; one thread, that of `Server.run`, decodes, fuses and publishes.
+"""
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import yaml
+import zenoh
+
+from calib.messages import RigMessage
+from calib.rig import Rig, dump_rig, load_rig
+from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
+from camera_node.network import open_router
+from fusion.config import ArenaConfig
+from fusion.health import Health
+from fusion.instants import Frame, Instant, Instants
+from fusion.messages import Latency, State
+from fusion.robots import load_robots
+from fusion.tracker import Fused, Tracker
+
+log = logging.getLogger("fusion")
+QUEUE = 2000  # messages: seconds of a large arena
+FAR_NS = 5_000_000_000  # a capture time so far from now is a fault
+TICK_S = 0.005  # how finely the end of a wait is met
+
+
+class Server:
+    """One arena's server; a context manager. `run` serves until `stop` or an exception such as Ctrl-C.
+
+    Raises, at entry:
+        NetworkError: an endpoint is taken.
+        ConfigError, FusionError, CalibrationError: a file is missing, broken, or declares what can't be tracked.
+    """
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self.config = config
+        self.keys = Keys(config.arena)
+        self.robots = load_robots(Path(config.robots))
+        self.health = Health(config.limits.lateness_ms)
+        self._rig: Rig | None = None
+        self._tracker: Tracker | None = None
+        self._apply(load_rig(Path(config.rig)) if config.rig else None)
+        self._messages: queue.Queue[tuple[Callable[[bytes, str, int], None], bytes, str, int]] = queue.Queue(
+            QUEUE
+        )
+        self._stopped = threading.Event()
+        self._closing = contextlib.ExitStack()
+
+    def __enter__(self) -> "Server":
+        with self._closing as stack:
+            self.session = stack.enter_context(
+                open_router(self.config.listen, Path(self.config.zenoh) if self.config.zenoh else None)
+            )
+            self._declare(stack)
+            self._closing = stack.pop_all()
+        log.info("arena '%s' listens on %s", self.config.arena, " ".join(self.config.listen))
+        if self._tracker is None:
+            log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._closing.close()
+
+    def stop(self) -> None:
+        """Let `run` return; callable from any thread."""
+        self._stopped.set()
+
+    def run(self) -> None:
+        """Serve."""
+        while not self._stopped.is_set():
+            with contextlib.suppress(queue.Empty):
+                take, data, key, received_ns = self._messages.get(timeout=TICK_S)
+                take(data, key, received_ns)
+            now_ns = time.time_ns()
+            for instant in self._instants.take(now_ns):
+                self._fuse(instant)
+            if status := self.health.status(now_ns, self._calibrated(), self._instants.late):
+                self._publish(self.keys.fusion_status, status)
+
+    def _declare(self, stack: contextlib.ExitStack) -> None:
+        keys, session = self.keys, self.session
+        detections = self._enqueue(self._take_detections)
+        rig = self._enqueue(self._take_rig)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        stack.callback(session.declare_queryable(keys.clock, self._answer_clock).undeclare)
+        stack.callback(session.declare_queryable(keys.rig, self._answer_rig).undeclare)
+        stack.callback(session.declare_subscriber(keys.detections(), detections).undeclare)
+        stack.callback(session.declare_subscriber(keys.rig, rig).undeclare)
+        stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
+
+    def _enqueue(self, take: Callable[[bytes, str, int], None]) -> Callable[[zenoh.Sample], None]:
+        """A callback that only enqueues: whatever else it did would stall the link."""
+
+        def callback(sample: zenoh.Sample) -> None:
+            try:
+                entry = (take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns())
+                self._messages.put_nowait(entry)
+            except queue.Full:
+                self.health.count("queue full")
+
+        return callback
+
+    def _publish(self, key: str, message: msgspec.Struct) -> None:
+        if key not in self._publishers:
+            self._publishers[key] = self.session.declare_publisher(key)
+        self._publishers[key].put(encode(message))
+
+    # What arrives.
+
+    def _take_detections(self, data: bytes, key: str, received_ns: int) -> None:
+        try:
+            message = decode(data, Detections)
+            if key != self.keys.detections(message.camera):
+                raise MessageError("of another camera than its key")
+        except MessageError:
+            self.health.count("detections that are no message")
+            return
+        if abs(message.t_ns - received_ns) > FAR_NS:
+            self.health.count("implausible time")
+            return
+        if self.health.arrived(message.camera, message.t_ns, received_ns):
+            self._add(message, received_ns)
+
+    def _add(self, message: Detections, received_ns: int) -> None:
+        if self._tracker is None or self._rig is None:
+            return
+        camera = self._rig.placed().get(message.camera)
+        if camera is None:
+            self.health.count("unknown camera")
+        elif (message.width, message.height) != (camera.width, camera.height):
+            self.health.count("wrong image size")
+        else:
+            frame = Frame.of(message, camera.time_offset_ms, received_ns)
+            self.health.noted(message.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
+
+    def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
+        try:
+            message = decode(data, RigMessage)
+            self._apply(msgspec.yaml.decode(message.yaml, type=Rig))
+        except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+            self.health.count("rig that is no rig")
+            log.warning(
+                "a published rig is refused, the old one stays: %s", " ".join(str(error).split())[:200]
+            )
+
+    def _apply(self, rig: Rig | None) -> None:
+        """Put a calibration in force; robots are found anew."""
+        placed = rig.placed() if rig else {}
+        tracker = Tracker(placed, self.robots, self.config.limits) if placed else None
+        self._rig, self._tracker = rig, tracker
+        rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
+        self._instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
+        if placed:
+            log.info("calibration in force: %s", ", ".join(placed))
+
+    def _calibrated(self) -> set[str]:
+        return set(self._rig.placed()) if self._rig else set()
+
+    # What is answered.
+
+    def _answer_clock(self, query: zenoh.Query) -> None:
+        query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns())))
+
+    def _answer_rig(self, query: zenoh.Query) -> None:
+        rig = self._rig
+        if rig is not None:
+            query.reply(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+
+    # What is told.
+
+    def _fuse(self, instant: Instant) -> None:
+        if self._tracker is None:
+            return
+        begun_ns = time.time_ns()
+        fused = self._tracker.fuse(instant)
+        latency = _latency(instant, begun_ns, time.time_ns())
+        for pose in fused.poses:
+            told = msgspec.structs.replace(pose, latency=latency)
+            self._publish(self.keys.robot_pose(pose.robot), told)
+        self._publish(self.keys.markers, fused.markers)
+        self._note(fused, latency)
+
+    def _note(self, fused: Fused, latency: Latency | None) -> None:
+        states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
+        self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
+
+
+def _latency(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
+    """Where the time went since the newest exposure; None for an instant without frames."""
+    newest = max(instant.frames, key=lambda frame: frame.t_ns, default=None)
+    if newest is None:
+        return None
+    sent_ns = newest.sent_ns or newest.received_ns
+    return Latency(
+        camera_ms=(sent_ns - newest.t_ns) * 1e-6,
+        network_ms=(newest.received_ns - sent_ns) * 1e-6,
+        wait_ms=(begun_ns - newest.received_ns) * 1e-6,
+        fuse_ms=(done_ns - begun_ns) * 1e-6,
+        total_ms=(done_ns - newest.t_ns) * 1e-6,
+    )

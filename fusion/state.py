@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where robots are and how they move: a batch of rigid bodies with covariance, and their motion model.
+
+The error of a state is (delta theta, delta p, delta omega, delta v): R exp(delta theta) in the body's frame, the rest
+added in the world. White noise on acceleration (Bar-Shalom et al. 2001, section 6.2.2) drives it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+UNKNOWN_TURN = np.pi**2  # variance of a turn about the normal that nothing tells, rad^2
+UNKNOWN_RATE = 10.0**2  # variance of a turning rate that nothing tells, rad^2/s^2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """N bodies: R (N, 3, 3) and p (N, 3) in the world, omega and v (N, 3) in the world, P (N, 12, 12)."""
+
+    R: Array
+    p: Array
+    omega: Array
+    v: Array
+    P: Array
+
+    @classmethod
+    def at_rest(cls, R: Array, p: Array, sigmas: tuple[float, float, float, float]) -> "States":
+        """Bodies at R, p and without motion, to the standard deviations of theta, p, omega and v."""
+        n = len(p)
+        P = np.tile(np.diag(np.repeat(np.square(sigmas), 3)), (n, 1, 1))
+        return cls(R.copy(), p.copy(), np.zeros((n, 3)), np.zeros((n, 3)), P)
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def select(self, rows: NDArray) -> "States":
+        """The rows that a mask or an index array names."""
+        return States(self.R[rows], self.p[rows], self.omega[rows], self.v[rows], self.P[rows])
+
+    def store(self, rows: NDArray, other: "States") -> None:
+        """Overwrite rows, in place."""
+        for name in self.__slots__:
+            getattr(self, name)[rows] = getattr(other, name)
+
+    def moved(self, delta: Array) -> "States":
+        """The states displaced by errors (N, 12)."""
+        return States(
+            self.R @ exp_so3(delta[:, THETA]),
+            self.p + delta[:, POSITION],
+            self.omega + delta[:, OMEGA],
+            self.v + delta[:, VELOCITY],
+            self.P,
+        )
+
+
+def predict(
+    states: States, dt: Array, densities: Array, single: NDArray[np.bool_]
+) -> tuple[States, Array, Array]:
+    """Where bodies are after `dt` (N,) seconds.
+
+    Args:
+        states: N bodies.
+        dt: seconds each.
+        densities: (N, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+        single: (N,) bodies of one marker: their normal wanders, and no turning rate is claimed.
+
+    Returns:
+        the predicted states; F (N, 12, 12), how an error moves; Q (N, 12, 12), the noise added.
+    """
+    half = exp_so3(states.omega * dt[:, None] / 2)
+    R_half = half @ states.R
+    turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
+    F = np.tile(np.eye(12), (len(states), 1, 1))
+    F[:, THETA, OMEGA] = turn
+    F[:, POSITION, VELOCITY] = dt[:, None, None] * np.eye(3)
+    Q = _noise(dt, densities, R_half)
+    P = F @ states.P @ F.transpose(0, 2, 1) + Q
+    moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
+    return moved, F, Q
+
+
+def forget_turn(P: Array) -> Array:
+    """Covariances (N, 12, 12) of one-marker bodies, their turn about the normal and turning rate unknown again."""
+    P = P.copy()
+    unknown = [2, 6, 7, 8]
+    P[:, unknown, :] = 0
+    P[:, :, unknown] = 0
+    P[:, unknown, unknown] = [UNKNOWN_TURN, UNKNOWN_RATE, UNKNOWN_RATE, UNKNOWN_RATE]
+    return P
+
+
+def exp_so3(vectors: Array) -> Array:
+    """(N, 3, 3) rotations by vectors (N, 3): Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    W = skew(vectors)
+    return np.eye(3) + np.sinc(angle / np.pi) * W + np.sinc(angle / (2 * np.pi)) ** 2 / 2 * (W @ W)
+
+
+def skew(vectors: Array) -> Array:
+    """(..., 3, 3) matrices [v]x of vectors (..., 3): [v]x w = v x w."""
+    W = np.zeros((*vectors.shape, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
+    return W - np.swapaxes(W, -1, -2)
+
+
+def _noise(dt: Array, densities: Array, R_half: Array) -> Array:
+    """(N, 12, 12) of white noise on acceleration: q [dt^3/3, dt^2/2; dt^2/2, dt]."""
+    Q = np.zeros((len(dt), 12, 12))
+    i = np.arange(3)
+    for k, (place, rate) in enumerate(((THETA, OMEGA), (POSITION, VELOCITY))):
+        q = densities[:, k]
+        Q[:, place.start + i, place.start + i] = (q * dt**3 / 3)[:, None]
+        Q[:, rate.start + i, rate.start + i] = (q * dt)[:, None]
+        turn = R_half.transpose(0, 2, 1) if place is THETA else np.eye(3)
+        Q[:, place, rate] = (q * dt**2 / 2)[:, None, None] * turn
+        Q[:, rate, place] = np.swapaxes(Q[:, place, rate], 1, 2)
+    return Q
