@@ -36,6 +36,7 @@ constexpr int kMaxPixels = 1200;  // larger roundels are sampled on a coarser gr
 constexpr int kMaxIterations = 12;
 constexpr double kStep = 1e-3;     // pixels: a smaller step ends the iteration
 constexpr double kNoiseFloor = 1;  // grey levels
+constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kTukey = 6;       // standard deviations from which on a pixel does not count
 constexpr double kCardRatio = 9.0 / 7;
 
@@ -187,6 +188,7 @@ class Solver {
             double moved = 0;
             for (int i = 0; i < kCount; ++i) p[i] += delta[i];
             for (int i = 0; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
+            p[kBlur] = std::max(p[kBlur], kMinBlur);
             if (!is_sane()) return false;
             if (moved < kStep) return true;
         }
@@ -253,8 +255,7 @@ class Solver {
         const double area = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
         return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * size && p[kAxx] > 0 &&
                std::sqrt(std::max(area, 0.0)) > 0.7 * size && std::sqrt(std::max(area, 0.0)) < 1.4 * size &&
-               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] > 0.2 && p[kBlur] < 3 + 0.1 * size &&
-               p[kCard] > 1;
+               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * size && p[kCard] > 1;
     }
 
     const std::vector<Pixel>& pixels_;
@@ -279,7 +280,7 @@ std::optional<Fit> refine(const ImageView& image, const Start& start) {
     const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
     // Perspective moves a circle's centre by its radius squared: the inner circle's image tells that of
     // radius nought.
-    const double to_disc = 1 / (p[kRatio] * p[kRatio] - 1);
+    const double to_disc = 1 / (1 - p[kRatio] * p[kRatio]);
     return Fit{.outer = {p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
                .covariance = *centre,
                .offset_x = to_disc * p[kOffsetX],
