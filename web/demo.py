@@ -205,8 +205,10 @@ class Demo:
         t_s = self._scene_time(time.time_ns())
         if t_s >= self.scene.wave_s:
             return f"the wave is over; calibrating ({t_s - self.scene.wave_s:.0f} s)"
+        if t_s < 0:
+            return f"the programs start; the wave begins in {-t_s:.0f} s"
         seen = ", ".join(f"{name} {100 * c.share:.0f} %" for name, c in sorted(latest.coverage.items()))
-        return f"waving the wand, {max(0.0, t_s):.0f} of {self.scene.wave_s:.0f} s; seen in {seen or 'no camera yet'}"
+        return f"waving the wand, {t_s:.0f} of {self.scene.wave_s:.0f} s; seen in {seen or 'no camera yet'}"
 
     def _describe_tracking(self, score: Score, usage: Usage) -> str:
         errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.tracks)
