@@ -30,7 +30,7 @@ class Sheet:
     paper: str = "a4"
     """a4, a3 or letter."""
 
-    def run(self) -> None:
+    def run(self) -> int:
         """Write the sheet and say how many roundels it holds."""
         svg, count = draw(self)
         write_atomically(self.out, svg)
