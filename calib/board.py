@@ -51,5 +51,7 @@ class BoardFinder:
         for picture in (image, cv2.bitwise_not(image)):
             pixels, numbers = self._detector.detectBoard(picture)[:2]
             if numbers is not None and len(numbers) >= 6:
-                return np.asarray(pixels, np.float32).reshape(-1, 2), self.corners[np.ravel(numbers)]
+                return np.asarray(pixels, np.float32).reshape(-1, 2), self.corners[
+                    np.ravel(numbers).astype(np.intp)
+                ]
         return None

@@ -28,7 +28,7 @@ GRID = (5, 4)  # cells of the image in which corners are counted
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
+class CalibratedLens:
     """A calibrated lens: the camera, views used and offered, RMS reprojection error, and the share of the image's
     cells in which corners were seen."""
 
@@ -91,7 +91,7 @@ def read_frames(path: Path) -> Iterator[Grey]:
     video.release()
 
 
-def calibrate_lens(name: str, frames: Iterable[Grey], finder: BoardFinder) -> Lens:
+def calibrate_lens(name: str, frames: Iterable[Grey], finder: BoardFinder) -> CalibratedLens:
     """The lens of camera `name` from frames of a board.
 
     Raises:
@@ -113,7 +113,7 @@ def calibrate_lens(name: str, frames: Iterable[Grey], finder: BoardFinder) -> Le
     return _solve(name, views, (int(size[0]), int(size[1])), count)
 
 
-def _solve(name: str, views: list[BoardView], size: tuple[int, int], count: int) -> Lens:
+def _solve(name: str, views: list[BoardView], size: tuple[int, int], count: int) -> CalibratedLens:
     chosen = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, MAX_VIEWS).astype(int))]
     try:
         rms, K, distortion, turns = _zhang(chosen, size)
@@ -135,7 +135,7 @@ def _solve(name: str, views: list[BoardView], size: tuple[int, int], count: int)
         cy=float(K[1, 2]),
         distortion=tuple(float(x) for x in distortion),
     )
-    return Lens(camera, len(kept), count, rms, _coverage(kept, size))
+    return CalibratedLens(camera, len(kept), count, rms, _coverage(kept, size))
 
 
 _ADVICE = "views of the board that are all parallel can't fix a lens; tilt it by 30 degrees to all sides"
@@ -148,7 +148,7 @@ def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[float, Ar
         float(rms),
         np.asarray(K, float),
         np.ravel(distortion)[:5].astype(float),
-        [np.ravel(t) for t in turns],
+        [np.ravel(t).astype(float) for t in turns],
     )
 
 
@@ -170,7 +170,7 @@ def _coverage(views: Sequence[BoardView], size: tuple[int, int]) -> float:
     return float((counts > 0).mean())
 
 
-def merge(rig: Rig | None, lenses: dict[str, Lens]) -> Rig:
+def merge(rig: Rig | None, lenses: dict[str, CalibratedLens]) -> Rig:
     """The rig with new lenses; a camera's pose belongs to the lens that it was found with and goes."""
     cameras = dict(rig.cameras) if rig else {}
     cameras |= {name: lens.camera for name, lens in lenses.items()}

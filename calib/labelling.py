@@ -85,7 +85,7 @@ class Labeller:
         """The wand in a frame, or the reason why it can't be told."""
         roundels = message.unpack()
         xy = self.lens.normalise(roundels.uv)
-        inside = np.isfinite(xy).all(axis=1)
+        inside = np.flatnonzero(np.isfinite(xy).all(axis=1))
         roundels, xy = roundels.select(inside), xy[inside]
         if len(roundels) > MAX_ROUNDELS:
             return f"more than {MAX_ROUNDELS} roundels in the frame"

@@ -2,6 +2,7 @@
 """A wand waved before live cameras: collect detections, put the rig."""
 
 import queue
+import threading
 import time
 from collections import Counter
 
@@ -55,10 +56,12 @@ def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[De
 def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:
     """Put the rig on its key; whether a subscriber was there to take it within two seconds."""
     publisher = session.declare_publisher(Keys(arena).rig, reliability=zenoh.Reliability.RELIABLE)
-    end = time.monotonic() + DELIVERY_S
-    while not publisher.matching_status.matching and time.monotonic() < end:
-        time.sleep(0.02)
-    taken = bool(publisher.matching_status.matching)
+    listening = threading.Event()
+    listener = publisher.declare_matching_listener(
+        lambda status: listening.set() if status.matching else listening.clear()
+    )
+    taken = publisher.matching_status or listening.wait(DELIVERY_S)
     publisher.put(encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+    listener.undeclare()
     publisher.undeclare()
     return taken

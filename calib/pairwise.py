@@ -6,7 +6,7 @@ brought together by RANSAC over Kabsch's motion. Else the essential matrix (Nist
 and the wand's lengths the scale.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -83,7 +83,7 @@ def _point(view: View, row: int) -> Array:
 
 
 def relate_all(
-    instants: Sequence[Sequence[View]], lenses: dict[str, Lens], wand: Body
+    instants: Sequence[Sequence[View]], lenses: Mapping[str, Lens], wand: Body
 ) -> tuple[list[TwoView], dict[tuple[str, str], int]]:
     """The geometry of every pair of cameras that has one, and the number of instants that each pair shares."""
     found, counts = [], {}
@@ -110,6 +110,7 @@ def relate_by_points(shared: Shared, a: str, b: str) -> TwoView | None:
     moved = np.einsum("sij,nj->sni", motions[:, :3, :3], Q) + motions[:, None, :3, 3]
     inlier = np.linalg.norm(moved - P, axis=2) < gate
     best = inlier[inlier.sum(axis=1).argmax()]
+    T = np.eye(4)
     for _ in range(3):
         if best.sum() < 4:
             return None
@@ -149,7 +150,7 @@ def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
     """Points (n, 3), camera a's frame, seen at (n, 2) image plane coordinates in two cameras (linear triangulation)."""
     P_a, P_b = np.eye(4)[:3], invert(T_a_b)[:3]
     homogeneous = cv2.triangulatePoints(P_a, P_b, xy_a.T, xy_b.T).T
-    return homogeneous[:, :3] / homogeneous[:, 3:]
+    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], float)
 
 
 def _scale(points: Array, instant: NDArray[np.intp], label: NDArray[np.intp], wand: Body) -> float | None:

@@ -55,7 +55,8 @@ class AffineWand:
         weights = np.linalg.lstsq(system, np.vstack([points.T, np.ones(len(points))]), rcond=None)[0].T
         pairs = np.array(list(combinations(range(len(basis)), 2)), np.intp).reshape(-1, 2)
         ends = points[basis][pairs]
-        return cls(np.array(basis), weights, pairs, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+        lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        return cls(np.array(basis), np.asarray(weights, float), pairs, lengths)
 
 
 def hermite(tau: Array, dt: Array) -> Array:
@@ -95,7 +96,7 @@ def whitened_motion(dt: float, density: float) -> Array:
     """
     error = np.array([[-1.0, -dt, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0]])
     Q = density * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    return np.linalg.solve(np.linalg.cholesky(Q), error)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(Q), error), float)
 
 
 def finite_velocities(knot_s: Array, points: Array) -> Array:

@@ -26,7 +26,7 @@ from camera_node.pose import Pose
 
 Array = NDArray[np.float64]
 
-MIN_SIGMA_PX = 0.05  # no lens model is better than this, whatever a detector claims
+MIN_SIGMA_PX = 0.02  # no lens model is better than this, whatever a detector claims
 LENGTH_SLACK = 0.25  # of a wand length at the start: beyond, a detection is wrong
 
 
@@ -113,7 +113,7 @@ def _solve(
     instants = [[view for view in instant if view.camera in start] for instant in instants]
     affine = AffineWand.of(wand)
     basis = _start_basis(triangulate(instants, start, len(wand.markers)), affine)
-    good = np.isfinite(basis).all(axis=(1, 2))
+    good = np.array([np.isfinite(points).all() for points in basis], bool)
     for instant in (instant for instant, ok in zip(instants, good, strict=True) if not ok):
         for view in instant:
             left_out[view.camera]["instant without two good views of the wand"] += 1
@@ -151,15 +151,17 @@ def _pose_problem(
     metric: bool,
 ) -> tuple[Problem, State, Observations]:
     origin_ns = instants[0][0].t_ns
-    knot_s = np.array([np.mean([view.t_ns - origin_ns for view in instant]) for instant in instants]) * 1e-9
+    knot_s = 1e-9 * np.array(
+        [np.mean([view.t_ns - origin_ns for view in instant]) for instant in instants], np.float64
+    )
     cameras = np.array([start[name] for name in names])
     if not metric:
         # Nothing tells the scale: the two cameras that are farthest apart are one metre apart.
-        a, b, far = _farthest(cameras)
+        far = _farthest(cameras)[2]
         cameras[:, :3, 3] /= far
         basis = basis / far
     velocity = finite_velocities(knot_s, basis)
-    fixed = (*_farthest(cameras),) if len(affine.lengths) == 0 else None
+    fixed = _farthest(cameras) if len(affine.lengths) == 0 else None
     problem = Problem(
         [rig.cameras[name] for name in names], affine, knot_s, acceleration_density(knot_s, basis), fixed
     )
@@ -186,7 +188,7 @@ def observe(instants: Sequence[Sequence[View]], names: Sequence[str], origin_ns:
         label=np.concatenate([view.labels for _, view in frames]),
         t_s=np.repeat([(view.t_ns - origin_ns) * 1e-9 for _, view in frames], sizes),
         uv=np.concatenate([view.roundels.uv for _, view in frames]),
-        root=np.swapaxes(np.linalg.cholesky(np.linalg.inv(cov)), 1, 2),
+        root=np.asarray(np.swapaxes(np.linalg.cholesky(np.linalg.inv(cov)), 1, 2), float),
     )
 
 

@@ -31,8 +31,8 @@ def upright(cameras: Array, points: Array) -> Array:
         points: (N, 3) where the wand has been.
     """
     right, up = cameras[:, :3, 0], -cameras[:, :3, 1].mean(axis=0)
-    # One part in a hundred for the mean up axis decides what level rows leave open.
-    scatter = right.T @ right / len(right) - 0.01 * np.outer(up, up)
+    # One part in a thousand for the mean up axis decides what level rows leave open.
+    scatter = right.T @ right / len(right) - 0.001 * np.outer(up, up)
     z = np.linalg.eigh(scatter)[1][:, 0]
     z = z if z @ up >= 0 else -z
     x = right[0] - (right[0] @ z) * z

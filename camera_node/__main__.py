@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m camera_node` publishes a camera, `python -m camera_node detect` looks at images."""
+"""The command line: `python -m camera_node` publishes a camera; `detect` looks at images, `print` makes roundels."""
 
 import contextlib
 import logging
@@ -20,6 +20,7 @@ class Publish:
     """Publish what a camera sees: every roundel of every frame, over Zenoh, until stopped.
 
     To look at single images instead: python -m camera_node detect IMAGE...
+    To print roundels: python -m camera_node print roundels.svg
     """
 
     source: str
@@ -100,14 +101,18 @@ def main() -> None:
     run(_program)
 
 
-def _program() -> None:
+def _program() -> int | None:
     arguments = sys.argv[1:]
-    if arguments[:1] == ["detect"]:
+    name = arguments[0] if arguments else ""
+    if name == "detect":
         from camera_node.detect import Detect
 
-        tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
-    else:
-        tyro.cli(Publish, prog="camera_node", args=arguments).run()
+        return tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
+    if name == "print":
+        from camera_node.sheet import Sheet
+
+        return tyro.cli(Sheet, prog="camera_node print", args=arguments[1:]).run()
+    return tyro.cli(Publish, prog="camera_node", args=arguments).run()
 
 
 if __name__ == "__main__":

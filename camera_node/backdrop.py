@@ -10,8 +10,16 @@ from camera_node.pose import Array
 Picture = NDArray[np.float32]
 SIZE_M = 10.0  # the floor is a square around the world's origin
 PIXEL_M = 0.005
+FLOOR = 128.0
 WALL = 120.0  # grey level of all that is not floor
 SUBSAMPLES = 3
+_TO_PIXELS = np.array([1, -1], np.float32) / np.float32(PIXEL_M)
+
+
+def plain_floor() -> Picture:
+    """A floor of one grey level, (n, n)."""
+    n = round(SIZE_M / PIXEL_M)
+    return np.full((n, n), FLOOR, np.float32)
 
 
 def paint_floor(seed: int) -> Picture:
@@ -20,8 +28,8 @@ def paint_floor(seed: int) -> Picture:
     None of its marks is a roundel, though discs, letters and sheets of paper come close.
     """
     rng = np.random.default_rng(seed)
-    n = round(SIZE_M / PIXEL_M)
-    floor = np.full((n, n), 128, np.uint8)
+    floor = plain_floor().astype(np.uint8)
+    n = len(floor)
     floor[:: round(0.5 / PIXEL_M)] = floor[:, :: round(0.5 / PIXEL_M)] = 100
     for mark in (_paint_sheet, _paint_disc, _paint_letters, _paint_tape):
         for _ in range(14):
@@ -29,8 +37,8 @@ def paint_floor(seed: int) -> Picture:
     light = cv2.resize(
         rng.uniform(0.8, 1.15, (5, 5)).astype(np.float32), (n, n), interpolation=cv2.INTER_CUBIC
     )
-    grain = rng.normal(1.0, 0.04, (n, n)).astype(np.float32)
-    return floor * light * grain
+    grain = rng.standard_normal((n, n), np.float32)
+    return np.asarray(floor * light * (1 + np.float32(0.04) * grain), np.float32)
 
 
 def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
@@ -42,11 +50,12 @@ def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
         T_world_cam: (4, 4) pose of the camera.
     """
     h, w = rays.shape[:2]
+    T = T_world_cam.astype(np.float32)
     fine = cv2.resize(rays, (w * SUBSAMPLES, h * SUBSAMPLES), interpolation=cv2.INTER_LINEAR)
-    directions = cv2.transform(fine, np.column_stack([T_world_cam[:3, :2], T_world_cam[:3, 2]]))
-    down = np.minimum(directions[..., 2], -1e-6)  # a ray that rises meets the floor nowhere: far out
-    xy = T_world_cam[:2, 3] - directions[..., :2] * (T_world_cam[2, 3] / down)[..., None]
-    where = ((xy * (1, -1) + SIZE_M / 2) / PIXEL_M).clip(-10, 32000).astype(np.float32)
+    directions = cv2.transform(fine, T[:3, :3])  # of a point (x, y) it takes (x, y, 1)
+    down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # a ray that rises goes far out
+    xy = T[:2, 3] - directions[..., :2] * (T[2, 3] / down)
+    where = (xy * _TO_PIXELS + np.float32(SIZE_M / 2 / PIXEL_M)).clip(-10, 32000)
     columns, rows = cv2.split(where)
     seen = cv2.remap(floor, columns, rows, cv2.INTER_LINEAR, borderValue=WALL)
     return np.asarray(cv2.resize(seen, (w, h), interpolation=cv2.INTER_AREA), np.float32)

@@ -36,7 +36,7 @@ class RoundTrip:
 
     def error_ns(self, now_ns: int) -> float:
         """How far the truth may be from `offset_ns`: all delay was on one way, and the clocks drifted since."""
-        return (self.received_ns - self.sent_ns) / 2 + DRIFT * max(0, now_ns - self.received_ns)
+        return (self.received_ns - self.sent_ns) / 2 + DRIFT * max(0, now_ns - self.sent_ns)
 
 
 class OffsetEstimator:

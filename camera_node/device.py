@@ -168,11 +168,12 @@ class DeviceSource:
         device: Path,
         settings: SourceSettings,
         open: Callable[[Path, SourceSettings], Capture] = open_capture,
+        reopen_s: float = REOPEN_S,
     ) -> None:
         """Raises CameraError where the camera does not open."""
         self.device, self.settings = device, settings
         self.dropped = 0
-        self._open = open
+        self._open, self._reopen_s = open, reopen_s
         self._lost = False
         self._capture: Capture | None = open(device, settings)
         self._adjust: list[tuple[int, float]] = []
@@ -209,7 +210,7 @@ class DeviceSource:
     def _run(self) -> None:
         while not self._closed.is_set():
             if not (self._grab() if self._capture else self._reopen()):
-                self._closed.wait(REOPEN_S)
+                self._closed.wait(self._reopen_s)
         if self._capture:
             self._capture.release()
 

@@ -117,7 +117,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("no camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible time")
-        uu, uv, vv = _column(self.cov, "<f4", 3).T
+        cov = _column(self.cov, "<f4", 3)
+        uu, uv, vv = np.where(np.isfinite(cov), cov, 0.0).T
         if not (np.abs(_column(self.uv, "<f8", 2)) < 1e5).all() or not ((uu > 0) & (uu * vv > uv * uv)).all():
             raise MessageError("a centre or a covariance that is no number or out of range")
 
@@ -193,4 +194,5 @@ def decode(data: bytes, kind: type[T]) -> T:
 
 
 def _column(data: bytes, dtype: str, width: int) -> np.ndarray:
-    return np.frombuffer(data, dtype).reshape(-1, width).astype(float)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        return np.frombuffer(data, dtype).reshape(-1, width).astype(float)

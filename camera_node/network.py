@@ -95,14 +95,15 @@ def _brief(error: Exception) -> str:
 class ServerWatch:
     """Tells once that the server is away, and once that it is back; by its liveliness token."""
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, session: zenoh.Session, key: str, patience_s: float = PATIENCE_S) -> None:
+        self._patience_s = patience_s
         self._present, self._told = False, False
-        self._opened = time.monotonic()
+        self._since = time.monotonic()
         self._subscriber = session.liveliness().declare_subscriber(key, self._change, history=True)
 
     def tell_absence(self) -> None:
         """Called now and then: a server that was not seen since the start is told of once."""
-        if not self._present and not self._told and time.monotonic() - self._opened > PATIENCE_S:
+        if not self._present and not self._told and time.monotonic() - self._since >= self._patience_s:
             self._told = True
             log.warning("the server is away; what is seen meanwhile is lost, and it is tried on")
 
@@ -114,4 +115,4 @@ class ServerWatch:
         if self._present and self._told:
             log.warning("the server is there again")
             self._told = False
-        self._opened = time.monotonic()
+        self._since = time.monotonic()

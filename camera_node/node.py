@@ -29,6 +29,7 @@ log = logging.getLogger("camera_node")
 
 STATUS_S = 1.0
 LISTENER_S = 5.0  # how long a recording waits for somebody to listen
+ROUTES_S = 0.3  # Zenoh routers know of a listener 0.1 s before they have agreed on the route to it
 
 
 class Node:
@@ -137,6 +138,7 @@ class Node:
         if not publisher.matching_status and not listens.wait(LISTENER_S):
             log.warning("nobody listens to %s; the recording starts all the same", self.name)
         listener.undeclare()
+        self._closed.wait(ROUTES_S)
 
     def _report(self, watch: ServerWatch) -> None:
         publisher = self.session.declare_publisher(self.keys.camera_status(self.name))

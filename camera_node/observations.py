@@ -120,9 +120,10 @@ def _read_rows(file: Iterable[str], path: Path) -> Rows:
     for row in reader:
         try:
             u, v, number = float(row["u"]), float(row["v"]), int(row.get("marker") or -1)
-            if not (np.isfinite([u, v]).all() and abs(u) < 1e5 and abs(v) < 1e5 and row["camera"]):
+            t_ns, in_range = int(row["t_ns"]), abs(u) < 1e5 and abs(v) < 1e5  # and no NaN
+            if not (in_range and row["camera"] and 0 <= t_ns < 2**63 and -1 <= number < 2**31):
                 raise ValueError
-            rows.setdefault((int(row["t_ns"]), row["camera"]), []).append((u, v, number))
+            rows.setdefault((t_ns, row["camera"]), []).append((u, v, number))
         except (TypeError, ValueError):
             raise ConfigError(
                 f"{path}, line {reader.line_num}: not t_ns,camera,u,v in whole ns and pixels"

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.backdrop import paint_floor, view_floor
+from camera_node.backdrop import paint_floor, plain_floor, view_floor
 from camera_node.body import Body
 from camera_node.lens import Lens
 from camera_node.pose import Array, invert
@@ -72,6 +72,7 @@ class Renderer:
         self._reach = math.ceil(4 * self.camera.blur_px)  # pixels over which the blur spreads
         self._margin = self._reach + 2
         self._rays = map_rays(self.camera, self._margin)
+        # Outside this radius x/z, y/z nothing is seen: the corners' with room for a disc that is cut there.
         self._limit = 1.15 * float(np.linalg.norm(self._rays, axis=2).max())
         self._gain = vignette(self.camera)
         self._seed = zlib.crc32(f"{scene.seed} {name}".encode())
@@ -115,16 +116,18 @@ class Renderer:
     def _bound(self, instants: list[Disc]) -> tuple[int, int, int, int] | None:
         """Columns and rows u0, v0, u1, v1 that the discs can touch, within the rays that are known; or None."""
         points = np.concatenate([disc.outline() for disc in instants])
-        z = points[:, 2]
-        if z.min() < NEAR_M or np.hypot(points[:, 0], points[:, 1]).max() > self._limit * z.min():
+        z, radii = points[:, 2], np.hypot(points[:, 0], points[:, 1])
+        if z.min() < NEAR_M or (radii > self._limit * z).all():
             return None
+        size, known = np.array((self.camera.width, self.camera.height)), self._reach + 1
+        if (radii > self._limit * z).any():  # out there a lens model may fold back: anywhere in the image
+            return (-known, -known, *(size + known).tolist())
         uv = self.camera.project(points)
         low = np.floor(uv.min(0)).astype(int) - self._reach
         high = np.ceil(uv.max(0)).astype(int) + self._reach + 1
-        u0, v0 = np.maximum(low, -self._reach - 1).tolist()
-        u1, v1 = np.minimum(high, np.add((self.camera.width, self.camera.height), self._reach + 1)).tolist()
-        hidden = u1 <= 0 or v1 <= 0 or u0 >= self.camera.width or v0 >= self.camera.height
-        return None if hidden else (u0, v0, u1, v1)
+        if (high <= 0).any() or (low >= size).any():
+            return None
+        return (*np.maximum(low, -known).tolist(), *np.minimum(high, size + known).tolist())
 
     def _trace(self, disc: Disc, box: tuple[int, int, int, int]) -> Picture:
         """(h, w, 2) of a box: how much of each pixel the card covers, and the light from there, both blurred."""
@@ -143,7 +146,8 @@ class Renderer:
 
     def _view_backdrop(self) -> Picture:
         m = self._margin
-        seen = view_floor(paint_floor(self.scene.seed), self._rays, self.camera.T_world_cam)
+        floor = paint_floor(self.scene.seed) if self.scene.clutter else plain_floor()
+        seen = view_floor(floor, self._rays, self.camera.T_world_cam)
         sharp = np.ascontiguousarray(seen[m:-m, m:-m])
         return cv2.GaussianBlur(sharp, (0, 0), self.camera.blur_px) * self._gain
 

@@ -108,6 +108,8 @@ class _Bodies(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A scene's YAML file; without `clutter` the floor is plain grey."""
+
     wand: str
     robots: str
     wave_s: float
@@ -115,6 +117,7 @@ class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     wand_motion: Motion
     robot_motions: dict[str, Motion]
     seed: int = 0
+    clutter: bool = True
 
 
 class Scene:
@@ -124,7 +127,8 @@ class Scene:
     """
 
     def __init__(self, file: _File, wand: Body, robots: dict[str, Body]) -> None:
-        self.seed, self.wave_s, self.cameras = file.seed, file.wave_s, file.cameras
+        self.seed, self.clutter = file.seed, file.clutter
+        self.wave_s, self.cameras = file.wave_s, file.cameras
         self.wand, self.robots = wand, robots
         self._wand_motion, self._motions = file.wand_motion, file.robot_motions
 

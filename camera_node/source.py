@@ -103,7 +103,7 @@ class FolderSource:
         if not folder.is_dir():
             raise CameraError(f"{folder} is no folder; frames are expected as {folder}/<t_ns>.png or .jpg")
         files = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
-        if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,18}", path.stem)]:
+        if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,19}", path.stem)]:
             raise CameraError(
                 f"{folder / min(bad)} is not named by its capture time in nanoseconds, as <t_ns>.png"
             )

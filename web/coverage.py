@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Where in its image a camera has seen roundels: what tells a person where to wave the wand next."""
 
+from collections.abc import Mapping
+from itertools import zip_longest
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +12,7 @@ from camera_node.messages import Detections
 
 WIDTH = 160  # pixels of the small picture
 CELLS = 8  # of the grid that the share counts, in each direction
+TITLE = 18  # pixels above each picture, for its camera's name
 PAPER, INK = np.array([24, 28, 38], np.uint8), np.array([64, 200, 170], np.uint8)
 
 
@@ -39,3 +44,24 @@ class Coverage:
     def image(self) -> NDArray[np.uint8]:
         """(rows, 160, 3) RGB."""
         return np.where(self.inked[..., None], INK, PAPER)
+
+
+def montage(pictures: Mapping[str, Coverage]) -> NDArray[np.uint8]:
+    """All cameras' pictures, two in a row, their names and shares above them: (h, 2 * 160 + 8, 3) RGB."""
+    tiles = [_entitle(name, pictures[name]) for name in sorted(pictures)]
+    height = max((len(tile) for tile in tiles), default=1)
+    rows = []
+    for left, right in zip_longest(tiles[::2], tiles[1::2], fillvalue=np.full((1, 1, 3), 36, np.uint8)):
+        row = np.full((height, 2 * WIDTH + 8, 3), 36, np.uint8)
+        row[: len(left), :WIDTH] = left
+        row[: len(right), WIDTH + 8 : WIDTH + 8 + right.shape[1]] = right
+        rows.append(row)
+    return np.concatenate(rows) if rows else np.zeros((1, 2 * WIDTH + 8, 3), np.uint8)
+
+
+def _entitle(name: str, picture: Coverage) -> NDArray[np.uint8]:
+    tile = np.full((TITLE + len(picture.inked), WIDTH, 3), 36, np.uint8)
+    tile[TITLE:] = picture.image()
+    text = f"{name[:16]} {100 * picture.share:.0f} %"
+    cv2.putText(tile, text, (2, TITLE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (205, 210, 220), 1, cv2.LINE_AA)
+    return tile

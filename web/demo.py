@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import web
 from calib.camera import Camera, transform
-from calib.rig import Rig, save_rig
+from calib.live import publish
+from calib.rig import Rig, load_rig, save_rig
+from calib.world import align
 from camera_node.errors import ConfigError
 from camera_node.messages import encode
 from camera_node.network import open_client
@@ -28,6 +29,7 @@ from web.usage import Usage
 ARENA = "demo"
 START_S = 3.0  # for the programs to come up before the wave begins
 SOLVE_S = 90.0  # after the wave, for calibration to be done
+SETTLE_S = 0.5  # after a new calibration, for poses of the old one to be gone
 ACQUIRE_S = 5.0  # after calibration, for robots to be found; whatever is missing then counts as lost
 TICK_S = 0.05
 
@@ -72,7 +74,10 @@ def run_demo(
     except ProgramFailed as error:
         print(f"the demo failed: {error}", flush=True)
         return 1
-    shutil.rmtree(folder, ignore_errors=True)
+    if code:
+        print(f"what each program said is in {folder}", flush=True)
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
     return code
 
 
@@ -81,8 +86,8 @@ class Demo:
 
     def __init__(self, scene: Scene, files: Path, processes: Processes, endpoint: str) -> None:
         self.scene, self.files, self.processes, self.endpoint = scene, files, processes, endpoint
-        self.epoch_ns = time.time_ns() + round(START_S * 1e9)
         self.session = open_client([endpoint])
+        self.epoch_ns = time.time_ns() + round(START_S * 1e9)
         self.feed = Feed(self.session, ARENA, self._take_pose)
         self._score: Score | None = None
 
@@ -90,13 +95,10 @@ class Demo:
         """All of it; returns the exit code."""
         try:
             self._start(page)
-            placed = self._calibrate()
-            T, worst_mm = align(placed, self.scene)
-            print(
-                f"calibrated: {len(placed)} cameras, {worst_mm:.2f} mm from their true places at most",
-                flush=True,
-            )
-            return self._track(T, seconds)
+            self._calibrate()
+            self._survey()
+            self._acquire()
+            return self._track(seconds)
         finally:
             self.feed.close()
             self.session.close()
@@ -124,27 +126,39 @@ class Demo:
         rigs = ["--rig", str(folder / "intrinsics.yaml"), "--out", str(folder / "rig.yaml")]
         start("calib", "calib", [*wave, *rigs, *connect])
 
-    def _calibrate(self) -> dict[str, Camera]:
-        """Wave the wand until the calibration is in force; the cameras that it placed."""
+    def _calibrate(self) -> None:
+        """Wave the wand until `calib` has placed the cameras."""
         for whole_second in self._ticks(self.scene.wave_s + SOLVE_S):
-            latest = self.feed.latest()
-            if self.processes.finished("calib") and latest.rig and latest.rig.placed():
-                break
-            self._tell(self._describe_wave(latest), self._wave_share(), whole_second)
-        else:
-            raise ProgramFailed(f"no calibration came in time; the logs are in {self.processes.folder}")
-        if missing := set(self.scene.cameras) - set(latest.rig.placed()):
-            raise ProgramFailed(f"calibration did not place {', '.join(sorted(missing))}")
-        return latest.rig.placed()
+            if self.processes.finished("calib"):
+                return
+            self._tell(self._describe_wave(self.feed.latest()), self._wave_share(), whole_second)
+        raise ProgramFailed(f"no calibration came in time; the logs are in {self.processes.folder}")
 
-    def _track(self, T_true_world: Array, seconds: float | None) -> int:
-        """Follow the robots, then sum up; the exit code."""
-        markers = {name: len(body.markers) for name, body in self.scene.robots.items()}
-        score = self._score = Score(self._truth, T_true_world, markers)
+    def _survey(self) -> None:
+        """Make the calibration's world the scene's, by the cameras' true places: a wand alone fixes no world."""
+        rig = load_rig(self.processes.folder / "rig.yaml")
+        if missing := set(self.scene.cameras) - set(rig.placed()):
+            raise ProgramFailed(f"calibration did not place {', '.join(sorted(missing))}")
+        moved, misses_m = align(
+            rig, {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
+        )
+        publish(self.session, ARENA, moved)
+        worst = 1e3 * max(misses_m.values())
+        print(
+            f"calibrated: {len(misses_m)} cameras, {worst:.2f} mm from their true places at most", flush=True
+        )
+
+    def _acquire(self) -> None:
+        """Give the server the time to find the robots."""
+        score = self._score = self._new_score(time.time_ns() + round(SETTLE_S * 1e9))
         for _ in self._ticks(ACQUIRE_S):
             if score.all_tracked():
                 break
+
+    def _track(self, seconds: float | None) -> int:
+        """Follow the robots, then sum up; the exit code."""
         usage = Usage(self.processes, self.feed)
+        score = self._score = self._new_score(usage.start_ns)
         try:
             for whole_second in self._ticks(seconds):
                 if whole_second:
@@ -159,6 +173,10 @@ class Demo:
             print(line)
         print(f"FAILED: {'; '.join(faults)}" if faults else "all robots were tracked, and right", flush=True)
         return 1 if faults else 0
+
+    def _new_score(self, start_ns: int) -> Score:
+        markers = {name: len(body.markers) for name, body in self.scene.robots.items()}
+        return Score(self._truth, markers, start_ns)
 
     def _ticks(self, seconds: float | None) -> Iterator[bool]:
         """Every `TICK_S`, whether a whole second has passed; for so long or for ever. A program that fails raises."""
@@ -187,8 +205,10 @@ class Demo:
         t_s = self._scene_time(time.time_ns())
         if t_s >= self.scene.wave_s:
             return f"the wave is over; calibrating ({t_s - self.scene.wave_s:.0f} s)"
+        if t_s < 0:
+            return f"the programs start; the wave begins in {-t_s:.0f} s"
         seen = ", ".join(f"{name} {100 * c.share:.0f} %" for name, c in sorted(latest.coverage.items()))
-        return f"waving the wand, {max(0.0, t_s):.0f} of {self.scene.wave_s:.0f} s; seen in {seen or 'no camera yet'}"
+        return f"waving the wand, {t_s:.0f} of {self.scene.wave_s:.0f} s; seen in {seen or 'no camera yet'}"
 
     def _describe_tracking(self, score: Score, usage: Usage) -> str:
         errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.tracks)
@@ -207,16 +227,3 @@ class Demo:
         self.session.put(progress_key(ARENA), encode(progress))
         if aloud:
             print(text, flush=True)
-
-
-def align(placed: dict[str, Camera], scene: Scene) -> tuple[Array, float]:
-    """The motion (4, 4) of the calibration's world to the scene's, and the worst camera's distance then, mm.
-
-    A wand fixes no world: the motion is the one that brings the cameras' centres to the true ones.
-    """
-    found = np.array([camera.matrix()[:3, 3] for camera in placed.values()])
-    true = np.array([scene.T_world_cam(name)[:3, 3] for name in placed])
-    T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors(true - true.mean(axis=0), found - found.mean(axis=0))[0].as_matrix()
-    T[:3, 3] = true.mean(axis=0) - T[:3, :3] @ found.mean(axis=0)
-    return T, 1e3 * float(np.linalg.norm(transform(T, found) - true, axis=1).max())

@@ -14,7 +14,7 @@ from web.feed import FAR_M, Latest
 from web.tables import robot_state
 from web.trails import Trails, fade
 
-BACKGROUND = (1, 1, 2)
+BACKGROUND = (3, 3, 4)
 CAMERA, GHOST, LABELLED, UNLABELLED = (122, 162, 247), (235, 238, 245), (255, 255, 255), (150, 150, 150)
 COASTING, LOST = (222, 99, 10), (40, 20, 20)
 # Viser's meshes and lines take colours as linear light: (c / 255)^2.2 of what is to be seen.
@@ -39,7 +39,7 @@ def draw_camera(scene: viser.SceneApi, name: str, camera: Camera) -> list[Any]:
         f"/cameras/{name}",
         fov=2 * math.atan(camera.height / (2 * camera.fy)),
         aspect=camera.width * camera.fy / (camera.height * camera.fx),
-        scale=0.22,
+        scale=0.2,
         thickness=0.01,
         color=CAMERA,
         variant="filled",

@@ -61,13 +61,13 @@ class Feed:
     ) -> None:
         self.session, self.keys = session, Keys(arena)
         self._on_pose = on_pose
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._latest = Latest()
         keys = self.keys
         self._subscribers: list[Any] = [
             self._subscribe(keys.robot_pose(), RobotPose, self._take_pose),
             self._subscribe(keys.markers, Markers, self._keep("markers")),
-            self._subscribe(keys.fusion_status, FusionStatus, self._keep("status")),
+            self._subscribe(keys.fusion_status, FusionStatus, self._take_status),
             self._subscribe(keys.camera_status(), CameraStatus, self._take_camera),
             self._subscribe(keys.detections(), Detections, self._take_detections),
             self._subscribe(keys.rig, RigMessage, self._take_rig),
@@ -120,6 +120,11 @@ class Feed:
         if self._on_pose is not None:
             self._on_pose(pose)
 
+    def _take_status(self, status: FusionStatus, key: str) -> None:
+        self._latest.status = Seen(status, time.monotonic())
+        if self._latest.rig is None:  # the server may be known before its queryable is
+            self._ask_rig()
+
     def _take_camera(self, status: CameraStatus, key: str) -> None:
         self._store(self._latest.cameras, status.camera, status, key)
 
@@ -147,7 +152,10 @@ class Feed:
         with self._lock:
             self._latest.server_alive = alive
         if alive:  # whoever joins late asks for the calibration in force
-            self.session.get(self.keys.rig, self._receive_reply, timeout=5.0)
+            self._ask_rig()
+
+    def _ask_rig(self) -> None:
+        self.session.get(self.keys.rig, self._receive_reply, timeout=5.0)
 
     def _receive_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from web.coverage import montage
 from web.feed import Feed, Latest
 from web.tables import describe_server, list_faults, tabulate_cameras, tabulate_robots
 
@@ -32,7 +33,8 @@ class Panel:
         with self._skipped:
             self._faults = gui.add_html("")
         self._wave = gui.add_folder("Where the wand was seen", visible=False)
-        self._coverage: dict[str, Any] = {}
+        with self._wave:
+            self._coverage = gui.add_image(montage({}))
         self._look = gui.add_folder("Look")
         with self._look:
             gui.add_button("Frame the arena").on_click(lambda _: frame_arena())
@@ -81,13 +83,7 @@ class Panel:
         self._wave.visible = bool(latest.coverage) and not (latest.rig and latest.rig.placed())
         if not self._wave.visible:
             return
-        for name, coverage in sorted(latest.coverage.items()):
-            label = f"{name}: {100 * coverage.share:.0f} %"
-            if name not in self._coverage:
-                with self._wave:
-                    self._coverage[name] = self.server.gui.add_image(coverage.image(), label=label)
-            self._coverage[name].image = coverage.image()
-            self._coverage[name].label = label
+        self._coverage.image = montage(latest.coverage)
 
 
 def decode_jpeg(data: bytes | None) -> NDArray[np.uint8] | None:

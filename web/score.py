@@ -53,21 +53,21 @@ class Track:
 class Score:
     """Compares poses with the truth as they come.
 
-    `truth(robot, t_ns)` is T_world_robot (4, 4), None while the robot is not there. `T_true_world` brings the
-    calibration's world to the truth's: a wand alone fixes no world.
+    `truth(robot, t_ns)` is T_world_robot (4, 4), None while the robot is not there.
     """
 
     def __init__(
-        self, truth: Callable[[str, int], Array | None], T_true_world: Array, robots: dict[str, int]
-    ):
-        """`robots` maps a name to its number of markers."""
-        self._truth, self._T, self._markers = truth, T_true_world, robots
+        self, truth: Callable[[str, int], Array | None], robots: dict[str, int], start_ns: int = 0
+    ) -> None:
+        """`robots` maps a name to its number of markers; poses of before `start_ns` do not count."""
+        self._truth, self._markers, self._start_ns = truth, robots, start_ns
         self.tracks = {robot: Track() for robot in robots}
         self.latencies_ms: list[float] = []
 
     def add(self, pose: RobotPose) -> None:
         """Take one pose into account; robots that the truth does not know count for nothing."""
-        T_true = self._truth(pose.robot, pose.t_ns) if pose.robot in self.tracks else None
+        counts = pose.robot in self.tracks and pose.t_ns >= self._start_ns
+        T_true = self._truth(pose.robot, pose.t_ns) if counts else None
         if T_true is None:
             return
         track = self.tracks[pose.robot]
@@ -76,8 +76,7 @@ class Score:
             self.latencies_ms.append(pose.latency.total_ms)
         if pose.state != "tracked":
             return
-        position = self._T[:3, :3] @ pose.position + self._T[:3, 3]
-        R = self._T[:3, :3] @ rotation_from_wxyz(pose.quaternion_wxyz)
+        position, R = np.array(pose.position), rotation_from_wxyz(pose.quaternion_wxyz)
         track.t_ns.append(pose.t_ns)
         track.position_mm.append(1e3 * float(np.linalg.norm(position - T_true[:3, 3])))
         track.rotation_deg.append(angle_deg(R, T_true[:3, :3]))
@@ -126,16 +125,18 @@ def rms(values: list[float]) -> float:
 
 def summarise(results: list[Result], latencies_ms: list[float]) -> list[str]:
     """The lines of a summary."""
-    lines = [
-        f"{r.robot}: position {r.rms_mm:.2f} mm RMS, {r.max_mm:.2f} mm max; rotation {_degrees(r.rotation_deg)}; "
-        f"tracked {100 * r.tracked:.1f} %; longest gap {r.gap_s:.2f} s"
-        for r in results
-    ]
+    lines = [_describe(result) for result in results]
     if latencies_ms:
         p50, p99 = np.percentile(latencies_ms, [50, 99])
         lines.append(f"latency: {p50:.1f} ms p50, {p99:.1f} ms p99 (newest exposure's middle to publication)")
     return lines
 
 
-def _degrees(angle: float) -> str:
-    return "not known of one marker" if np.isnan(angle) else f"{angle:.2f} degrees RMS"
+def _describe(result: Result) -> str:
+    if np.isnan(result.rms_mm):
+        return f"{result.robot}: never tracked"
+    turn = "" if np.isnan(result.rotation_deg) else f"rotation {result.rotation_deg:.2f} degrees RMS; "
+    return (
+        f"{result.robot}: position {result.rms_mm:.2f} mm RMS, {result.max_mm:.2f} mm max; {turn}"
+        f"tracked {100 * result.tracked:.1f} %; longest gap {result.gap_s:.2f} s"
+    )

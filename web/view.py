@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The live view: a Viser server that draws what a `Feed` knows, thirty times a second."""
 
+import math
 import os
 import socket
 import threading
@@ -19,6 +20,7 @@ from web.panel import Panel
 PERIOD_S = 1 / 30
 TRAIL_EVERY = 3  # frames
 PANEL_EVERY = 15
+FIELD_OF_VIEW, DISTANCE = math.radians(42), 2.3  # a long lens, from a distance of so many radii of the rig
 
 
 class View:
@@ -50,6 +52,7 @@ class View:
             fade_strength=2.0,
             fade_from="origin",
         )
+        self.server.initial_camera.fov = FIELD_OF_VIEW
         self.frame_arena()
 
     @property
@@ -137,8 +140,9 @@ def frame(rig: Rig | None) -> tuple[tuple[float, float, float], tuple[float, flo
     """From where to look, and at what, to have the whole rig in sight, metres."""
     centres = [camera.matrix()[:3, 3] for camera in (rig.placed() if rig else {}).values()]
     low, high = (np.min(centres, 0), np.max(centres, 0)) if centres else (np.full(3, -2.0), np.full(3, 2.0))
-    middle = (low + high) / 2
-    target = np.array([middle[0], middle[1], 0.3 * high[2]])
-    reach = max(1.5, float(np.linalg.norm(high - low)) / 2)
-    eye = target + reach * np.array([0.75, -1.25, 0.62])
-    return tuple(eye.tolist()), tuple(target.tolist())
+    reach = DISTANCE * max(1.5, float(np.linalg.norm(high - low)) / 2)
+    ahead = np.array([-0.45, 0.78, -0.43])
+    target = np.array([*(low + high)[:2] / 2, 0.45 * high[2]])
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    target += 0.11 * reach * right  # the panel covers the right of the page
+    return tuple((target - reach * ahead).tolist()), tuple(target.tolist())

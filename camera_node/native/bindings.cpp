@@ -11,6 +11,7 @@ using Grey = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
 using Table = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 
 static roundel::ImageView view(const Grey& image) {
+    if (image.size() == 0) return {nullptr, 0, 0, 0};
     if (image.shape(1) > 1 && image.stride(1) != 1) throw nb::value_error("image rows must be contiguous");
     return {image.data(), int(image.shape(1)), int(image.shape(0)), ptrdiff_t(image.stride(0))};
 }

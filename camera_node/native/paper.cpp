@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <stdexcept>
 
 namespace roundel {
 
@@ -56,7 +57,10 @@ Ellipse covariance_ellipse(const Moments& disc) {
             e.angle};
 }
 
-double distance_by_principal_axis(double diameter, double major) { return diameter / major; }
+double distance_by_principal_axis(double diameter, double major) {
+    if (!(major > 0)) throw std::invalid_argument("the major axis must be above 0");
+    return diameter / major;
+}
 
 std::vector<Pair> find_pairs(const Segments& segments, int width, int height, const Settings& settings) {
     std::vector<Pair> pairs;

@@ -34,8 +34,9 @@ using Matrix = std::array<Parameters, kCount>;
 constexpr double kBand = 2;       // pixels on either side of an edge that are used
 constexpr int kMaxPixels = 1200;  // larger roundels are sampled on a coarser grid
 constexpr int kMaxIterations = 12;
-constexpr double kStep = 1e-3;     // pixels: a smaller step ends the iteration
+constexpr double kStep = 4e-3;     // pixels: a step below it is the last, and leaves an error of far less
 constexpr double kNoiseFloor = 1;  // grey levels
+constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kTukey = 6;       // standard deviations from which on a pixel does not count
 constexpr double kCardRatio = 9.0 / 7;
 
@@ -55,10 +56,11 @@ double cube(double x) { return x * x * x; }
 Edge edge(const Symmetric& inverse, double r, double dx, double dy) {
     const double qx = inverse.xx * dx + inverse.xy * dy, qy = inverse.xy * dx + inverse.yy * dy;
     const double wx = inverse.xx * qx + inverse.xy * qy, wy = inverse.xy * qx + inverse.yy * qy;
-    const double f = std::hypot(qx, qy) + 1e-9, w = std::hypot(wx, wy) + 1e-9;
-    const double nx = wx / w, ny = wy / w, ux = qx / f, uy = qy / f;
-    return {(f - r) * f / w,          -nx,          -ny,    -r * nx * ux,
-            -r * (nx * uy + ny * ux), -r * ny * uy, -f / w, cube(f / w) * square(inverse.det()) / r};
+    const double f = std::sqrt(qx * qx + qy * qy) + 1e-9, per_f = 1 / f;
+    const double per_w = 1 / (std::sqrt(wx * wx + wy * wy) + 1e-9), stretch = f * per_w;
+    const double nx = wx * per_w, ny = wy * per_w, ux = r * qx * per_f, uy = r * qy * per_f;
+    return {(f - r) * stretch,    -nx,      -ny,      -nx * ux,
+            -(nx * uy + ny * ux), -ny * uy, -stretch, cube(stretch) * square(inverse.det()) / r};
 }
 
 /// The share of the inside that a pixel sees near a blurred edge, and its derivatives by distance and by
@@ -187,15 +189,16 @@ class Solver {
             double moved = 0;
             for (int i = 0; i < kCount; ++i) p[i] += delta[i];
             for (int i = 0; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
+            p[kBlur] = std::max(p[kBlur], kMinBlur);
             if (!is_sane()) return false;
-            if (moved < kStep) return true;
+            if (moved < kStep) break;
         }
+        accumulate();
         return true;
     }
 
     /// Covariance of two neighbouring parameters at the solution; nothing where the equations are singular.
-    std::optional<Symmetric> covariance(Parameter first, Parameter second) {
-        accumulate();
+    std::optional<Symmetric> covariance(Parameter first, Parameter second) const {
         const Cholesky<kCount> factor(H_);
         if (!factor.positive()) return std::nullopt;
         Parameters ex{}, ey{};
@@ -253,8 +256,7 @@ class Solver {
         const double area = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
         return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * size && p[kAxx] > 0 &&
                std::sqrt(std::max(area, 0.0)) > 0.7 * size && std::sqrt(std::max(area, 0.0)) < 1.4 * size &&
-               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] > 0.2 && p[kBlur] < 3 + 0.1 * size &&
-               p[kCard] > 1;
+               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * size && p[kCard] > 1;
     }
 
     const std::vector<Pixel>& pixels_;
@@ -279,7 +281,7 @@ std::optional<Fit> refine(const ImageView& image, const Start& start) {
     const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
     // Perspective moves a circle's centre by its radius squared: the inner circle's image tells that of
     // radius nought.
-    const double to_disc = 1 / (p[kRatio] * p[kRatio] - 1);
+    const double to_disc = 1 / (1 - p[kRatio] * p[kRatio]);
     return Fit{.outer = {p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
                .covariance = *centre,
                .offset_x = to_disc * p[kOffsetX],

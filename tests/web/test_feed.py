@@ -34,7 +34,7 @@ def test_a_late_joiner_gets_the_rig(played: Played):
     token = played.session.liveliness().declare_token(played.keys.fusion_alive)
     session = open_client([played.endpoint])
     late = Feed(session, "test")
-    wait_for(lambda: late.latest().rig)
+    wait_for(lambda: played.status() or late.latest().rig)  # it asks again with every status
     rig = late.latest().rig
     assert rig is not None
     assert set(rig.placed()) == {"north", "east", "south", "west"}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from conftest import Played, wait_for
 
-from web.coverage import Coverage
+from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen
 from web.tables import STALE_S, describe, describe_server, tabulate_cameras, tabulate_robots
 from web.trails import LENGTH, Trails, fade
@@ -75,6 +75,16 @@ def test_coverage_of_an_odd_image():
     """A line of pixels has a picture too."""
     assert Coverage(32768, 1).image().shape == (1, 160, 3)
     assert Coverage(1, 32768).image().shape == (640, 160, 3)
+
+
+def test_a_montage_has_room_for_all():
+    """Two in a row, whatever their shapes; and none is a picture as well."""
+    assert montage({}).shape == (1, 328, 3)
+    assert montage({"a": Coverage(640, 480), "b": Coverage(480, 640), "c": Coverage(640, 480)}).shape == (
+        2 * (18 + 213),
+        328,
+        3,
+    )
 
 
 def test_trails_are_bounded_and_end_at_the_robot():

@@ -126,7 +126,7 @@ def test_drawing_survives_what_an_arena_may_say(played: Played, feed: Feed):
         played.pose(f"robot {count}", (0.0, 0.0, 0.0), "lost")
         wait_for(lambda count=count: f"robot {count}" in feed.latest().poses)
         view.update()
-    wait_for(lambda: feed.latest().rig)
+    wait_for(lambda: played.status() or feed.latest().rig)
     view.update()
     played.markers([])
     wait_for(lambda: (seen := feed.latest().markers) and len(seen.message) == 0)

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a simulated frame costs: `python tests/benchmarks/simulation.py [SCENE]`, processor time of one thread."""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from camera_node.rendering import Renderer
+from camera_node.scene import Scene
+
+DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml"
+FRAMES = 200
+
+
+def main(path: Path) -> None:
+    """Print start-up and time a frame, by camera, while the wand waves and while the robots drive."""
+    scene = Scene.load(path)
+    for name in scene.cameras:
+        start = time.process_time()
+        renderer = Renderer(scene, name)
+        print(f"{name}: start-up {time.process_time() - start:.2f} s", end="")
+        for what, first_s in (("wand", 0.0), ("robots", scene.wave_s)):
+            times = np.linspace(first_s, first_s + min(scene.wave_s, 15.0) * 0.99, FRAMES)
+            start = time.process_time()
+            for k, t_s in enumerate(times):
+                renderer.render(float(t_s), k)
+            print(f"; {what} {(time.process_time() - start) / FRAMES * 1e3:.2f} ms a frame", end="")
+        print()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO)

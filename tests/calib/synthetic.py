@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A synthetic arena: cameras in a ring, a wand on a smooth path, and what an ideal detector would say of it."""
+
+from dataclasses import dataclass
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Camera, transform
+from calib.rig import Rig
+from camera_node.body import Body
+from camera_node.lens import Lens
+from camera_node.messages import Detections
+from camera_node.pose import Pose, invert, look_at, rotation_from_vector
+from camera_node.roundels import Roundels
+
+Array = NDArray[np.float64]
+
+WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
+PERIOD_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Arena:
+    """A rig whose poses are the truth, and a wand before it."""
+
+    truth: Rig
+    wand: Body = WAND
+    speed: float = 1.0
+
+    @property
+    def intrinsics(self) -> Rig:
+        """The rig as a calibration starts: without poses."""
+        bare = {n: msgspec.structs.replace(c, T_world_cam=None) for n, c in self.truth.cameras.items()}
+        return Rig(cameras=bare)
+
+    def wand_pose(self, t_s: float) -> Array:
+        """T_world_wand (4, 4): a Lissajous path of about a metre and a tumbling stick."""
+        w = self.speed * t_s
+        T = np.eye(4)
+        T[:3, :3] = rotation_from_vector([0.7 * np.sin(0.9 * w), 0.6 * np.cos(1.1 * w), 0.8 * w])
+        T[:3, 3] = [0.9 * np.sin(0.7 * w), 0.9 * np.cos(0.53 * w), 1.0 + 0.5 * np.sin(0.43 * w + 1)]
+        return T
+
+    def see(self, name: str, t_ns: int) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Disc centres (M, 2), full axes (M, 2), angles (M,), and which are in the image of an eye that sees through
+        the wand (both sides of a roundel are printed)."""
+        camera = self.truth.cameras[name]
+        T = invert(camera.matrix()) @ self.wand_pose(t_ns * 1e-9)
+        centres = transform(T, self.wand.points)
+        uv = camera.project(centres)
+        outlines = [ellipse(camera, centre, T[:3, :3], self.wand.diameter_m / 2) for centre in centres]
+        axes, angles = np.array([o[0] for o in outlines]), np.array([o[1] for o in outlines])
+        inside = ((uv > 15) & (uv < [camera.width - 15, camera.height - 15])).all(axis=1)
+        return uv, axes, angles, inside & (axes[:, 1] > 5)
+
+
+def ellipse(lens: Lens, centre: Array, R: Array, radius: float) -> tuple[Array, float]:
+    """Full axes (2,) and angle of a disc's outline, to first order about its centre."""
+    J = lens.project_with_jacobian(centre[None])[1][0] @ R[:, :2] * radius
+    U, s, _ = np.linalg.svd(J)
+    angle = float(np.arctan(U[1, 0] / U[0, 0]))
+    return 2 * s, angle
+
+
+def ring(cameras: int = 4, **options) -> Arena:
+    """Cameras with distorted lenses on a ring of 2.6 m radius, 2.4 m high, looking at the middle."""
+    rng = np.random.default_rng(5)
+    entries = {}
+    for k in range(cameras):
+        turn = 2 * np.pi * k / cameras + 0.2 * rng.uniform(-1, 1)
+        place = np.array([2.6 * np.cos(turn), 2.6 * np.sin(turn), 2.4 + 0.3 * rng.uniform(-1, 1)])
+        entries[f"cam{k}"] = Camera(
+            width=800,
+            height=600,
+            fx=520.0 + 10 * k,
+            fy=522.0 + 10 * k,
+            cx=402.0,
+            cy=297.0,
+            distortion=(-0.1, 0.03, 0.0002, -0.0001, 0.0),
+            T_world_cam=Pose.from_matrix(look_at(place, [0.0, 0.0, 0.8])),
+        )
+    return Arena(Rig(cameras=entries), **options)
+
+
+def record(
+    arena: Arena,
+    seconds: float = 10.0,
+    sigma_px: float = 0.0,
+    seed: int = 0,
+    free_running: bool = True,
+    numbered: bool = False,
+    sized: bool = True,
+    outliers: float = 0.0,
+    clutter: int = 0,
+    missing: float = 0.0,
+    period_ns: int = PERIOD_NS,
+) -> list[Detections]:
+    """What the cameras see: `outliers` is a share of gross errors, `clutter` the number of false roundels a frame."""
+    rng = np.random.default_rng(seed)
+    messages = []
+    for k, (name, camera) in enumerate(arena.truth.cameras.items()):
+        phase = k * period_ns // (3 * len(arena.truth.cameras)) if free_running else 0
+        for seq in range(int(seconds * 1e9 / period_ns)):
+            t_ns = seq * period_ns + phase
+            uv, axes, angles, seen = arena.see(name, t_ns)
+            seen &= rng.random(len(uv)) >= missing
+            rows = rng.permutation(np.flatnonzero(seen))
+            uv = uv[rows] + sigma_px * rng.standard_normal((len(rows), 2))
+            gross = rng.random(len(rows)) < outliers
+            uv[gross] += rng.uniform(-60, 60, (int(gross.sum()), 2))
+            columns = Roundels.from_points(
+                uv, max(sigma_px, 0.02), rows.astype(np.int32) if numbered else None
+            )
+            if sized:
+                columns = _with_sizes(columns, axes[rows], angles[rows])
+            if clutter:
+                columns = _add_clutter(columns, clutter, rng)
+            header = {
+                "camera": name,
+                "seq": seq,
+                "t_ns": t_ns,
+                "width": camera.width,
+                "height": camera.height,
+            }
+            messages.append(Detections.pack(columns, **header))
+    return messages
+
+
+def _with_sizes(roundels: Roundels, axes: Array, angles: Array) -> Roundels:
+    one = np.ones(len(roundels))
+    return Roundels(
+        roundels.uv, roundels.cov, axes, angles, 0.6 * one, 100 * one, roundels.id, roundels.track
+    )
+
+
+def _add_clutter(roundels: Roundels, count: int, rng: np.random.Generator) -> Roundels:
+    false = Roundels.from_points(rng.uniform([20, 20], [780, 580], (count, 2)), 0.1)
+    major = rng.uniform(10, 40, count)
+    false = _with_sizes(false, np.column_stack([major, 0.7 * major]), rng.uniform(-1.5, 1.5, count))
+    return Roundels(*(np.concatenate([getattr(roundels, n), getattr(false, n)]) for n in Roundels.__slots__))
+
+
+def errors(found: Rig, truth: Rig) -> tuple[float, float]:
+    """Largest error of a camera's position, m, and orientation, rad, after the best rigid motion of the world."""
+    names = list(found.placed())
+    A = np.array([found.cameras[n].matrix() for n in names])
+    B = np.array([truth.cameras[n].matrix() for n in names])
+    a, b = A[:, :3, 3], B[:, :3, 3]
+    cross = sum(y[:3, :3] @ x[:3, :3].T for x, y in zip(A, B, strict=True))
+    U, _, Vt = np.linalg.svd(cross + (b - b.mean(0)).T @ (a - a.mean(0)))
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    shift = np.linalg.norm((a - a.mean(0)) @ R.T - (b - b.mean(0)), axis=1).max()
+    turns = [cv2.Rodrigues(y[:3, :3].T @ R @ x[:3, :3])[0] for x, y in zip(A, B, strict=True)]
+    return float(shift), float(max(np.linalg.norm(turn) for turn in turns))

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`python -m calib` end to end: files in, a rig out; faults are one line and exit code 2."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from synthetic import Arena, errors, record, ring
+
+from calib.camera import Camera
+from calib.rig import Rig, load_rig, save_rig
+from camera_node.observations import write_observations
+from camera_node.pose import Pose, invert
+
+WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
+
+
+def calib(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "calib", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture
+def waved(tmp_path: Path) -> Arena:
+    """An arena whose intrinsics, wand and observations lie in `tmp_path`."""
+    arena = ring()
+    save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
+    (tmp_path / "wand.yaml").write_text(WAND_YAML)
+    write_observations(tmp_path / "observations.csv", record(arena, 6.0, sigma_px=0.1, numbered=True))
+    return arena
+
+
+def wand_options(folder: Path) -> list[object]:
+    return ["--wand", folder / "wand.yaml", "--rig", folder / "lenses.yaml", "--out", folder / "rig.yaml"]
+
+
+def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
+    done = calib("wand", *wand_options(tmp_path), "--observations", tmp_path / "observations.csv")
+    assert done.returncode == 0, done.stderr
+    assert "residual" in done.stdout
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert errors(rig, waved.truth) < (3e-3, 1.5e-3)  # as without the file: noise is 0.1 px
+    assert rig.calibration["cameras"]["cam0"]["observations"] > 50
+    rows = [f"{n},{','.join(map(str, c.matrix()[:3, 3]))}" for n, c in waved.truth.cameras.items()]
+    (tmp_path / "survey.csv").write_text("\n".join(["camera,x,y,z", *rows]))
+    surveyed = ("--positions", tmp_path / "survey.csv", "--out", tmp_path / "world.yaml")
+    done = calib("world", "--rig", tmp_path / "rig.yaml", *surveyed)
+    assert done.returncode == 0, done.stderr
+    for name, camera in load_rig(tmp_path / "world.yaml").cameras.items():
+        truth = waved.truth.cameras[name].matrix()
+        assert camera.matrix()[:3, 3] == pytest.approx(truth[:3, 3], abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "fault"),
+    [
+        ("wand.yaml", "diameter_m: 0.1\nmarkers: [[0,0,0],[0.2,0,0],[0.4,0,0]]\n", "symmetric"),
+        ("wand.yaml", "diameter_m: 0.1\nmarker: [[0,0,0]]\n", "unknown field"),
+        ("lenses.yaml", "cameras: {cam0: {time_offset_ms: 1.0}}\n", "no intrinsics"),
+        ("lenses.yaml", "cameras: [", "not valid YAML"),
+        ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n", "one camera"),
+        ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam9,1,1\n", "'cam9'"),
+        ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam1,1,1\n", "in no frame"),
+    ],
+)
+def test_a_fault_is_one_line_and_nothing_is_overwritten(
+    tmp_path: Path, waved: Arena, file: str, text: str, fault: str
+):
+    rows = (tmp_path / "observations.csv").read_text().splitlines()
+    unnumbered = [row.rsplit(",", 1)[0] for row in rows]
+    (tmp_path / "observations.csv").write_text("\n".join(unnumbered) + "\n")
+    (tmp_path / "rig.yaml").write_text("precious")
+    (tmp_path / file).write_text(text)
+    done = calib("wand", *wand_options(tmp_path), "--observations", tmp_path / "observations.csv")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.splitlines()) == 1
+    assert fault in done.stderr
+    assert (tmp_path / "rig.yaml").read_text() == "precious"
+
+
+def test_a_folder_of_one_camera_or_of_a_stranger_is_named(tmp_path: Path, waved: Arena):
+    frames = tmp_path / "frames"
+    (frames / "cam0").mkdir(parents=True)
+    done = calib("wand", *wand_options(tmp_path), "--frames", frames)
+    assert (done.returncode, "one camera, 'cam0'" in done.stderr) == (2, True)
+    (frames / "north").mkdir()
+    done = calib("wand", *wand_options(tmp_path), "--frames", frames)
+    assert (done.returncode, "north is no camera of the rig" in done.stderr) == (2, True)
+
+
+def test_frames_of_a_foreign_arena(tmp_path: Path, shared_data: Callable[[str], Path]):
+    """Four free-running cameras, rendered elsewhere: every camera within 3 mm and 0.1 degrees."""
+    recording = shared_data("arena_small")
+    told = json.loads((recording / "truth.json").read_text())["cameras"]
+    lenses = {name: _camera(entry) for name, entry in told.items()}
+    truth = {name: _camera(entry, placed=True) for name, entry in told.items()}
+    save_rig(Rig(cameras=lenses), tmp_path / "lenses.yaml")
+    (tmp_path / "wand.yaml").write_text(WAND_YAML)
+    done = calib("wand", *wand_options(tmp_path), "--frames", recording / "wand")
+    assert done.returncode == 0, done.stderr
+    found = load_rig(tmp_path / "rig.yaml")
+    assert set(found.placed()) == set(told)
+    assert errors(found, Rig(cameras=truth)) < (3e-3, np.radians(0.1))
+
+
+def _camera(entry: dict, placed: bool = False) -> Camera:
+    K = entry["K"]
+    return Camera(
+        width=entry["width"],
+        height=entry["height"],
+        fx=K[0][0],
+        fy=K[1][1],
+        cx=K[0][2],
+        cy=K[1][2],
+        distortion=tuple(entry["dist"]),
+        T_world_cam=Pose.from_matrix(invert(np.array(entry["T_cam_world"]))) if placed else None,
+    )
+
+
+def test_intrinsics_refuse_what_is_no_board_or_no_image(tmp_path: Path):
+    out = ("--out", tmp_path / "rig.yaml")
+    done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5by4", *out)
+    assert (done.returncode, "is no board" in done.stderr) == (2, True)
+    (tmp_path / "cam0").mkdir()
+    cv2.imwrite(str(tmp_path / "cam0" / "1.png"), np.zeros((40, 60), np.uint8))
+    done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)
+    assert (done.returncode, "the board is in 0 of 1 frames" in done.stderr) == (2, True)
+    (tmp_path / "cam0" / "2.png").write_text("no image")
+    done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert not (tmp_path / "rig.yaml").exists()

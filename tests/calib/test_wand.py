@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A waved wand places cameras: exactly without noise, honestly with it, loudly when it can't."""
+
+import msgspec
+import numpy as np
+import pytest
+from synthetic import WAND, Arena, errors, record, ring
+
+from calib.adjustment import world_motions
+from calib.errors import CalibrationError
+from calib.rig import Rig
+from calib.wand import calibrate
+from calib.world import move
+from camera_node.body import Body
+from camera_node.messages import Detections
+
+
+def run(arena: Arena, messages: list[Detections]):
+    return calibrate(arena.intrinsics, arena.wand, messages)
+
+
+def test_exact_without_noise_when_cameras_fire_together():
+    """What remains is the pixel's rounding and the hand's prior, far below a tenth of a millimetre."""
+    arena = ring()
+    result = run(arena, record(arena, free_running=False))
+    assert errors(result.rig, arena.truth) < (1e-4, 1e-4)
+    assert not result.report.unplaced
+    assert result.report.length_std_mm == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize(("seconds", "period_ms"), [(10, 100), (30, 300)], ids=["dense", "sparse"])
+def test_exact_without_noise_when_cameras_run_freely(seconds: float, period_ms: int):
+    """A quarter of a period apart at a metre a second, ignoring the times would cost centimetres."""
+    arena = ring()
+    result = run(arena, record(arena, seconds, period_ns=period_ms * 1_000_000))
+    assert errors(result.rig, arena.truth) < (2e-4, 2e-4)
+
+
+def test_reported_covariance_is_honest():
+    """Squared Mahalanobis errors of all cameras, the world's 6 motions taken out, follow chi-square with 6C - 6
+    degrees. The mean of 6 runs of 18 degrees has a standard deviation of sqrt(2 * 18 / 6) = 2.4: three are allowed,
+    and the claims may err upwards by a third (velocities counted as known, a floor of 0.02 px)."""
+    arena = ring()
+    squares = [_squared_mahalanobis(arena, seed) for seed in range(6)]
+    assert 18 / 1.33 - 7.3 < np.mean(squares) < 18 + 7.3
+
+
+def _squared_mahalanobis(arena: Arena, seed: int) -> float:
+    found = run(arena, record(arena, 6.0, sigma_px=0.1, seed=seed)).rig
+    names = sorted(found.cameras)
+    truth = np.array([arena.truth.cameras[n].matrix() for n in names])
+    found = move(found, truth[0] @ np.linalg.inv(found.cameras[names[0]].matrix()))
+    offsets = [np.linalg.inv(found.cameras[n].matrix()) @ T for n, T in zip(names, truth, strict=True)]
+    error = np.concatenate([[D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]] for D in offsets])
+    blocks = np.array([found.cameras[n].covariance for n in names])
+    # Cameras' errors are nearly independent of each other once the world's motions are taken out of them.
+    information = np.zeros((len(error), len(error)))
+    for k, block in enumerate(blocks):
+        information[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = np.linalg.inv(block)
+    gauge = world_motions(truth)
+    free = error - gauge @ np.linalg.solve(gauge.T @ information @ gauge, gauge.T @ information @ error)
+    return float(free @ information @ free)
+
+
+def test_gross_outliers_and_clutter_are_left_out_and_counted():
+    """Noise 0.1 px: position errors are some tenths of a millimetre; 3 mm is far beyond, and far below what 5 % of
+    errors of up to 60 px do to plain least squares."""
+    arena = ring()
+    numbered = run(arena, record(arena, sigma_px=0.1, outliers=0.05, numbered=True, sized=False))
+    assert errors(numbered.rig, arena.truth) < (3e-3, 1.5e-3)
+    assert len(numbered.report.outliers) == sum(row.outliers for row in numbered.report.cameras) > 10
+    cluttered = run(arena, record(arena, sigma_px=0.1, clutter=6, missing=0.05))
+    assert errors(cluttered.rig, arena.truth) < (3e-3, 1.5e-3)
+
+
+def test_no_camera_comes_first():
+    """Renaming the cameras backwards changes nothing but the names and the world."""
+    arena = ring()
+    messages = record(arena, 6.0, sigma_px=0.1)
+    names = sorted(arena.truth.cameras)
+    other = dict(zip(names, reversed(names), strict=True))
+    renamed = Arena(Rig(cameras={other[n]: c for n, c in arena.truth.cameras.items()}))
+    there = run(renamed, [msgspec.structs.replace(m, camera=other[m.camera]) for m in messages]).rig
+    here = run(arena, messages).rig
+    back = Rig(cameras={other[n]: c for n, c in there.cameras.items()})
+    assert errors(back, here) < (1e-5, 1e-5)
+
+
+def test_a_camera_that_shares_too_little_is_named_with_the_reason():
+    arena = ring()
+    messages = [m for m in record(arena) if m.camera != "cam3" or m.seq % 17 == 0]
+    result = run(arena, messages)
+    assert list(result.report.unplaced) == ["cam3"]
+    assert "shared with other cameras" in result.report.unplaced["cam3"]
+    assert result.rig.cameras["cam3"].T_world_cam is None
+    assert len(result.rig.placed()) == 3
+
+
+@pytest.mark.parametrize("markers", [1, 2, 4])
+def test_wands_of_other_numbers_of_markers(markers: int):
+    """One roundel of known size gives the scale by its size, to about a percent; two need numbers; four are a plane."""
+    points = ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.25, 0.0), (0.33, 0.13, 0.0))[:markers]
+    arena = ring(wand=Body(diameter_m=0.1, markers=points))
+    result = run(arena, record(arena, sigma_px=0.02, numbered=markers == 2))
+    assert len(result.rig.placed()) == 4
+    limit = 0.05 if markers == 1 else 1e-3
+    assert errors(result.rig, arena.truth) < (limit, limit)
+
+
+def test_a_light_without_size_gives_a_rig_up_to_scale():
+    arena = ring(wand=Body(diameter_m=0.1))
+    result = run(arena, record(arena, sigma_px=0.1, sized=False, seconds=20))
+    assert not result.report.metric
+    found = np.array([c.matrix()[:3, 3] for c in result.rig.cameras.values()])
+    truth = np.array([c.matrix()[:3, 3] for c in arena.truth.cameras.values()])
+    distances = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (found, truth)]
+    assert distances[0].max() == pytest.approx(1.0, abs=1e-3)
+    assert distances[0] == pytest.approx(distances[1] / distances[1].max(), abs=3e-3)
+
+
+def test_world_is_upright_and_under_the_wave():
+    """Cameras without roll: z is up to within their noise; the wave is a metre around the origin."""
+    arena = ring()
+    rig = run(arena, record(arena)).rig
+    heights = [camera.matrix()[2, 3] for camera in rig.cameras.values()]
+    truth = [camera.matrix()[2, 3] for camera in arena.truth.cameras.values()]
+    assert np.diff(heights) == pytest.approx(np.diff(truth), abs=2e-3)
+    assert 0 < min(heights) < max(heights) < 3
+
+
+def test_faults_are_named():
+    arena = ring()
+    messages = record(arena, 3.0)
+    symmetric = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), (0.5, 0.0, 0.0)))
+    with pytest.raises(CalibrationError, match=r"symmetric.*0\.250 m.*0\.500 m"):
+        calibrate(arena.intrinsics, symmetric, messages)
+    with pytest.raises(CalibrationError, match="one camera, 'cam0'"):
+        run(arena, [m for m in messages if m.camera == "cam0"])
+    with pytest.raises(CalibrationError, match="'north' of the recording is not in the rig"):
+        run(arena, [msgspec.structs.replace(m, camera="north") for m in messages])
+    with pytest.raises(CalibrationError, match="800 x 601 pixels, its intrinsics are for 800 x 600"):
+        run(arena, [msgspec.structs.replace(m, height=601) for m in messages])
+    alone = [m for m in messages if (m.t_ns // 1_000_000_000) % 4 == int(m.camera[3])]
+    with pytest.raises(CalibrationError, match="no two cameras ever saw the wand at once"):
+        run(arena, alone)
+    longer = Body(diameter_m=0.12, markers=tuple((4 * x, y, z) for x, y, z in WAND.markers))
+    with pytest.raises(CalibrationError, match="wand"):
+        calibrate(arena.intrinsics, longer, messages)

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Zenoh routers on loopback, and waiting with a deadline."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+
+from camera_node.errors import NetworkError
+from camera_node.network import open_client, open_router
+
+DEADLINE_S = 15.0  # generous: a loaded machine; nothing waits for it unless a test fails
+
+
+class Inbox:
+    """What a Zenoh callback gave, and a wait for more of it."""
+
+    def __init__(self) -> None:
+        self.items: list = []
+        self._changed = threading.Condition()
+
+    def put(self, item: object) -> None:
+        with self._changed:
+            self.items.append(item)
+            self._changed.notify_all()
+
+    def until(self, happened: Callable[[list], object]) -> bool:
+        """Wait until `happened(items)`; whether it did within the deadline."""
+        with self._changed:
+            return bool(self._changed.wait_for(lambda: happened(self.items), DEADLINE_S))
+
+
+def eventually(happened: Callable[[], object], act: Callable[[], object] = lambda: None) -> bool:
+    """Act every 10 ms until it has happened; whether it did within the deadline. For what tells nobody."""
+    pause, end = threading.Event(), time.monotonic() + DEADLINE_S
+    while not happened() and time.monotonic() < end:
+        act()
+        pause.wait(0.01)
+    return bool(happened())
+
+
+class Network:
+    """Routers and clients that are closed when the test ends."""
+
+    def __init__(self) -> None:
+        self._sessions: list[zenoh.Session] = []
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def router(self) -> zenoh.Session:
+        """A router on a port that nobody else took in the meantime; on the known endpoint while it is free."""
+        for _ in range(20):
+            try:
+                return self._keep(open_router([self.endpoint]))
+            except NetworkError:
+                self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        raise AssertionError("twenty ports were taken one after another")
+
+    def router_again(self) -> zenoh.Session:
+        """A router where clients already look for one."""
+        return self._keep(open_router([self.endpoint]))
+
+    def client(self) -> zenoh.Session:
+        return self._keep(open_client([self.endpoint]))
+
+    def _keep(self, session: zenoh.Session) -> zenoh.Session:
+        self._sessions.append(session)
+        return session
+
+    def close(self) -> None:
+        for session in reversed(self._sessions):
+            session.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    network = Network()
+    yield network
+    network.close()
+
+
+@pytest.fixture(name="eventually")
+def _eventually() -> Callable[..., bool]:
+    return eventually
+
+
+@pytest.fixture
+def inbox() -> Callable[[], Inbox]:
+    return Inbox

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Small scenes for tests: one camera above a plain floor, and a robot that stands where a test puts it."""
+
+from pathlib import Path
+
+import yaml
+
+from camera_node.scene import Scene
+
+LENS = {"width": 320, "height": 240, "fx": 300.0, "fy": 301.0, "cx": 158.3, "cy": 121.7}
+CAMERA = LENS | {"position_m": [0.0, -0.6, 2.0], "look_at_m": [0.0, 0.0, 0.0], "noise": 0.0}
+DISC = {"diameter_m": 0.2, "surround_ratio": 1.0, "inner_ratio": 0.1}  # all but black: nearly one ellipse
+
+
+def write_scene(folder: Path, robots: dict, motions: dict, cameras: dict | None = None, **fields) -> Path:
+    """Write scene.yaml, wand.yaml and robots.yaml; the robots are there from the epoch on."""
+    plain = {"wand": "wand.yaml", "robots": "robots.yaml", "wave_s": 0.0, "wand_motion": {}, "clutter": False}
+    scene = plain | {"cameras": cameras or {"cam0": CAMERA}, "robot_motions": motions} | fields
+    (folder / "wand.yaml").write_text(
+        yaml.safe_dump({"diameter_m": 0.1, "markers": [[0, 0, 0], [0.3, 0, 0]]})
+    )
+    (folder / "robots.yaml").write_text(yaml.safe_dump({"robots": robots}))
+    (folder / "scene.yaml").write_text(yaml.safe_dump(scene))
+    return folder / "scene.yaml"
+
+
+def load_disc(folder: Path, camera: dict | None = None, **motion) -> Scene:
+    """One robot "disc" that moves as `motion` says, before the camera "cam0"."""
+    return Scene.load(
+        write_scene(folder, {"disc": DISC}, {"disc": motion}, {"cam0": CAMERA | (camera or {})})
+    )

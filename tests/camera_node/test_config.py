@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Files that people write: an error names the file and the place in it."""
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from camera_node.body import Body
+from camera_node.config import load_yaml, write_atomically
+from camera_node.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("diameter_m: wide", r"\$\.diameter_m"),
+        ("diameter_m: 0.1\ncolour: red", "colour"),
+        ("diameter_m: 0.1\nmarkers: [[0, 0]]", r"\$\.markers\[0\]"),
+        ("diameter_m: -1", "diameter"),
+        ("{}", "diameter_m"),
+        ("[1, 2", "not valid YAML"),
+        ("", "object"),
+        ("a: \xff\x00", "YAML"),
+        ("diameter_m: 1\nmarkers: [[.nan, 0, 0]]", "finite"),
+    ],
+)
+def test_a_broken_file_is_named_with_the_place(tmp_path: Path, text: str, says: str):
+    path = tmp_path / "wand.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ConfigError, match=says) as caught:
+        load_yaml(path, Body)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"none\.yaml does not exist"):
+        load_yaml(tmp_path / "none.yaml", Body)
+    with pytest.raises(ConfigError, match="can't be read"):
+        load_yaml(tmp_path, Body)
+
+
+def test_writing_replaces_the_whole_file_and_leaves_nothing_else(tmp_path: Path):
+    path = tmp_path / "rig.yaml"
+    write_atomically(path, "old " * 1000)
+    write_atomically(path, "new: ä\n")
+    assert path.read_text(encoding="utf-8") == "new: ä\n"
+    assert list(tmp_path.iterdir()) == [path]
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_writing_into_a_missing_folder_says_so(tmp_path: Path):
+    with pytest.raises(ConfigError, match="is its folder there"):
+        write_atomically(tmp_path / "no" / "rig.yaml", "")

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cameras by Video4Linux, as far as they go without one: names, settings, times, and a source that fails.
+
+A short video file, opened by OpenCV like a camera, stands for a camera that stops delivering after its last frame.
+"""
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.device import DeviceSource, camera_names, capture_time, find_device, open_capture, properties
+from camera_node.errors import CameraError
+from camera_node.source import SourceSettings, open_source
+
+
+@pytest.fixture
+def sys_root(tmp_path: Path) -> Path:
+    """A /sys/class/video4linux of two equal cameras, each with a metadata device, and a third."""
+    for number, (name, index) in enumerate(
+        [("HD Webcam", 0), ("HD Webcam", 1), ("HD Webcam", 0), ("HD Webcam", 1), ("Arducam OV9281", 0)]
+    ):
+        entry = tmp_path / f"video{number}"
+        entry.mkdir()
+        (entry / "name").write_text(name + "\n")
+        (entry / "index").write_text(f"{index}\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("text", "device"),
+    [("2", "/dev/video2"), ("/dev/video7", "/dev/video7"), ("Arducam OV9281", "/dev/video4")],
+)
+def test_cameras_are_found_by_number_path_and_name(sys_root: Path, text: str, device: str):
+    assert find_device(text, sys_root) == Path(device)
+
+
+def test_metadata_devices_are_no_cameras(sys_root: Path):
+    assert [str(path) for path in camera_names(sys_root)] == ["/dev/video0", "/dev/video2", "/dev/video4"]
+
+
+def test_names_of_no_or_several_cameras_are_told(sys_root: Path, tmp_path: Path):
+    with pytest.raises(CameraError, match=r"several .* /dev/video0, /dev/video2"):
+        find_device("HD Webcam", sys_root)
+    with pytest.raises(CameraError, match=r"'nope'; cameras present: .*/dev/video4 \(Arducam OV9281\)"):
+        find_device("nope", sys_root)
+    with pytest.raises(CameraError, match="has no camera"):
+        find_device("nope", tmp_path / "none")
+
+
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(CameraError, match="/dev/video99 does not exist"):
+        open_source("99", SourceSettings())
+    with pytest.raises(CameraError, match="is no camera"):
+        open_capture(Path("/dev/null"), SourceSettings())
+
+
+def test_settings_become_properties_in_the_order_that_v4l2_needs():
+    """The format comes before the size and the rate; an exposure counts 100 us, in manual mode (1)."""
+    settings = SourceSettings(width=1280, height=720, fps=60, exposure_us=1520, gain=8, fourcc="MJPG")
+    assert properties(settings) == [
+        (cv2.CAP_PROP_FOURCC, 0x47504A4D),
+        (cv2.CAP_PROP_FRAME_WIDTH, 1280),
+        (cv2.CAP_PROP_FRAME_HEIGHT, 720),
+        (cv2.CAP_PROP_FPS, 60),
+        (cv2.CAP_PROP_AUTO_EXPOSURE, 1),
+        (cv2.CAP_PROP_EXPOSURE, 15),
+        (cv2.CAP_PROP_GAIN, 8),
+    ]
+    assert properties(SourceSettings()) == []
+    assert properties(SourceSettings(exposure_us=1))[1] == (cv2.CAP_PROP_EXPOSURE, 1)
+
+
+UNIX, MONOTONIC, MS = 1_700_000_000_000_000_000, 5_000_000_000_000, 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("stamp_ms", "exposure_us", "expected"),
+    [
+        (5_000_000 - 20, 0, UNIX - 20 * MS),  # 20 ms old
+        (5_000_000 - 20, 4000, UNIX - 22 * MS),  # and the middle of its 4 ms
+        (0, 4000, UNIX - 2 * MS),  # no stamp: the time of the grab
+        (5_000_000 + 20, 0, UNIX),  # from the future
+        (5_000_000 - 1500, 0, UNIX),  # too old to be true
+        (float("nan"), 0, UNIX),
+    ],
+)
+def test_buffer_stamps_become_unix_times(stamp_ms: float, exposure_us: float, expected: int):
+    """Doubles of this size resolve 256 ns."""
+    assert abs(capture_time(stamp_ms, MONOTONIC, UNIX, exposure_us) - expected) <= 256
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "camera.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
+    for level in (50, 100, 150):
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
+    """Every opening fails every other time, as a camera that is plugged in again; frames come all the same."""
+    caplog.set_level(logging.WARNING, "camera_node.device")
+    openings = iter(range(1000))
+
+    def open_video(path: Path, settings: SourceSettings) -> cv2.VideoCapture:
+        if next(openings) % 3 == 1:
+            raise CameraError("not yet")
+        return cv2.VideoCapture(str(path))
+
+    source = DeviceSource(video, SourceSettings(), open_video, reopen_s=0.01)
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        if len(caplog.records) >= 4:
+            source.close()
+    assert {frame.image.shape for frame in frames} == {(48, 64)}
+    assert [frame.t_ns for frame in frames] == sorted(frame.t_ns for frame in frames)
+    told = [record.getMessage() for record in caplog.records]
+    assert all("stopped delivering" in line for line in told[::2])
+    assert all("delivers again" in line for line in told[1::2])
+
+
+def test_the_newest_frame_is_taken_and_others_are_counted(video: Path, eventually):
+    """Who comes late gets the last frame; what nobody took is counted."""
+    source = DeviceSource(video, SourceSettings(), lambda path, _: cv2.VideoCapture(str(path)), reopen_s=100)
+    assert eventually(lambda: source.dropped == 2)
+    frame = next(iter(source))
+    assert abs(int(frame.image[0, 0]) - 150) <= 3  # JPEG
+    source.close()
+    assert list(source) == []

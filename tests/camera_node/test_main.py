@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command line: what a user did wrong is one line and exit code 2."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "camera_node", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--source", "99"], "/dev/video99 does not exist"),
+        (["--source", "nowhere"], "no folder, video or camera 'nowhere'"),
+        (["--source", "sim"], "--scene FILE"),
+        (["--source", "FRAMES", "--name", "a/b"], "--name 'a/b'"),
+        (["--source", "FRAMES", "--arena", "*"], "--arena '*'"),
+        (["--source", "FRAMES", "--connect", "server"], "tcp/host:7447"),
+        (["--source", "FRAMES", "--inner-ratios", "7"], "inner_ratios"),
+        (["--source", "FRAMES", "--zenoh", "none.json5"], "none.json5 does not exist"),
+        (["--source", "FRAMES", "--fourcc", "JPEG2000"], "four letters"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path: Path, arguments: list[str], says: str):
+    (tmp_path / "0.png").write_bytes(b"no image")
+    arguments = [str(tmp_path) if argument == "FRAMES" else argument for argument in arguments]
+    done = run(*arguments, *([] if "--name" in arguments else ["--name", "cam0"]))
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_help_and_wrong_options():
+    assert "--source" in run("--help").stdout
+    wrong = run("--colour", "red")
+    assert wrong.returncode == 2
+    assert "Traceback" not in wrong.stderr

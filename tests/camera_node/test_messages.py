@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Messages: they arrive as they were sent, and bytes that are no message are told apart whatever they are."""
+
+import contextlib
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import calib.messages
+import camera_node.messages
+import fusion.messages
+from camera_node.messages import (
+    MAX_ROUNDELS,
+    CameraStatus,
+    ClockReply,
+    Detections,
+    MessageError,
+    Settings,
+    decode,
+    encode,
+)
+from camera_node.roundels import Roundels
+from fusion.messages import FusionStatus, Markers, RobotPose
+
+KINDS = (Detections, CameraStatus, ClockReply, Settings, Markers, RobotPose, FusionStatus)
+HEADER = {"camera": "cam0", "seq": 3, "t_ns": 1_700_000_000_000_000_000, "width": 640, "height": 480}
+
+
+@st.composite
+def roundels(draw: st.DrawFn) -> Roundels:
+    """Columns such as a detector gives: centres in range, positive definite covariances, the rest as it comes."""
+    n = draw(st.integers(0, 20))
+
+    def column(*shape: int, low=-1e4, high=1e4):
+        return draw(hnp.arrays(float, (n, *shape), elements=st.floats(low, high, width=32)))
+
+    root = column(2, 2, low=-2.0, high=2.0)
+    cov = root @ root.swapaxes(1, 2) + 0.01 * np.eye(2)
+    number = draw(hnp.arrays(np.int32, n))
+    return Roundels(
+        column(2), cov, column(2), column(), column(), np.full(n, np.nan), number, np.full(n, -1, np.int32)
+    )
+
+
+@given(roundels())
+def test_detections_arrive_as_they_were_sent(sent: Roundels):
+    """Centres to the bit; the other columns travel as float32, to half a unit in its last place or its least number."""
+    got = decode(encode(Detections.pack(sent, **HEADER)), Detections).unpack()
+    assert np.array_equal(got.uv, sent.uv)
+    np.testing.assert_allclose(got.cov, sent.cov, rtol=2.0**-24, atol=2.0**-149)
+    for name in ("axes_px", "angle_rad", "ratio", "contrast", "id", "track"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
+
+
+@given(st.binary(max_size=400), st.sampled_from(KINDS))
+def test_random_bytes_are_no_message(data: bytes, kind: type[msgspec.Struct]):
+    """Random bytes decode to nothing but MessageError (or, for a message of defaults alone, to a message)."""
+    with contextlib.suppress(MessageError):
+        assert isinstance(decode(data, kind), kind)
+
+
+@given(st.data())
+def test_truncated_and_altered_messages_are_caught(data: st.DataObject):
+    """A message cut short is none; with any bytes replaced it is a message or a MessageError, never another error."""
+    whole = bytearray(encode(Detections.pack(Roundels.from_points(np.ones((3, 2)), 0.3), **HEADER)))
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(MessageError):
+        decode(bytes(whole[:cut]), Detections)
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)
+    ):
+        whole[place] = value
+    try:
+        message = decode(bytes(whole), Detections)
+        assert np.isfinite(message.unpack().uv).all()
+    except MessageError:
+        pass
+
+
+COLUMNS = ("uv", "cov", "axes_px", "angle_rad", "ratio", "contrast", "id", "track")
+GOOD = Detections.pack(Roundels.from_points(np.ones((2, 2)), 0.3), **HEADER)
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_columns_of_other_lengths_are_refused(column: str):
+    with pytest.raises(MessageError, match="column"):
+        decode(encode(msgspec.structs.replace(GOOD, **{column: getattr(GOOD, column) + b"\0"})), Detections)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"uv": np.array([math.nan, 1, 1, 1]).tobytes()},
+        {"uv": np.array([1e300, 1, 1, 1]).tobytes()},
+        {"cov": np.array([math.inf, 0, 0, 1, 0, 1], "<f4").tobytes()},
+        {"cov": np.array([1, 1, 1, 1, 0, 1], "<f4").tobytes()},
+        {"width": 0},
+        {"height": 10**6},
+        {"t_ns": -1},
+        {"exposure_us": math.nan},
+        {"detect_us": math.inf},
+        {"camera": ""},
+        {"version": 2},
+    ],
+    ids=str,
+)
+def test_impossible_content_is_refused(change: dict):
+    with pytest.raises(MessageError):
+        decode(encode(msgspec.structs.replace(GOOD, **change)), Detections)
+
+
+def test_a_message_that_claims_too_many_roundels_is_refused():
+    many = Detections.pack(Roundels.from_points(np.ones((MAX_ROUNDELS + 1, 2)), 0.3), **HEADER)
+    with pytest.raises(MessageError):
+        decode(encode(many), Detections)
+
+
+def test_a_newer_sender_may_add_fields():
+    """Fields that this program does not know are skipped, so that a version need not change for them."""
+    fields = msgspec.msgpack.decode(encode(GOOD)) | {"colour": "red"}
+    assert decode(msgspec.msgpack.encode(fields), Detections) == GOOD
+
+
+def test_every_field_is_documented():
+    """docs/messages.md names every message of the three packages and every field of it in its own section."""
+    sections = (Path(__file__).parents[2] / "docs" / "messages.md").read_text().split("\n## ")
+    for module in (camera_node.messages, calib.messages, fusion.messages):
+        for name, kind in vars(module).items():
+            if (
+                isinstance(kind, type)
+                and issubclass(kind, msgspec.Struct)
+                and kind.__module__ == module.__name__
+            ):
+                section = next((s for s in sections if s.startswith(name + "\n")), None)
+                assert section, f"{name} has no section"
+                missing = [field for field in kind.__struct_fields__ if f"| `{field}` |" not in section]
+                assert not missing, f"{name} lacks {missing}"

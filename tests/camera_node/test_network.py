@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Zenoh sessions: they open without a router, find it, survive its loss, and are relayed to one another."""
+
+import logging
+import threading
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from camera_node.errors import ConfigError, NetworkError
+from camera_node.network import ServerWatch, open_client, open_router
+
+
+class Ticker:
+    """Puts a counter every 10 ms until it is stopped."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._publisher = session.declare_publisher(key)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            self._publisher.put(b"tick")
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(5)
+
+
+@pytest.fixture
+def ticking(network):
+    """A client that puts to a/b before there is a router."""
+    ticker = Ticker(network.client(), "a/b")
+    yield
+    ticker.close()
+
+
+def test_a_client_delivers_when_the_router_comes_up_and_when_it_comes_again(network, inbox, ticking):
+    for _ in range(2):
+        router, got = network.router_again(), inbox()
+        router.declare_subscriber("a/b", got.put)
+        assert got.until(len)
+        router.close()
+
+
+def test_the_router_relays_between_clients(network, inbox, ticking):
+    """What a camera publishes reaches a viewer, not only the server: publications, queries and liveliness."""
+    got, alive = inbox(), inbox()
+    network.router_again()
+    viewer, camera = network.client(), network.client()
+    viewer.declare_subscriber("a/b", got.put)
+    viewer.liveliness().declare_subscriber("a/alive", alive.put, history=True)
+    token = camera.liveliness().declare_token("a/alive")
+    queryable = camera.declare_queryable("a/q", lambda query: query.reply("a/q", b"answer"))
+    assert got.until(len)
+    assert alive.until(len)
+    assert [reply.ok.payload.to_string() for reply in viewer.get("a/q", timeout=5.0) if reply.ok] == [
+        "answer"
+    ]
+    token.undeclare()
+    assert alive.until(lambda samples: samples[-1].kind == zenoh.SampleKind.DELETE)
+    queryable.undeclare()
+
+
+def test_a_taken_port_is_named(network):
+    network.router()
+    with pytest.raises(NetworkError, match=network.endpoint.rsplit(":", 1)[1]) as caught:
+        open_router([network.endpoint])
+    assert "another server" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("endpoint", ["foo", "", "carrier-pigeon/roof:1"])
+def test_endpoints_that_are_none_are_named(endpoint: str):
+    for open_session in (open_client, open_router):
+        with pytest.raises(NetworkError, match="tcp/"):
+            open_session([endpoint]).close()
+
+
+def test_a_zenoh_configuration_is_used_or_named(tmp_path: Path, network):
+    with pytest.raises(ConfigError, match=r"none\.json5 does not exist"):
+        open_client([network.endpoint], tmp_path / "none.json5")
+    broken = tmp_path / "broken.json5"
+    for text in ("{", '{"nonsense": 1}'):
+        broken.write_text(text)
+        with pytest.raises(ConfigError, match="is no Zenoh configuration"):
+            open_client([network.endpoint], broken)
+    good = tmp_path / "good.json5"
+    good.write_text('{ id: "c0ffee" }')
+    with open_client([network.endpoint], good) as session:
+        assert str(session.zid()) == "c0ffee"
+
+
+def test_puts_while_the_router_is_away_are_not_kept(network, inbox, eventually):
+    """10,000 puts of 4 kB would be 40 MB: the first that arrives is a later one."""
+    publisher = network.client().declare_publisher("a/b")
+    for _ in range(10_000):
+        publisher.put(bytes(4096))
+    got = inbox()
+    network.router_again().declare_subscriber("a/b", got.put)
+    assert eventually(lambda: got.items, lambda: publisher.put(b"fresh"))
+    assert got.items[0].payload.to_bytes() == b"fresh"
+
+
+def test_the_servers_coming_and_going_is_told_once_each(network, eventually, caplog):
+    """However often the absence is looked at; a server that was never seen is away as well."""
+    caplog.set_level(logging.WARNING, "camera_node.network")
+    watch = ServerWatch(network.client(), "a/alive", patience_s=0.0)
+
+    def told() -> list[str]:
+        return [record.getMessage().split(";")[0] for record in caplog.records]
+
+    for _ in range(3):
+        watch.tell_absence()
+    assert told() == ["the server is away"]
+    token = network.router_again().liveliness().declare_token("a/alive")
+    assert eventually(lambda: len(told()) == 2)
+    token.undeclare()
+    assert eventually(lambda: len(told()) == 3, watch.tell_absence)
+    watch.tell_absence()
+    assert told() == ["the server is away", "the server is there again", "the server is away"]
+    watch.close()

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The node over real Zenoh: what it publishes, what it answers, and how it ends."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+
+from camera_node.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
+from camera_node.node import Node
+from camera_node.source import SourceSettings, open_source
+
+MS = 1_000_000
+START = 1_700_000_000_000_000_000
+CENTRE = (160.25, 120.5)
+KEYS = Keys("arena")
+
+
+def render() -> np.ndarray:
+    """A frontal roundel of 48 px at CENTRE on a white card, drawn 16 times finer, averaged and blurred."""
+    scale, grey = 16, np.full((240 * 16, 320 * 16), 90, np.uint8)
+    u, v = ((c + 0.5) * scale - 0.5 for c in CENTRE)
+    for diameter, level in ((62, 230), (48, 30), (28.8, 230)):
+        cv2.circle(grey, (round(u), round(v)), round(diameter * scale / 2), level, -1)
+    return cv2.GaussianBlur(cv2.resize(grey, (320, 240), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty frames, 50 ms apart."""
+    folder, image = tmp_path_factory.mktemp("frames"), render()
+    for k in range(40):
+        cv2.imwrite(str(folder / f"{START + 50 * MS * k}.png"), image)
+    return folder
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Path:
+    """A minute of frames, one every 100 ms, of one file."""
+    folder = tmp_path / "slow"
+    folder.mkdir()
+    first = folder / "0.png"
+    cv2.imwrite(str(first), render())
+    for k in range(1, 600):
+        (folder / f"{100 * MS * k}.png").symlink_to(first)
+    return folder
+
+
+@pytest.fixture
+def running(network):
+    """`running(folder)`: a node in a thread, until the test ends."""
+    nodes: list[tuple[Node, threading.Thread]] = []
+
+    def start(folder: Path, **settings) -> Node:
+        source = open_source(str(folder), SourceSettings(**settings))
+        keep_stamps = settings.get("stamps", "recorded") == "recorded"
+        node = Node("cam0", source, network.client(), keep_stamps=keep_stamps)
+        thread = threading.Thread(target=node.run)
+        thread.start()
+        nodes.append((node, thread))
+        return node
+
+    yield start
+    for node, thread in nodes:
+        node.close()
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def subscribe(session: zenoh.Session, key: str, kind: type, inbox):
+    box = inbox()
+    session.declare_subscriber(key, lambda sample: box.put(decode(sample.payload.to_bytes(), kind)))
+    return box
+
+
+def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, frames):
+    """In order, with the roundel where it was drawn, to 0.1 px: drawing on whole sub-pixels takes 0.03."""
+    got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
+    running(frames)
+    assert got.until(lambda messages: len(messages) == 40)
+    assert [message.t_ns for message in got.items] == [START + 50 * MS * k for k in range(40)]
+    assert [message.seq for message in got.items] == list(range(40))
+    assert {(message.camera, message.width, message.height) for message in got.items} == {("cam0", 320, 240)}
+    for message in got.items:
+        np.testing.assert_allclose(message.unpack().uv, [CENTRE], atol=0.1)
+        assert message.detect_us > 0
+
+
+def test_the_status_comes_once_a_second_and_the_token_goes_with_the_node(network, inbox, running, slow):
+    """10 frames a second are sent; a loaded machine may slip a few of them from one second to the next."""
+    router, alive = network.router(), inbox()
+    statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
+    subscribe(router, KEYS.detections(), Detections, inbox)
+    router.liveliness().declare_subscriber(KEYS.camera_alive(), alive.put, history=True)
+    begun = time.monotonic()
+    node = running(slow)
+    assert statuses.until(lambda items: len(items) == 2)
+    assert time.monotonic() - begun >= 2
+    status = statuses.items[0]
+    assert (status.camera, status.width, status.height, status.roundels) == ("cam0", 320, 240, 1.0)
+    assert (status.dropped, status.refused, status.advice) == (0, 0, "")
+    assert 4 <= status.fps <= 16
+    assert status.clock_offset_ms is None
+    node.close()
+    assert alive.until(lambda samples: len(samples) == 2)
+    assert [sample.kind for sample in alive.items] == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE]
+
+
+def test_stamps_are_in_the_servers_time(network, inbox, running, slow):
+    """A server whose clock is an hour ahead: stamps follow, to the half of the round trip that the status tells."""
+    hour, router = 3600 * 10**9, network.router()
+    router.declare_queryable(
+        KEYS.clock, lambda query: query.reply(KEYS.clock, encode(ClockReply(time.time_ns() + hour)))
+    )
+    got = subscribe(router, KEYS.detections(), Detections, inbox)
+    statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
+    running(slow, stamps="now")
+    assert statuses.until(lambda items: items and items[-1].clock_offset_ms is not None)
+    status = statuses.items[-1]
+    assert abs(status.clock_offset_ms - 3_600_000) <= status.clock_error_ms
+    assert got.until(lambda items: items and items[-1].t_ns > time.time_ns() + hour // 2)
+
+
+def ask(session: zenoh.Session, key: str, payload: bytes | None = None) -> tuple[bool, bytes]:
+    """The first reply: whether it is no error, and its payload."""
+    for reply in session.get(key, payload=payload, timeout=10.0):
+        answer = reply.ok or reply.err
+        assert answer
+        return bool(reply.ok), answer.payload.to_bytes()
+    raise AssertionError(f"no reply from {key}")
+
+
+def test_a_snapshot_is_a_picture(network, inbox, running, slow):
+    """At full quality JPEG loses a few grey levels; a bad quality is refused."""
+    router = network.router()
+    got = subscribe(router, KEYS.detections(), Detections, inbox)
+    running(slow)
+    assert got.until(lambda items: len(items) > 1)
+    ok, data = ask(router, KEYS.snapshot("cam0") + "?quality=100")
+    assert ok
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    assert np.abs(image.astype(int) - render()).max() <= 8
+    assert len(ask(router, KEYS.snapshot("cam0") + "?quality=5")[1]) < len(data)
+    assert not ask(router, KEYS.snapshot("cam0") + "?quality=best")[0]
+
+
+def test_settings_are_told_and_taken(network, inbox, running, slow):
+    """A mask over the roundel hides it; msgpack and JSON are answered in kind; nonsense is refused and counted."""
+    router, key = network.router(), KEYS.settings("cam0")
+    got = subscribe(router, KEYS.detections(), Detections, inbox)
+    statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
+    running(slow)
+    assert got.until(lambda items: items and len(items[-1]) == 1)
+    assert decode(ask(router, key)[1], Settings) == Settings(mask=())
+    ok, reply = ask(router, key, b'{"mask": [[100, 100, 200, 200]]}')
+    assert ok
+    assert msgspec.json.decode(reply, type=Settings).mask == ((100, 100, 200, 200),)
+    assert got.until(lambda items: len(items[-1]) == 0)
+    assert ask(router, key, encode(Settings(mask=(), min_contrast=20)))[0]
+    assert got.until(lambda items: len(items[-1]) == 1)
+    bad = [
+        b"\xff",
+        b'{"colour": 1}',
+        b'{"gain": 3}',
+        b'{"exposure_us": -1}',
+        b'{"min_contrast": 0}',
+        b"{" * 5000,
+        b'{"mask": [[0, 0, 1e999, 1]]}',
+    ]
+    for payload in bad:
+        ok, reply = ask(router, key, payload)
+        assert not ok
+        assert reply
+    assert statuses.until(lambda items: items and items[-1].refused == len(bad))
+
+
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
+def test_the_program_outlives_the_servers_absence(network, inbox, eventually, slow, tmp_path, stop):
+    """Started before the router: it says so once, delivers when the router comes, and a signal ends it with code 0."""
+    errors = tmp_path / "stderr"
+    command = [sys.executable, "-m", "camera_node", "--source", str(slow), "--name", "cam0"]
+    with errors.open("w") as file:
+        node = subprocess.Popen([*command, "--connect", network.endpoint], stderr=file)
+    try:
+        assert eventually(lambda: "the server is away" in errors.read_text())
+        router = network.router_again()
+        got = subscribe(router, KEYS.detections(), Detections, inbox)
+        token = router.liveliness().declare_token(KEYS.fusion_alive)
+        assert got.until(len)
+        assert eventually(lambda: "the server is there again" in errors.read_text())
+        node.send_signal(stop)
+        assert node.wait(10) == 0
+        token.undeclare()
+        assert errors.read_text().count("the server is away") == 1
+        assert "Traceback" not in errors.read_text()
+    finally:
+        node.kill()
+        node.wait(10)

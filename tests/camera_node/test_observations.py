@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""observations.csv: what is written is read again, and a broken row is named by its line."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.errors import CameraError, ConfigError
+from camera_node.messages import Detections
+from camera_node.observations import detect_frames, read_observations, write_observations
+from camera_node.roundels import Roundels
+
+
+def message(camera: str, seq: int, t_ns: int, uv: np.ndarray, numbers: list[int]) -> Detections:
+    roundels = Roundels.from_points(uv, 0.3, np.array(numbers, np.int32))
+    return Detections.pack(roundels, camera=camera, seq=seq, t_ns=t_ns, width=640, height=480)
+
+
+def test_observations_survive_the_file(tmp_path: Path):
+    """Pixels are written to four decimals: half of the last one may be lost."""
+    rng, path = np.random.default_rng(2), tmp_path / "observations.csv"
+    sent = [
+        message(camera, k, 10**18 + 33 * k + i, rng.uniform(0, 480, (3, 2)), [k, -1, 7])
+        for k in range(4)
+        for i, camera in enumerate(("cam0", "north-2"))
+    ]
+    write_observations(path, sent)
+    got = read_observations(path, {"cam0": (640, 480), "north-2": (640, 480)})
+    assert [(m.camera, m.seq, m.t_ns, m.width) for m in got] == [
+        (m.camera, m.seq, m.t_ns, m.width) for m in sorted(sent, key=lambda m: m.t_ns)
+    ]
+    for a, b in zip(got, sent, strict=True):
+        np.testing.assert_allclose(a.unpack().uv, b.unpack().uv, atol=0.5001e-4)
+        np.testing.assert_array_equal(a.unpack().id, b.unpack().id)
+        a.check()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("t_ns,camera,u\n1,a,2\n", "lacks the column v"),
+        ("t_ns,camera,u,v\n", "holds no observations"),
+        ("", "lacks the column"),
+        ("t_ns,camera,u,v\n1,a,2,3\n1.5,a,2,3\n", "line 3"),
+        ("t_ns,camera,u,v\n1,a,nan,3\n", "line 2"),
+        ("t_ns,camera,u,v\n1,a,2\n", "line 2"),
+        ("t_ns,camera,u,v\n-1,a,2,3\n", "line 2"),
+        ("t_ns,camera,u,v\n1,,2,3\n", "line 2"),
+        ("t_ns,camera,u,v,marker\n1,a,2,3,x\n", "line 2"),
+        ("t_ns,camera,u,v,marker\n1,a,2,3,99999999999\n", "line 2"),
+        ("t_ns,camera,u,v\n99999999999999999999,a,2,3\n", "line 2"),
+    ],
+)
+def test_a_broken_file_is_named_with_its_line(tmp_path: Path, text: str, says: str):
+    path = tmp_path / "observations.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=says) as caught:
+        read_observations(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_and_bytes_are_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match="can't be read"):
+        read_observations(tmp_path / "none.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="no text"):
+        read_observations(tmp_path / "bytes.csv")
+    with pytest.raises(ConfigError, match="is its folder there"):
+        write_observations(tmp_path / "no" / "o.csv", [])
+
+
+def test_folders_without_cameras_are_named(tmp_path: Path):
+    with pytest.raises(CameraError, match="is no folder"):
+        detect_frames(tmp_path / "none")
+    with pytest.raises(CameraError, match="holds no folder of a camera"):
+        detect_frames(tmp_path)
+
+
+def test_a_recording_of_real_cameras_reads(shared_data: Callable[[str], Path]):
+    messages = read_observations(shared_data("webcams") / "wand_observations.csv")
+    assert {m.camera for m in messages} == {"cam_0", "cam_1", "cam_2", "cam_3"}
+    assert [m.t_ns for m in messages] == sorted(m.t_ns for m in messages)
+    for m in messages:
+        m.check()

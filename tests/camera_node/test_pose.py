@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Poses form a group, and quaternions lose nothing."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from camera_node.pose import (
+    Pose,
+    invert,
+    look_at,
+    rotation_from_vector,
+    rotation_from_wxyz,
+    wxyz_from_rotation,
+)
+
+EPS = 1e-12  # a few hundred roundings of numbers near 1
+coordinate = st.floats(-10, 10)
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.01)
+poses = st.builds(Pose, st.tuples(coordinate, coordinate, coordinate), quaternions)
+half_turns = st.tuples(st.just(0.0), *[st.floats(-1, 1)] * 3).filter(lambda q: np.linalg.norm(q) > 0.01)
+
+
+@given(poses, poses, poses)
+def test_poses_form_a_group(a: Pose, b: Pose, c: Pose):
+    """Associative, with inverse on either side; entries reach 50, hence the factor."""
+    A, B, C = a.matrix(), b.matrix(), c.matrix()
+    np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=50 * EPS)
+    np.testing.assert_allclose(A @ invert(A), np.eye(4), atol=50 * EPS)
+    np.testing.assert_allclose(invert(A @ B), invert(B) @ invert(A), atol=50 * EPS)
+
+
+@given(quaternions | half_turns)
+def test_a_rotation_survives_its_quaternion(q: tuple[float, ...]):
+    """Also a half turn, where w is 0 and the trace tells nothing."""
+    R = rotation_from_wxyz(q)
+    wxyz = wxyz_from_rotation(R)
+    assert wxyz[0] >= 0
+    assert np.linalg.norm(wxyz) == pytest.approx(1, abs=EPS)
+    np.testing.assert_allclose(rotation_from_wxyz(wxyz), R, atol=EPS)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=EPS)
+    assert np.linalg.det(R) == pytest.approx(1, abs=EPS)
+
+
+@given(poses)
+def test_a_pose_survives_its_matrix(pose: Pose):
+    np.testing.assert_allclose(Pose.from_matrix(pose.matrix()).matrix(), pose.matrix(), atol=EPS)
+
+
+def test_a_vector_turns_about_its_axis():
+    np.testing.assert_allclose(rotation_from_vector([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=EPS)
+    np.testing.assert_allclose(rotation_from_vector([0, 0, 0]), np.eye(3), atol=EPS)
+
+
+def test_a_camera_looks_at_its_target_upright():
+    T = look_at([4, 1, 3], [0, 0, 0])
+    centre = invert(T) @ [0, 0, 0, 1]
+    np.testing.assert_allclose(centre[:2], 0, atol=10 * EPS)
+    assert centre[2] > 0
+    assert T[2, 1] < 0  # image y is down in the world
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+
+
+def test_a_camera_that_looks_straight_down_has_no_upright():
+    with pytest.raises(ValueError, match="straight above"):
+        look_at([0, 0, 3], [0, 0, 0])
+
+
+@pytest.mark.parametrize("pose", [((0, 0, 0), (0, 0, 0, 0)), ((float("nan"), 0, 0), (1, 0, 0, 0))])
+def test_impossible_poses_are_refused(pose: tuple):
+    with pytest.raises(ValueError, match=r"zero|finite"):
+        Pose(*pose)

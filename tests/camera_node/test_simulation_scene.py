@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The scene: motions, faults in its files, and what the demo's scene promises to everything that stands on it."""
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scenes import CAMERA, DISC, load_disc, write_scene
+
+from camera_node.body import Body
+from camera_node.errors import ConfigError
+from camera_node.lens import load_lens
+from camera_node.pose import Array, invert
+from camera_node.rendering import discs_of
+from camera_node.scene import Scene, SceneCamera
+
+DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml"
+
+
+@pytest.fixture(scope="module")
+def demo() -> Scene:
+    return Scene.load(DEMO)
+
+
+def view_minor_px(camera: SceneCamera, body: Body, T_world_body: Array) -> float:
+    """Minor axis in pixels of the body's flattest black disc; 0 unless all cards are whole in the image."""
+    smallest = np.inf
+    for disc in discs_of(body, invert(camera.T_world_cam) @ T_world_body):
+        uv = camera.project(disc.outline())
+        inside = (uv > 0).all() and (uv < (camera.width - 1, camera.height - 1)).all()
+        if not (disc.faces_camera and inside):
+            return 0.0
+        # Points evenly around an ellipse of half-axis b have the variance b^2 / 2 along it.
+        half = np.sqrt(2 * np.linalg.eigvalsh(np.cov(uv.T, bias=True))[0]) * np.cos(np.pi / len(uv))
+        smallest = min(smallest, 2 * half * disc.radii[1] / disc.radii[0])
+    return float(smallest)
+
+
+def test_robots_are_large_in_three_cameras_at_all_times(demo):
+    """12 px is what every detector of the peers needs; three cameras keep a robot when one is in the way."""
+    for t_s in np.arange(demo.wave_s, demo.wave_s + 90, 0.25):
+        for name, (body, T) in demo.bodies_at(t_s).items():
+            minors = [view_minor_px(camera, body, T) for camera in demo.cameras.values()]
+            assert sum(minor >= 12 for minor in minors) >= 3, (name, t_s, minors)
+
+
+def test_robots_keep_apart(demo):
+    """0.35 m between any two roundels' bodies' origins: none drives into another."""
+    for t_s in np.arange(demo.wave_s, demo.wave_s + 90, 0.25):
+        places = [T[:3, 3] for _, T in demo.bodies_at(t_s).values()]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(places, 2)) > 0.35
+
+
+def test_robots_drive_at_a_walking_pace(demo):
+    speeds = [
+        np.linalg.norm(demo.robot_twist(name, t)[0]) for name in demo.robots for t in np.arange(15, 45, 0.5)
+    ]
+    assert min(speeds) > 0.15
+    assert max(speeds) < 0.6
+
+
+def test_the_wave_calibrates_every_camera(demo):
+    """At 8 px or more in two cameras for most of the time, and every two cameras share a fifth of it."""
+    seen = []
+    for t_s in np.arange(0, demo.wave_s, 0.1):
+        (body, T) = demo.bodies_at(t_s)["wand"]
+        seen.append([view_minor_px(camera, body, T) >= 8 for camera in demo.cameras.values()])
+    seen = np.array(seen)
+    assert (seen.sum(1) >= 2).mean() > 0.9
+    together = seen.T.astype(float) @ seen / len(seen)
+    assert together.min() > 0.2, together
+
+
+def test_the_wand_goes_when_the_robots_come(demo):
+    before, after = demo.wave_s - 1e-6, demo.wave_s
+    assert set(demo.bodies_at(before)) == {"wand"}
+    assert set(demo.bodies_at(after)) == set(demo.robots)
+    assert demo.wand_pose(after) is None
+    assert all(demo.robot_pose(name, before) is None for name in demo.robots)
+    assert all(demo.robot_twist(name, before) is None for name in demo.robots)
+
+
+def test_a_twist_moves_the_pose(demo):
+    """A step of h along the twist meets the pose after h up to h^2 / 2 times the acceleration (under 2 m/s^2)."""
+    h, t_s = 0.01, 21.3
+    for name in demo.robots:
+        before, after = demo.robot_pose(name, t_s), demo.robot_pose(name, t_s + h)
+        velocity, omega = demo.robot_twist(name, t_s)
+        assert np.linalg.norm(before[:3, 3] + h * velocity - after[:3, 3]) < h**2
+        turned = before[:3, :3] + h * np.cross(omega, before[:3, :3].T).T
+        assert np.abs(turned - after[:3, :3]).max() < 2 * h**2
+
+
+def test_a_robot_that_faces_its_travel_looks_along_its_velocity(demo):
+    for t_s in np.arange(20, 32, 0.7):
+        velocity, _ = demo.robot_twist("rover", t_s)
+        assert demo.robot_pose("rover", t_s)[:3, 0] @ velocity == pytest.approx(
+            np.linalg.norm(velocity), rel=1e-4
+        )
+
+
+def test_rig_entries_are_a_rig_of_intrinsics(demo, tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump({"cameras": demo.rig_entries()}))
+    lens = load_lens(path, "east")
+    assert lens.distortion == demo.camera("east").distortion
+    assert set(demo.rig_entries()["east"]) == {*CAMERA, "distortion", "model"} - {
+        "position_m",
+        "look_at_m",
+        "noise",
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"colour": "red"}, "colour"),
+        ({"wand": "gone.yaml"}, "gone.yaml does not exist"),
+        ({"cameras": {}}, "names no camera"),
+        ({"cameras": {"cam0": CAMERA | {"fsp": 30}}}, "fsp"),
+        ({"cameras": {"cam0": CAMERA | {"look_at_m": [0.0, -0.6, 0.0]}}}, "straight above"),
+        ({"cameras": {"cam0": CAMERA | {"exposure_us": 1e6}}}, "exposure_us"),
+        ({"cameras": {"cam0": CAMERA | {"fx": -1.0}}}, "focal"),
+        ({"robot_motions": {}}, "robot 'disc' must stand both"),
+        ({"robot_motions": {"disc": {"x_m": {"period_s": 0}}}}, "period"),
+        ({"wand_motion": {"x_m": {"speed": 1}}}, "speed"),
+    ],
+)
+def test_a_faulty_scene_says_what_and_where(tmp_path, change, says):
+    path = write_scene(tmp_path, {"disc": DISC}, {"disc": {}})
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    with pytest.raises(ConfigError, match=says) as fault:
+        Scene.load(path)
+    assert str(tmp_path) in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_robot_can_not_be_called_wand(tmp_path):
+    with pytest.raises(ConfigError, match="rename the robot"):
+        Scene.load(write_scene(tmp_path, {"wand": DISC}, {"wand": {}}))
+
+
+def test_unknown_names_are_refused(tmp_path):
+    scene = load_disc(tmp_path)
+    with pytest.raises(ConfigError, match="no camera 'cam7'; it has cam0"):
+        scene.camera("cam7")
+    with pytest.raises(ConfigError, match="no robot 'r2'; it has disc"):
+        scene.robot_pose("r2", 0.0)

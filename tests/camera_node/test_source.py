@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Recordings: their frames, their times, and their faults."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.errors import CameraError, ConfigError
+from camera_node.source import FolderSource, Source, SourceSettings, VideoSource, open_source, read_grey
+
+MS = 1_000_000
+FAST = SourceSettings(pace="fast")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Frames at 0, 30, 60 and 90 ms after 10 s, written out of order; their grey level is 0, 30, 60, 90."""
+    for ms in (60, 0, 90, 30):
+        cv2.imwrite(str(tmp_path / f"{(10_000 + ms) * MS:012d}.png"), np.full((4, 6), ms, np.uint8))
+    return tmp_path
+
+
+def video(path: Path, n: int = 3) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
+    for k in range(n):
+        writer.write(np.full((48, 64, 3), 50 * k, np.uint8))
+    writer.release()
+    return path
+
+
+def times(source: Source) -> list[int]:
+    return [frame.t_ns for frame in source]
+
+
+def test_a_folder_comes_in_order_with_its_times(folder: Path):
+    frames = list(open_source(str(folder), FAST))
+    assert [(frame.t_ns // MS, frame.image[0, 0]) for frame in frames] == [
+        (10_000 + k, k) for k in (0, 30, 60, 90)
+    ]
+    assert len(FolderSource(folder)) == 4
+
+
+def test_a_replay_keeps_the_recorded_pace(folder: Path):
+    """No frame comes before it is due; how late one comes is the machine's affair."""
+    begun = time.time_ns()
+    for k, _ in enumerate(open_source(str(folder), SourceSettings())):
+        assert time.time_ns() - begun >= 30 * k * MS
+
+
+def test_stamps_can_be_moved_to_now(folder: Path):
+    """The first frame is now, and the intervals stay; with an epoch, the recording's time 0 is there."""
+    before = time.time_ns()
+    moved = times(open_source(str(folder), SourceSettings(pace="fast", stamps="now")))
+    assert before <= moved[0] <= time.time_ns()
+    assert [t - moved[0] for t in moved] == [0, 30 * MS, 60 * MS, 90 * MS]
+    epoch = SourceSettings(pace="fast", stamps="now", epoch_ns=5 * 10**17)
+    assert times(open_source(str(folder), epoch))[0] == 5 * 10**17 + 10_000 * MS
+
+
+def test_closing_ends_a_replay_that_waits(tmp_path: Path):
+    """The second frame is due in an hour."""
+    for t_ns in (0, 3600 * 10**9):
+        cv2.imwrite(str(tmp_path / f"{t_ns}.png"), np.zeros((4, 6), np.uint8))
+    source = open_source(str(tmp_path), SourceSettings())
+    first = threading.Event()
+    thread = threading.Thread(target=lambda: [first.set() for _ in source])
+    thread.start()
+    assert first.wait(10)
+    source.close()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def test_a_video_without_times_comes_at_its_rate(tmp_path: Path):
+    path = video(tmp_path / "cam0.avi")
+    assert times(VideoSource(path)) == [0, 40 * MS, 80 * MS]
+    assert times(VideoSource(path, fps=100)) == [0, 10 * MS, 20 * MS]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ("cam_id,frame_time\n0,1.5\n1,7\n0,1.7\n0,1.9", [1500 * MS, 1700 * MS, 1900 * MS]),
+        ("cam_id,frame_time\ncam0,1\ncam0,2\ncam0,3", [1000 * MS, 2000 * MS, 3000 * MS]),
+        ("frame_time\n1\n2\n3", [1000 * MS, 2000 * MS, 3000 * MS]),
+    ],
+)
+def test_a_videos_times_stand_beside_it(tmp_path: Path, rows: str, expected: list[int]):
+    (tmp_path / "timestamps.csv").write_text(rows)
+    assert times(VideoSource(video(tmp_path / "cam0.avi"))) == expected
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("cam_id,time\n0,1", "needs the columns"),
+        ("cam_id,frame_time\n0,one", "needs the columns"),
+        ("cam_id,frame_time\n0,inf", "needs the columns"),
+        ("cam_id,frame_time\n5,1", "no row whose cam_id"),
+        ("cam_id,frame_time\n0,1\n0,2", "more than the 2 frames"),
+    ],
+)
+def test_broken_times_are_named(tmp_path: Path, rows: str, says: str):
+    (tmp_path / "timestamps.csv").write_text(rows)
+    with pytest.raises(CameraError, match=says):
+        times(VideoSource(video(tmp_path / "cam0.avi")))
+
+
+def test_real_videos_have_the_times_of_their_cameras(shared_data: Callable[[str], Path]):
+    """Free-running webcams: each has its own 111 times, 18.3 s long, in rising order."""
+    folder = shared_data("webcams")
+    starts = set()
+    for k in range(4):
+        source = VideoSource(folder / f"cam_{k}.mp4")
+        assert source.times
+        assert len(source.times) == 111
+        assert source.times == sorted(source.times)
+        starts.add(source.times[0])
+        frame = next(iter(source))
+        assert frame.image.shape == (720, 1280)
+        assert frame.t_ns == source.times[0]
+    assert len(starts) == 4
+
+
+def test_sources_that_are_none_are_named(tmp_path: Path):
+    (tmp_path / "text.mp4").write_text("no video")
+    empty, named = tmp_path / "empty", tmp_path / "named"
+    empty.mkdir()
+    named.mkdir()
+    (named / "first.png").write_bytes(b"")
+    for text, says in [
+        ("nowhere", "no folder, video or camera 'nowhere'"),
+        (str(tmp_path / "text.mp4"), "is no video"),
+        (str(empty), "holds no frames"),
+        (str(named), r"first\.png is not named by its capture time"),
+    ]:
+        with pytest.raises(CameraError, match=says):
+            open_source(text, SourceSettings())
+    with pytest.raises(CameraError, match="is no folder"):
+        FolderSource(tmp_path / "none")
+    with pytest.raises(ConfigError, match="--scene"):
+        open_source("sim", SourceSettings())
+
+
+def test_images_that_are_none_are_named(tmp_path: Path):
+    for name, data in (("empty.png", b""), ("text.png", b"text")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(CameraError, match=f"{name} is no image"):
+            read_grey(tmp_path / name)
+    with pytest.raises(CameraError, match="does not exist"):
+        read_grey(tmp_path / "none.png")

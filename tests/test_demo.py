@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The whole arena end to end, as `make demo` runs it: every program real, only the light is simulated."""
+
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "demo"
+WAVE_S = 8.0  # enough for every camera to see the wand in most of its image
+
+
+def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "web", "--demo", "--headless", "--scene", str(scene), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """The demo's own scene with a shorter wave, in a folder of its own."""
+    folder = tmp_path / "demo"
+    shutil.copytree(CONFIGS, folder)
+    path = folder / "scene.yaml"
+    text, count = re.subn(r"(?m)^wave_s: *[0-9.]+", f"wave_s: {WAVE_S}", path.read_text())
+    assert count == 1
+    path.write_text(text)
+    return path
+
+
+def test_from_a_wave_to_poses_that_are_right(scene: Path):
+    """Exit code 0 says: every robot within 5 mm RMS and never lost for 0.5 s; the summary has a line for each."""
+    result = run_demo(scene, "--seconds", "5")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert re.search(r"calibrated: 4 cameras", result.stdout)
+    for robot in ("rover", "drone", "puck"):
+        assert re.search(
+            rf"^{robot}: position [0-9.]+ mm RMS.* tracked [0-9.]+ %", result.stdout, re.MULTILINE
+        )
+    assert re.search(r"^latency: [0-9.]+ ms p50", result.stdout, re.MULTILINE)
+    assert re.search(r"^frames/s: ", result.stdout, re.MULTILINE)
+    assert "all robots were tracked, and right" in result.stdout
+    mine = [
+        p for p in psutil.process_iter(["cmdline"]) if str(scene.parent) in " ".join(p.info["cmdline"] or ())
+    ]
+    assert not mine, "the demo left programs behind"
+
+
+def test_a_broken_file_is_one_line(scene: Path):
+    """Exit code 2, and the line names the file."""
+    (scene.parent / "robots.yaml").write_text("robots: {rover: {diameter_m: wide}}")
+    result = run_demo(scene, "--seconds", "5")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert "robots.yaml" in result.stderr
+    assert "diameter_m" in result.stderr
+
+
+def test_a_taken_endpoint_is_one_line(scene: Path):
+    """The server's own line, passed on."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        result = run_demo(scene, "--listen", endpoint, "--seconds", "5")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert endpoint in result.stderr
