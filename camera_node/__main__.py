@@ -60,6 +60,8 @@ class Publish:
 
     def run(self) -> None:
         """Open everything, publish until the source ends or a signal comes, and close everything."""
+        import cv2
+
         from camera_node.network import open_client
         from camera_node.node import Node
         from camera_node.source import Replay, open_source
@@ -67,6 +69,7 @@ class Publish:
         check_name("name", self.name)
         check_name("arena", self.arena)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        cv2.setNumThreads(1)  # a camera is one process of several on its machine
         with contextlib.ExitStack() as stack:
             settings = self.source_settings()
             source = open_source(self.source, settings)

@@ -96,7 +96,7 @@ class ServerWatch:
     """Tells once that the server is away, and once that it is back; by its liveliness token."""
 
     def __init__(self, session: zenoh.Session, key: str, patience_s: float = PATIENCE_S) -> None:
-        self._patience_s = patience_s
+        self._key, self._patience_s = key, patience_s
         self._present, self._told = False, False
         self._since = time.monotonic()
         self._subscriber = session.liveliness().declare_subscriber(key, self._change, history=True)
@@ -105,7 +105,11 @@ class ServerWatch:
         """Called now and then: a server that was not seen since the start is told of once."""
         if not self._present and not self._told and time.monotonic() - self._since >= self._patience_s:
             self._told = True
-            log.warning("the server is away; what is seen meanwhile is lost, and it is tried on")
+            log.warning(
+                "the server is away; what is seen meanwhile is lost, and it is tried on. "
+                "Does python -m fusion run, and are --connect and --arena right? (no %s)",
+                self._key,
+            )
 
     def close(self) -> None:
         self._subscriber.undeclare()

@@ -21,7 +21,7 @@ class Options:
     Attributes:
         connect: Zenoh endpoints of the server.
         arena: Name of the arena, as in the server's configuration.
-        zenoh_config: A Zenoh configuration file, for TLS or access control.
+        zenoh: A Zenoh configuration (JSON5) for TLS, access control or scouting.
         host: Address that the page is served on; 0.0.0.0 shows it to the whole network.
         port: Port that the page is served on.
         headless: One line a second instead of a page.
@@ -33,7 +33,7 @@ class Options:
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     arena: str = "arena"
-    zenoh_config: Path | None = None
+    zenoh: Path | None = None
     host: str = "127.0.0.1"
     port: int = 8080
     headless: bool = False
@@ -45,7 +45,7 @@ class Options:
 
 def watch(options: Options, stop: threading.Event) -> None:
     """Show the arena until `stop` is set."""
-    session = open_client(options.connect, options.zenoh_config)
+    session = open_client(options.connect, options.zenoh)
     try:
         feed = Feed(session, options.arena)
         if options.headless:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A whole arena without hardware: simulated cameras, a wand wave to calibrate, then robots."""
 
+import contextlib
 import shutil
 import socket
 import tempfile
@@ -20,6 +21,7 @@ from camera_node.messages import encode
 from camera_node.network import open_client
 from camera_node.scene import Scene
 from fusion.messages import RobotPose
+from web.errors import WebError
 from web.feed import Feed, Latest
 from web.messages import Progress, progress_key
 from web.processes import Processes, ProgramFailed, ended_by_signals
@@ -35,21 +37,24 @@ TICK_S = 0.05
 
 
 def default_scene() -> Path:
-    """The scene that lies in the checkout.
+    """The scene of the checkout, or the one that was installed with the package.
 
     Raises:
-        ConfigError: this is not a checkout.
+        ConfigError: neither is there.
     """
-    path = Path(web.__file__).parent.parent / "configs" / "demo" / "scene.yaml"
-    if not path.is_file():
-        raise ConfigError(f"{path} does not exist; run the demo in a checkout, or give --scene scene.yaml")
-    return path
+    package = Path(web.__file__).parent
+    for configs in (package.parent / "configs", package / "configs"):
+        if (path := configs / "demo" / "scene.yaml").is_file():
+            return path
+    raise ConfigError("the demo's scene.yaml is not installed; give one with --scene scene.yaml")
 
 
 def free_endpoint() -> str:
-    """A Zenoh endpoint on loopback that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+    """A Zenoh endpoint on loopback that nobody listens on: the usual port, or where that is taken any other."""
+    for port in (7447, 0):
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)) as server:
+            return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+    raise WebError("no port on 127.0.0.1 can be listened on; give an endpoint with --listen")
 
 
 def run_demo(
@@ -113,6 +118,7 @@ class Demo:
         if page is not None:
             start("web", "web", [*connect, "--host", page[0], "--port", str(page[1])])
             print(f"open http://{page[0]}:{page[1]} in a browser to watch; Ctrl-C ends", flush=True)
+        print(f"arena '{ARENA}' speaks Zenoh on {self.endpoint}", flush=True)
         intrinsics = {name: Camera(**entry) for name, entry in self.scene.rig_entries().items()}
         save_rig(Rig(cameras=intrinsics), folder / "intrinsics.yaml")
         wave = [

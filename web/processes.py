@@ -41,7 +41,12 @@ class Processes:
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments`."""
         command = [sys.executable, "-m", module, *arguments]
-        environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+        # One thread a program: on few cores, those of linear algebra libraries only take time from the cameras.
+        environment = os.environ | {
+            "PYTHONUNBUFFERED": "1",
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
         with self._log(name).open("wb") as log:
             # In a session of its own, so that Ctrl-C reaches this program alone, which then stops the others in order.
             child = subprocess.Popen(
