@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from synthetic import Arena, errors, record, ring
 
 from calib.camera import Camera
 from calib.rig import Rig, load_rig, save_rig
 from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
+from tests.calib.synthetic import Arena, errors, record, ring
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 

@@ -5,7 +5,6 @@ import socket
 import threading
 
 import pytest
-from synthetic import record, ring
 
 from calib.errors import CalibrationError
 from calib.live import collect, publish
@@ -13,6 +12,7 @@ from calib.messages import RigMessage
 from calib.rig import dump_rig
 from camera_node.messages import Keys, decode, encode
 from camera_node.network import open_client, open_router
+from tests.calib.synthetic import record, ring
 
 
 @pytest.fixture

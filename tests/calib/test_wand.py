@@ -4,7 +4,6 @@
 import msgspec
 import numpy as np
 import pytest
-from synthetic import WAND, Arena, errors, record, ring
 
 from calib.adjustment import world_motions
 from calib.errors import CalibrationError
@@ -13,6 +12,7 @@ from calib.wand import calibrate
 from calib.world import move
 from camera_node.body import Body
 from camera_node.messages import Detections
+from tests.calib.synthetic import WAND, Arena, errors, record, ring
 
 
 def run(arena: Arena, messages: list[Detections]):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import errors, ring
 
 from calib.errors import CalibrationError
 from calib.world import align, move, read_positions
 from camera_node.errors import ConfigError
 from camera_node.pose import rotation_from_vector
+from tests.calib.synthetic import errors, ring
 
 
 def test_align_undoes_any_motion():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rendering import Disc, expose, outer_conic, render
 
 from camera_node import _core
 from camera_node.detector import Detector
 from camera_node.errors import ConfigError
+from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])
 

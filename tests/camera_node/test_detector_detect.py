@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rendering import Disc, expose, render
 
 from camera_node.detect import Detect
 from camera_node.errors import CameraError, ConfigError
+from tests.camera_node.rendering import Disc, expose, render
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 
 import numpy as np
 import pytest
-from rendering import Disc, expose, outer_conic, render
 
 from camera_node.detector import Detector
 from camera_node.disc import locate
 from camera_node.lens import Lens
 from camera_node.roundels import Roundel
+from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PINHOLE = Lens(width=640, height=480, fx=600, fy=600, cx=320, cy=240)
 WIDE = Lens(

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scenes import CAMERA, DISC, write_scene
 
 from camera_node.pose import Pose
 from camera_node.rendering import Renderer
 from camera_node.scene import Scene
 from camera_node.simulation import SimulatedCamera, list_exposures, render_recording
 from camera_node.source import FolderSource, read_grey
+from tests.camera_node.scenes import CAMERA, DISC, write_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 FAST = CAMERA | {"fps": 100.0, "phase_ms": 3.0, "exposure_us": 4000.0}

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import CAMERA, DISC, load_disc, write_scene
 
 from camera_node.backdrop import FLOOR
 from camera_node.pose import invert
 from camera_node.rendering import BLACK, WHITE, Disc, Renderer, cover, discs_of, vignette
 from camera_node.scene import Scene
+from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 
 ROUNDING = 0.29  # standard deviation of a rounded grey level, sqrt(1/12)
 TILTED = {"pitch_deg": {"mean": 25}, "roll_deg": {"mean": -20}, "z_m": {"mean": 0.3}}

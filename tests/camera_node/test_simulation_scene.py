@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scenes import CAMERA, DISC, load_disc, write_scene
 
 from camera_node.body import Body
 from camera_node.errors import ConfigError
@@ -15,6 +14,7 @@ from camera_node.lens import load_lens
 from camera_node.pose import Array, invert
 from camera_node.rendering import discs_of
 from camera_node.scene import Scene, SceneCamera
+from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml"
 

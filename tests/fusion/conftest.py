@@ -10,12 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from synthetic import Arena
-
 from fusion.instants import Frame, Instants
 from fusion.messages import RobotPose
 from fusion.report import Fused
 from fusion.tracker import Limits, Tracker
+from tests.fusion.synthetic import Arena
 
 
 def fuse(arena: Arena, frames: list[Frame], limits: Limits | None = None) -> list[Fused]:

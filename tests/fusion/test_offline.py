@@ -10,7 +10,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from synthetic import SINGLE, TRIANGLE, Arena, line
 
 from calib.camera import Camera
 from calib.rig import Rig, save_rig
@@ -18,6 +17,7 @@ from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
 from fusion.offline import COLUMNS, run
 from fusion.robots import Robot
+from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 
 ROOT = Path(__file__).resolve().parents[2]
 ARENA = Arena(

@@ -14,7 +14,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from synthetic import TRIANGLE, Arena, line
 
 from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig, save_rig
@@ -24,6 +23,7 @@ from fusion.client import Arena as Client
 from fusion.config import ArenaConfig
 from fusion.server import Server
 from fusion.tracker import Limits
+from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 DEADLINE_S = 20.0
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from conftest import errors, fuse
-from synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
 from fusion.instants import Frame
 from fusion.tracker import Limits
+from tests.fusion.conftest import errors, fuse
+from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
 TIGHT = Limits(sigma_floor_px=1e-3)
 MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), tilt=(0.1, -0.2, 0.4))

@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
-from conftest import Played, four_cameras, wait_for
 
 from camera_node.messages import encode
 from camera_node.network import open_client
+from tests.web.conftest import Played, four_cameras, wait_for
 from web.feed import MAX_REASONS, Feed
 from web.messages import Progress, progress_key
 

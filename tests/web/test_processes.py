@@ -9,8 +9,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from conftest import free_port, wait_for
 
+from tests.web.conftest import free_port, wait_for
 from web.errors import WebError
 from web.processes import Processes, ProgramFailed, ended_by_signals
 

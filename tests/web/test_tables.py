@@ -5,8 +5,8 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from conftest import Played, wait_for
 
+from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen
 from web.tables import STALE_S, describe, describe_server, tabulate_cameras, tabulate_robots

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 import cv2
 import numpy as np
 import pytest
-from conftest import Played, four_cameras, free_port, wait_for
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
+from tests.web.conftest import Played, four_cameras, free_port, wait_for
 from web.drawing import puck
 from web.errors import WebError
 from web.feed import Feed
