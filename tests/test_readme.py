@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""README.md, run as it stands: every command, but for times that are shortened and ports that are free."""
+
+import os
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.calib.test_intrinsics import SPEC, views
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+README = (ROOT / "README.md").read_text()
+DEADLINE_S = 120.0
+
+
+def blocks(language: str) -> list[str]:
+    return [text for kind, text in BLOCK.findall(README) if kind == language]
+
+
+COMMANDS = [line for block in blocks("sh") for line in block.splitlines()]
+
+
+def find(start: str) -> str:
+    """The one command of the README that begins so; each is claimed by a test below."""
+    (command,) = [command for command in COMMANDS if command.startswith(start)]
+    return command
+
+
+def words(command: str) -> list[str]:
+    """The command for subprocess, `python` being the one that runs the tests."""
+    return [sys.executable, *shlex.split(command)[1:]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with what a clone has that the commands name."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    return tmp_path
+
+
+def run(command: str, folder: Path, expected: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        words(command), cwd=folder, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
+    assert done.returncode == expected, f"{command}\n{done.stdout}\n{done.stderr}"
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def test_every_command_is_claimed():
+    """A command that is added to the README needs a test here."""
+    claimed = (
+        *("make demo", 'make demo ARGS="--headless', "make test", "make check"),  # test_demo.py, .ci/run
+        *("pip install .", "pip install '.[server]'"),  # test_packaging.py
+        *("python -m camera_node print", "python -m camera_node detect", "python -m camera_node.simulation"),
+        *("python -m calib", "python -m fusion", "python -m camera_node --source", "python -m web"),
+    )
+    assert [command for command in COMMANDS if not command.startswith(claimed)] == []
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("make")])
+def test_make_knows_its_targets(command: str):
+    """Make says what it would do; test_demo.py does what `make demo` does, and this very run is `make test`."""
+    done = subprocess.run(
+        [*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_printing_and_detecting(folder: Path):
+    """The sheet is written; a picture with one roundel is drawn upon."""
+    run(find("python -m camera_node print"), folder)
+    assert "<svg" in (folder / "roundels.svg").read_text()
+    frames = "python -m camera_node.simulation configs/demo/scene.yaml frames --start 16 --seconds 0.1"
+    run(frames, folder)
+    shutil.copy(min((folder / "frames" / "north").iterdir()), folder / "picture.png")
+    said = run(find("python -m camera_node detect"), folder).stdout
+    assert re.search(r"picture.png: \d+ roundels", said)
+    assert cv2.imread(str(folder / "seen.png")) is not None
+
+
+def test_lenses_and_world(folder: Path):
+    """A board's pictures become a rig; surveyed places need cameras that are placed, and say so."""
+    (folder / "board" / "north").mkdir(parents=True)
+    for k, image in enumerate(views(0.6)):
+        cv2.imwrite(str(folder / "board" / "north" / f"{k}.png"), image)
+    command = find("python -m calib intrinsics").replace("charuco:5x4:0.054", SPEC)
+    assert "north" in run(command, folder).stdout
+    (folder / "surveyed.csv").write_text("camera,x,y,z\nnorth,0,0,2\n")
+    assert "error: " in run(find("python -m calib world"), folder, expected=2).stderr
+
+
+def test_a_recording_from_frames_to_poses(folder: Path):
+    """The simulator's recording, shortened; the poses it ends in follow all three robots."""
+    shorter = {"--seconds 15": "--seconds 8", "--seconds 5": "--seconds 1"}
+    for command in blocks("sh")[COMMAND_BLOCK].splitlines():
+        for long, short in shorter.items():
+            command = re.sub(rf"{long}$", short, command)
+        run(command, folder)
+    rows = (folder / "poses.csv").read_text().splitlines()[1:]
+    assert {row.split(",")[1] for row in rows if ",tracked," in row} == {"rover", "drone", "puck"}
+
+
+COMMAND_BLOCK = next(k for k, block in enumerate(blocks("sh")) if "camera_node.simulation" in block)
+
+
+@pytest.fixture
+def server(folder: Path) -> Iterator[tuple[Path, str]]:
+    """The README's live server on a port that is free here, and its endpoint."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/localhost:{probe.getsockname()[1]}"
+    command = [*words(find("python -m fusion --config")), "--listen", endpoint]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        assert endpoint in first, first
+        yield folder, endpoint
+        process.terminate()
+        assert process.wait(20) == 0
+
+
+def test_the_live_programs(server: tuple[Path, str]):
+    """Beside the README's server: a camera that is not there and a wand without cameras say so; the view serves."""
+    folder, endpoint = server
+    camera = find("python -m camera_node --source").replace("tcp/localhost:7447", endpoint)
+    if not Path("/dev/video0").exists():
+        assert "/dev/video0 does not exist" in run(camera, folder, expected=2).stderr
+    shutil.copy(ROOT / "configs" / "wand.yaml", folder / "wand.yaml")
+    run("python -m camera_node.simulation configs/demo/scene.yaml frames --seconds 0.1", folder)
+    shutil.copy(folder / "frames" / "rig.yaml", folder / "rig.yaml")
+    wand = find("python -m calib wand --live").replace("--seconds 30", f"--seconds 2 --connect {endpoint}")
+    assert "error: " in run(wand, folder, expected=2).stderr
+    view = find("python -m web").replace("tcp/localhost:7447", endpoint)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    process = subprocess.Popen([*words(view), "--port", str(port)], cwd=folder, stdout=subprocess.DEVNULL)
+    try:
+        wait_for_port(port)
+    finally:
+        process.terminate()
+        assert process.wait(20) == 0
+
+
+def wait_for_port(port: int) -> None:
+    end = time.monotonic() + DEADLINE_S
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+            return
+        except OSError:
+            assert time.monotonic() < end, "nobody listens"
+            time.sleep(0.05)
+
+
+def test_the_subscription_prints_poses(tmp_path: Path):
+    """The README's Python follows the rover of a running demo."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    (code,) = [block for block in blocks("python") if "Arena.connect" in block]
+    (tmp_path / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
+    demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60", "--listen", endpoint]
+    env = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(demo, stdout=subprocess.PIPE, text=True) as arena:
+        assert arena.stdout is not None
+        assert any(line.startswith("calibrated") for line in arena.stdout)
+        follow = [sys.executable, "follow.py"]
+        with subprocess.Popen(follow, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True) as follower:
+            assert follower.stdout is not None
+            line = follower.stdout.readline()
+            follower.kill()
+        arena.terminate()
+    assert re.match(r"\d{19} \(.*\) \(.*\)", line), line
