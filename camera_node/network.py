@@ -53,6 +53,7 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
         "connect/timeout_ms": -1,  # 0 would mean one attempt
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
+        "transport/unicast/open_timeout": 2000,  # of a listener that is no Zenoh: closing waits for it
     }
     try:
         return zenoh.open(_config(zenoh_config, options))

@@ -34,9 +34,9 @@ class Sheet:
         """Write the sheet and say how many roundels it holds."""
         svg, count = draw(self)
         write_atomically(self.out, svg)
-        print(
-            f"{self.out}: {count} roundels of d_o = {self.diameter * 1e3:g} mm; print at 100 %, then measure one"
-        )
+        roundels = "1 roundel" if count == 1 else f"{count} roundels"
+        size = f"d_o = {self.diameter * 1e3:g} mm"
+        print(f"{self.out}: {roundels} of {size}; print at 100 %, then measure one")
         return 0
 
 

@@ -29,8 +29,8 @@ def test_a_printed_sheet_measures_what_it_says(tmp_path: Path):
     subprocess.run([chromium, *flags.split(), *places], check=True, timeout=60, capture_output=True)
     found = Detector().detect(read_grey(picture))
     assert len(found) == count == 12
-    # The curve's flattening in the browser and 8-bit grey levels stay below a tenth of a pixel.
-    assert abs(found.axes_px - 50 * PX_PER_MM).max() < 0.1
+    # The browser draws curves as chords that stay within an eighth of a pixel: a quarter of the diameter's edges.
+    assert abs(found.axes_px - 50 * PX_PER_MM).max() < 0.25
     assert abs(found.ratio - 0.6).max() < 0.002
 
 
