@@ -4,7 +4,7 @@
 import os
 import tempfile
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import yaml
@@ -22,15 +22,33 @@ def load_yaml(path: Path, kind: type[T]) -> T:
             the file and the place in it, such as `$.cameras.cam0.fx`.
     """
     try:
-        return msgspec.yaml.decode(path.read_bytes(), type=kind)
+        data = msgspec.yaml.decode(path.read_bytes())
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; check the path") from None
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}") from None
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}") from None
     except (msgspec.DecodeError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+        where = " ".join(str(error).replace('in "<byte string>", ', "at ").split())
+        raise ConfigError(f"{path} is not valid YAML: {where}") from None
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {_name_entry(data, kind, str(error))}") from None
+
+
+def _name_entry(data: Any, kind: type, fault: str) -> str:
+    """The fault with the name of the entry that has it: of mappings, msgspec only says `[...]`."""
+    mappings = (
+        ((key, value) for key, value in data.items() if isinstance(value, dict)) if "[...]" in fault else ()
+    )
+    for key, entries in mappings:
+        for name, entry in entries.items():
+            try:
+                msgspec.convert({**data, key: {name: entry}}, kind)
+            except msgspec.ValidationError as error:
+                if f"$.{key}[...]" in str(error):
+                    return str(error).replace("[...]", f".{name}", 1)
+    return fault
 
 
 def write_atomically(path: Path, text: str) -> None:

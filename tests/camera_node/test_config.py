@@ -4,6 +4,7 @@
 import stat
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from camera_node.body import Body
@@ -53,3 +54,16 @@ def test_writing_replaces_the_whole_file_and_leaves_nothing_else(tmp_path: Path)
 def test_writing_into_a_missing_folder_says_so(tmp_path: Path):
     with pytest.raises(ConfigError, match="is its folder there"):
         write_atomically(tmp_path / "no" / "rig.yaml", "")
+
+
+def test_the_entry_of_a_mapping_is_named(tmp_path: Path):
+    """Of a rig with many cameras, the one with the fault."""
+    path = tmp_path / "scene.yaml"
+    good, bad = "{diameter_m: 0.1}", "{diameter_m: 0.1, colour: red}"
+    path.write_text(f"robots: {{a: {good}, b: {bad}, c: {good}}}")
+    with pytest.raises(ConfigError, match=r"colour.*\$\.robots\.b"):
+        load_yaml(path, _Robots)
+
+
+class _Robots(msgspec.Struct):
+    robots: dict[str, Body]
