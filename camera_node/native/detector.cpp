@@ -6,11 +6,15 @@
 #include <iterator>
 #include <optional>
 
+#include "soften.hpp"
+
 namespace roundel {
 
 namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
+constexpr double kHardBlur = 0.4;      // pixels: edges that are spread less are drawn, or sharpened
+constexpr double kNoise = 3;           // grey levels that a picture may differ by from the model
 
 /// A pair under its own threshold theta = (m_d + m_b) / 2, grown anew in the window around it.
 std::optional<Start> rethreshold(const ImageView& image, const Segment& outer, double theta,
@@ -33,14 +37,24 @@ std::optional<Start> rethreshold(const ImageView& image, const Segment& outer, d
     return std::nullopt;
 }
 
-/// The gates that end false positives: contrast, ratio, size, and grey levels as the model says.
-bool is_roundel(const Fit& fit, const Settings& settings) {
+/// The gates that end false positives: contrast, ratio, size, and grey levels as the model says but for
+/// `noise`.
+bool is_roundel(const Fit& fit, const Settings& settings, double noise) {
     const double contrast = fit.bright - fit.dark;
     const bool ratio = std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(), [&](double r) {
         return std::abs(fit.ratio - r) <= settings.ratio_tolerance;
     });
-    return ratio && contrast >= settings.min_contrast && fit.residual < 0.05 * contrast + 3 &&
+    return ratio && contrast >= settings.min_contrast && fit.residual < 0.05 * contrast + noise &&
            fit.outer.major >= settings.min_diameter && fit.outer.major <= settings.max_diameter;
+}
+
+/// The fit to the picture as it is or, where its edges are as hard as the pixel grid, to the softened one.
+std::optional<Fit> fit_roundel(const ImageView& image, const Start& start, const Settings& settings) {
+    const auto fit = refine(image, start);
+    if (fit && is_roundel(*fit, settings, kNoise)) return fit;
+    if (fit && fit->blur > kHardBlur) return std::nullopt;
+    const auto soft = refine_softened(image, start);
+    return soft && is_roundel(*soft, settings, kNoise * 6 / 16) ? soft : std::nullopt;
 }
 
 /// Whether two more dark rings lie around a roundel, which makes it a bullseye. One may be a plate that it
@@ -79,8 +93,8 @@ std::vector<Fit> Detector::detect(const ImageView& image) {
         const double own =
             (mean_level(image, segments, pair.dark) + mean_level(image, segments, pair.bright)) / 2;
         const auto start = rethreshold(image, segments.list[size_t(pair.dark)], own, settings_);
-        const auto fit = start ? refine(image, *start) : std::nullopt;
-        if (fit && is_roundel(*fit, settings_) && !is_bullseye(*fit, around)) found.push_back(*fit);
+        const auto fit = start ? fit_roundel(image, *start, settings_) : std::nullopt;
+        if (fit && !is_bullseye(*fit, around)) found.push_back(*fit);
     }
     update_theta(found);
     return found;

@@ -77,8 +77,6 @@ Step step(const Edge& edge, double blur) {
     return {std::erfc(t / std::numbers::sqrt2) / 2, slope, slope * (shift - edge.distance) / blur};
 }
 
-Symmetric scale(const Symmetric& m, double by) { return {by * m.xx, by * m.xy, by * m.yy}; }
-
 Symmetric invert(const Parameters& p) {
     const Symmetric A{p[kAxx], p[kAxy], p[kAyy]};
     return {A.yy / A.det(), -A.xy / A.det(), A.xx / A.det()};
@@ -286,7 +284,7 @@ std::optional<Fit> refine(const ImageView& image, const Start& start) {
                .covariance = *centre,
                .offset_x = to_disc * p[kOffsetX],
                .offset_y = to_disc * p[kOffsetY],
-               .offset_covariance = scale(*offset, to_disc * to_disc),
+               .offset_covariance = offset->scaled(to_disc * to_disc),
                .ratio = p[kRatio],
                .card = p[kCard],
                .dark = p[kDark],

@@ -127,6 +127,21 @@ def test_what_is_no_roundel_is_not_found(draw):
         assert len(Detector().detect(expose(seen, 2, rng()))) == 0
 
 
+@pytest.mark.parametrize("line", [cv2.LINE_8, cv2.LINE_AA])
+@pytest.mark.parametrize("blur", [0.0, 0.4, 0.7])
+@pytest.mark.parametrize("radius", [8, 12, 20, 40, 80, 150])
+def test_drawn_circles_are_found(line: int, blur: float, radius: int):
+    """A person's first picture: edges as hard as the pixel grid, right to the half pixel that drawing rounds by."""
+    image = np.full((480, 640), 220, np.uint8)
+    cv2.circle(image, (320, 240), radius, 20.0, -1, line)
+    cv2.circle(image, (320, 240), round(0.6 * radius), 220.0, -1, line)
+    if blur:
+        image = cv2.GaussianBlur(image, (0, 0), blur)
+    (found,) = Detector().detect(image.astype(np.uint8))
+    assert np.abs(found.uv - [320, 240]).max() < 0.1
+    assert np.abs(found.axes_px - (2 * radius + 0.5)).max() < 1
+
+
 def test_clutter_that_touches_the_card_costs_no_accuracy():
     """A bright and a dark bar across the surround: the centre stays within 0.05 px, a few of its sigmas."""
     disc = Disc((80.3, 59.8), 24, 0.5, 0.3)
