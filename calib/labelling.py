@@ -27,6 +27,7 @@ Index = NDArray[np.intp]
 GATE_PX = 3.0  # how far a marker may be from where the others say it is
 SIGMA_PX = 1.0
 SIGMA_LOG_RANGE = 0.05  # of a distance that comes from a roundel's size
+MAX_SIGMAS = 4.0  # a hypothesis that needs more is wrong
 SIGMA_LOG_SLANT = 0.2  # where sizes are unknown: a wand is rarely as near as it is long
 MARGIN = 12.0  # by which the second best must be worse; of a squared Mahalanobis distance
 SYMMETRY = 0.15  # spacings that differ by less are not told apart
@@ -179,7 +180,12 @@ class Labeller:
             for turn, shift in zip(turns, shifts, strict=True):
                 wands.append(self.wand.points @ cv2.Rodrigues(turn)[0].T + shift.ravel())
                 rows.append(triple)
-        return np.array(wands).reshape(-1, len(self.wand.markers), 3), np.array(rows, np.intp).reshape(-1, 3)
+        points = np.array(wands).reshape(-1, len(self.wand.markers), 3)
+        triples = np.array(rows, np.intp).reshape(-1, 3)
+        # Nearly all poses put a roundel where its size can't be: they go at once, before each is looked at.
+        far = np.linalg.norm(points[:, list(labels)], axis=2)
+        good = ~(np.abs(np.log(distances[triples] / far)) > MAX_SIGMAS * SIGMA_LOG_RANGE).any(axis=1)
+        return points[good], triples[good]
 
     def _fit(self, points: Array, rows: dict[int, int], xy: Array, distances: Array) -> _Fit | None:
         """The hypothesis with the markers it was not made from, where it explains the frame; else None."""
@@ -199,7 +205,7 @@ class Labeller:
             prior = (sizes / SIGMA_LOG_RANGE) ** 2
         else:
             prior = np.log(far.max() / far.min()) ** 2 / np.full(1, SIGMA_LOG_SLANT**2)
-        if (off > GATE_PX).any() or (prior > 16).any():
+        if (off > GATE_PX).any() or (prior > MAX_SIGMAS**2).any():
             return None
         return _Fit(tuple(labels), tuple(chosen), points, float(((off / SIGMA_PX) ** 2).sum() + prior.sum()))
 

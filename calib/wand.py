@@ -32,10 +32,11 @@ LENGTH_SLACK = 0.25  # of a wand length at the start: beyond, a detection is wro
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A rig with poses and covariances, and what there is to say of it."""
+    """A rig with poses and covariances, what there is to say of it, and the adjustment (cameras in order of names)."""
 
     rig: Rig
     report: WandReport
+    adjusted: Adjusted
 
 
 def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibration:
@@ -229,7 +230,7 @@ def _conclude(
         outliers=_outliers(names, observations, adjusted),
         metric=metric,
     )
-    return Calibration(move(msgspec.structs.replace(rig, cameras=cameras), T_world), report)
+    return Calibration(move(msgspec.structs.replace(rig, cameras=cameras), T_world), report, adjusted)
 
 
 def _report_camera(
