@@ -9,7 +9,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "fusion"))
 
-from synthetic import PERIOD_NS, Arena, line, ring
+from synthetic import (  # pyright: ignore[reportMissingImports]  # in tests/fusion
+    PERIOD_NS,
+    Arena,
+    line,
+    ring,
+)
 
 from fusion.instants import Instants
 from fusion.robots import Robot, require_distinct
