@@ -101,14 +101,15 @@ class Estimator:
         states = prediction.states
         delta = np.zeros((len(states), 12))
         P = states.P.copy()
+        shaped = _shaped(observations)
+        whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(observations.cov)), float)
+        motions = {k: _motion(prediction, k) for k in seen}
         for _ in range(iterations):
-            rows = self._linearise(prediction.states.moved(delta), observations)
+            rows = self._linearise(prediction.states.moved(delta), observations, whiten, shaped)
             weights = rows.weights()
             for k in seen:
                 mine = rows.body == k
-                step, P[k] = self._eliminate(
-                    prediction, k, rows.A[mine], rows.b[mine], weights[mine], delta[k]
-                )
+                step, P[k] = _eliminate(motions[k], rows.A[mine], rows.b[mine], weights[mine], delta[k])
                 delta[k] += step
         P[self.single] = forget_turn(P[self.single])
         return replace(prediction.states.moved(delta), P=P)
@@ -119,14 +120,14 @@ class Estimator:
         whitened = np.linalg.solve(np.linalg.cholesky(observations.cov), error[:, :, None])[:, :, 0]
         return error, np.sum(whitened**2, 1)
 
-    def _linearise(self, states: States, observations: Observations) -> _Rows:
+    def _linearise(
+        self, states: States, observations: Observations, whiten: Array, shaped: NDArray[np.bool_]
+    ) -> _Rows:
         views = self.optics.view(states, observations.discs)
-        L = np.linalg.cholesky(observations.cov)
-        A = np.asarray(np.linalg.solve(L, views.jacobian), float)
-        b = np.asarray(np.linalg.solve(L, (observations.uv - views.uv)[:, :, None]), float)[:, :, 0]
+        b = (whiten @ (observations.uv - views.uv)[:, :, None])[:, :, 0]
         known = np.isfinite(b).all(1)
-        rows = _Rows(observations.discs.body[known], A[known], b[known])
-        shaped = _needs_shapes(observations.discs) & np.isfinite(observations.axes_px).all(1) & known
+        rows = _Rows(observations.discs.body[known], (whiten @ views.jacobian)[known], b[known])
+        shaped = shaped & known
         if not shaped.any():
             return rows
         shapes = self._linearise_shapes(states, observations.select(shaped))
@@ -147,30 +148,42 @@ class Estimator:
         sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[:, 0, 0])) / seen.axes_px[:, 1]
         return _Rows(seen.discs.body, A / sigma[:, None, None], stretch[:, 0] / sigma[:, None])
 
-    @staticmethod
-    def _eliminate(
-        prediction: Prediction, k: int, A: Array, b: Array, weights: Array, delta: Array
-    ) -> tuple[Array, Array]:
-        """The correction (12,) of robot k about its prediction displaced by `delta`, and its covariance."""
-        A, b = A.reshape(-1, 12), b.reshape(-1)
-        weighted = np.repeat(weights, 2)[:, None] * A
-        whiten = np.linalg.inv(np.linalg.cholesky(prediction.Q[k]))
-        graph = gtsam.GaussianFactorGraph()
-        graph.push_back(gtsam.HessianFactor(BEFORE, np.linalg.inv(prediction.before[k]), np.zeros(12), 0.0))
-        graph.push_back(
-            gtsam.JacobianFactor(BEFORE, -whiten @ prediction.F[k], NOW, whiten, -whiten @ delta, UNIT)
-        )
-        graph.push_back(gtsam.HessianFactor(NOW, weighted.T @ A, weighted.T @ b, 0.0))
-        now = graph.eliminateSequential(ORDERING).at(1)
-        root = np.linalg.inv(now.R())
-        return root @ now.d(), root @ root.T
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """What the last instant tells of a body at this one: its information there, and whitened F and identity."""
+
+    information: Array
+    F: Array
+    identity: Array
 
 
-def _needs_shapes(discs: Discs) -> NDArray[np.bool_]:
-    """(N,) discs of bodies of which fewer than three markers are seen."""
+def _motion(prediction: Prediction, k: int) -> _Motion:
+    whiten = np.linalg.inv(np.linalg.cholesky(prediction.Q[k]))
+    return _Motion(np.linalg.inv(prediction.before[k]), whiten @ prediction.F[k], whiten)
+
+
+def _eliminate(motion: _Motion, A: Array, b: Array, weights: Array, delta: Array) -> tuple[Array, Array]:
+    """The correction (12,) of a robot about its prediction displaced by `delta`, and its covariance."""
+    A, b = A.reshape(-1, 12), b.reshape(-1)
+    weighted = np.repeat(weights, 2)[:, None] * A
+    graph = gtsam.GaussianFactorGraph()
+    graph.push_back(gtsam.HessianFactor(BEFORE, motion.information, np.zeros(12), 0.0))
+    graph.push_back(
+        gtsam.JacobianFactor(BEFORE, -motion.F, NOW, motion.identity, -motion.identity @ delta, UNIT)
+    )
+    graph.push_back(gtsam.HessianFactor(NOW, weighted.T @ A, weighted.T @ b, 0.0))
+    now = graph.eliminateSequential(ORDERING).at(1)
+    root = np.linalg.inv(now.R())
+    return root @ now.d(), root @ root.T
+
+
+def _shaped(observations: Observations) -> NDArray[np.bool_]:
+    """(N,) outlines of bodies of which fewer than three markers are seen: their shapes are needed."""
+    discs = observations.discs
     places = np.unique(np.column_stack([discs.body, discs.marker]), axis=0)
     seen = np.bincount(places[:, 0].astype(np.intp), minlength=1)
-    return seen[discs.body] < 3
+    return (seen[discs.body] < 3) & np.isfinite(observations.axes_px).all(1)
 
 
 def shears(measured: Array, expected: Array) -> Array:

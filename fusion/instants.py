@@ -61,7 +61,7 @@ class Instants:
     than that by more than `lateness_ns`: then it is dropped and counted.
     """
 
-    def __init__(self, period_ns: int | None = None, lateness_ns: int = 30_000_000) -> None:
+    def __init__(self, period_ns: int | None = None, lateness_ns: int = 150_000_000) -> None:
         """Start empty; without `period_ns` the rate is that of the fastest camera, learnt from its first frames."""
         self.period_ns = period_ns
         self._learns = period_ns is None

@@ -91,9 +91,10 @@ class Optics:
     def project(self, camera: Index, points: Array) -> tuple[Array, Array]:
         """Raw pixels (N, 2) of points (N, 3), each in its own camera's frame, and the derivative (N, 2, 3)."""
         uv, J = np.full((len(points), 2), np.nan), np.full((len(points), 2, 3), np.nan)
-        for k in np.unique(camera):
-            rows = camera == k
-            uv[rows], J[rows] = self.cameras[k].project_with_jacobian(points[rows])
+        for k, lens in enumerate(self.cameras):
+            rows = np.flatnonzero(camera == k)
+            if len(rows):
+                uv[rows], J[rows] = lens.project_with_jacobian(points[rows])
         return uv, J
 
     def rays(self, camera: int, uv: Array) -> Array:

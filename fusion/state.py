@@ -94,9 +94,9 @@ def forget_turn(P: Array) -> Array:
 
 def exp_so3(vectors: Array) -> Array:
     """(N, 3, 3) rotations by vectors (N, 3): Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    W = skew(vectors)
-    return np.eye(3) + np.sinc(angle / np.pi) * W + np.sinc(angle / (2 * np.pi)) ** 2 / 2 * (W @ W)
+    angle = np.maximum(np.sqrt(np.sum(vectors * vectors, -1)), 1e-12)[..., None, None]
+    W, half = skew(vectors), np.sin(angle / 2) / angle
+    return np.eye(3) + np.sin(angle) / angle * W + 2 * half**2 * (W @ W)
 
 
 def skew(vectors: Array) -> Array:

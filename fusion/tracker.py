@@ -38,7 +38,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     sigma_floor_px: float = 0.08  # added to the noise that detectors claim
     lost_after_s: float = 0.3  # without an observation
-    lateness_ms: float = 30.0  # how long an instant waits for a camera
+    lateness_ms: float = 150.0  # how long an instant waits for a camera: USB ones may be 100 ms behind
 
 
 class Tracker:
