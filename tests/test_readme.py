@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from tests.calib.test_intrinsics import SPEC, views
+from tests.calib.test_intrinsics import SPEC, board_poses, render
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -92,8 +92,8 @@ def test_printing_and_detecting(folder: Path):
 def test_lenses_and_world(folder: Path):
     """A board's pictures become a rig; surveyed places need cameras that are placed, and say so."""
     (folder / "board" / "north").mkdir(parents=True)
-    for k, image in enumerate(views(0.6)):
-        cv2.imwrite(str(folder / "board" / "north" / f"{k}.png"), image)
+    for k, pose in enumerate(board_poses(0.6)):
+        cv2.imwrite(str(folder / "board" / "north" / f"{k}.png"), render(*pose))
     command = find("python -m calib intrinsics").replace("charuco:5x4:0.054", SPEC)
     assert "north" in run(command, folder).stdout
     (folder / "surveyed.csv").write_text("camera,x,y,z\nnorth,0,0,2\n")

@@ -1,24 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What an instant costs to fuse, by robots and cameras: `python tests/benchmarks/fusion.py`, processor time."""
+"""What an instant costs to fuse, by robots and cameras: `python -m tests.benchmarks.fusion`, processor time."""
 
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "fusion"))
-
-from synthetic import (  # pyright: ignore[reportMissingImports]  # in tests/fusion
-    PERIOD_NS,
-    Arena,
-    line,
-    ring,
-)
 
 from fusion.instants import Instants
 from fusion.robots import Robot, require_distinct
 from fusion.tracker import Tracker
+from tests.fusion.synthetic import PERIOD_NS, Arena, line, ring
 
 FRAMES, START = 60, 10  # instants timed after those in which robots are found
 CASES = ((1, 4), (3, 4), (10, 4), (10, 8))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a simulated frame costs: `python tests/benchmarks/simulation.py [SCENE]`, processor time of one thread."""
+"""What a simulated frame costs: `python -m tests.benchmarks.simulation [SCENE]`, processor time of one thread."""
 
 import sys
 import time

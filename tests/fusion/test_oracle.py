@@ -11,13 +11,13 @@ which GTSAM has no factor for, is tested elsewhere against sampled circles.
 import gtsam
 import numpy as np
 import pytest
-from synthetic import ring
 
 from calib.camera import Camera
 from camera_node.pose import rotation_from_vector
 from fusion.estimator import CAUCHY, NOMINAL_WEIGHT, Estimator, Observations, Prediction
 from fusion.optics import Discs, Optics
 from fusion.state import States
+from tests.fusion.synthetic import ring
 
 CAMERAS = ring(distortion=(-0.1, 0.02, 0.0003, -0.0002))  # all that GTSAM's Cal3DS2 models
 MARKERS = np.array([[0.15, 0.0, 0.0], [-0.13, 0.14, 0.02], [-0.03, -0.14, 0.05], [0.1, 0.1, 0.0]])
