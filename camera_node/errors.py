@@ -12,6 +12,7 @@
 Every message says what is wrong, where, and what to do. Faults in live data are never raised: they are counted.
 """
 
+import os
 import sys
 from collections.abc import Callable
 
@@ -41,4 +42,7 @@ def run(program: Callable[[], int | None]) -> None:
         code = 2
     except KeyboardInterrupt:
         code = 130
+    except BrokenPipeError:  # whoever read the output has seen enough, as in `detect --json | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
     sys.exit(code or 0)

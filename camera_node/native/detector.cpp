@@ -13,7 +13,6 @@ namespace roundel {
 namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
-constexpr double kHardBlur = 0.4;      // pixels: edges that are spread less are drawn, or sharpened
 constexpr double kNoise = 3;           // grey levels that a picture may differ by from the model
 
 /// A pair under its own threshold theta = (m_d + m_b) / 2, grown anew in the window around it.
@@ -48,11 +47,11 @@ bool is_roundel(const Fit& fit, const Settings& settings, double noise) {
            fit.outer.major >= settings.min_diameter && fit.outer.major <= settings.max_diameter;
 }
 
-/// The fit to the picture as it is or, where its edges are as hard as the pixel grid, to the softened one.
+/// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
+/// softened one.
 std::optional<Fit> fit_roundel(const ImageView& image, const Start& start, const Settings& settings) {
     const auto fit = refine(image, start);
     if (fit && is_roundel(*fit, settings, kNoise)) return fit;
-    if (fit && fit->blur > kHardBlur) return std::nullopt;
     const auto soft = refine_softened(image, start);
     return soft && is_roundel(*soft, settings, kNoise * 6 / 16) ? soft : std::nullopt;
 }

@@ -4,8 +4,8 @@
 
 namespace roundel {
 
-/// `refine` on the 3 x 3 binomial mean of the image around `start`. Edges as hard as the pixel grid (drawn,
-/// or sharpened by a camera) have no sub-pixel shape for the fit to find until they are softened.
+/// `refine` on the 3 x 3 binomial mean of the image around `start`. Edges that are ragged at the scale of a
+/// pixel (drawn, sharpened by a camera, badly printed) fit no model until they are softened.
 ///
 /// The mean hides noise and ties neighbours together; the covariance is widened by what it hides, (16/6)^2.
 std::optional<Fit> refine_softened(const ImageView& image, const Start& start);
