@@ -76,7 +76,7 @@ def test_bad_input_is_one_line(recording, fault, said):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=120,
     )
     assert done.returncode == 2
     assert said in done.stderr
