@@ -3,7 +3,6 @@
 
 import csv
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,11 +14,11 @@ from calib.camera import Camera
 from calib.rig import Rig, save_rig
 from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
+from fusion.__main__ import main
 from fusion.offline import COLUMNS, run
 from fusion.robots import Robot
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 
-ROOT = Path(__file__).resolve().parents[2]
 ARENA = Arena(
     {"a": TRIANGLE, "c": SINGLE},
     {"a": line((0.2, 0.1, 0.2), (0.5, 0, 0)), "c": line((-0.5, 0, 0.2))},
@@ -60,7 +59,7 @@ def test_observations_become_poses(recording, capsys):
         ("no input", "either --frames"),
     ],
 )
-def test_bad_input_is_one_line(recording, fault, said):
+def test_bad_input_is_one_line(recording, fault, said, monkeypatch, capsys):
     if fault == "no rig":
         recording["rig"].unlink()
     elif fault == "unplaced":
@@ -71,16 +70,13 @@ def test_bad_input_is_one_line(recording, fault, said):
     else:
         del recording["observations"]
     options = [part for name, path in recording.items() for part in (f"--{name}", str(path))]
-    done = subprocess.run(
-        [sys.executable, "-m", "fusion", "run", *options],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    monkeypatch.setattr(sys, "argv", ["fusion", "run", *options])
+    with pytest.raises(SystemExit) as exited:
+        main()
+    assert exited.value.code == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert len(told.strip().splitlines()) == 1
 
 
 def test_a_recording_by_another_renderer(shared_data, tmp_path):

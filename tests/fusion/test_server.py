@@ -25,7 +25,7 @@ from fusion.server import Server
 from fusion.tracker import Limits
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
 
@@ -183,4 +183,4 @@ def test_bytes_that_are_no_pose_are_counted(tmp_path):
 def test_a_client_needs_neither_gtsam_nor_scipy():
     code = "import fusion.client, sys; sys.exit(bool({'gtsam', 'scipy', 'viser'} & set(sys.modules)))"
     root = Path(__file__).resolve().parents[2]
-    assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=120).returncode == 0
