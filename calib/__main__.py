@@ -50,7 +50,7 @@ class Wand:
     """The arena's name in the keys."""
     seconds: float = 30.0
     """How long to wave."""
-    zenoh_config: Path | None = None
+    zenoh: Path | None = None
     """A Zenoh configuration of your own."""
 
 
@@ -155,7 +155,7 @@ def _place(command: Wand, rig: Rig, wand: Body, messages: Sequence[Detections], 
 
 
 def _run_live(command: Wand, rig: Rig, wand: Body, console: Console) -> None:
-    with open_client(command.connect, command.zenoh_config) as session:
+    with open_client(command.connect, command.zenoh) as session:
         messages, bad = collect(session, command.arena, command.seconds)
         if bad:
             console.print(f"warning: {bad} messages were none and were skipped")
