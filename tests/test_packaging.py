@@ -16,6 +16,8 @@ import camera_node._core, camera_node.node, calib.rig, fusion.client
 here = pathlib.Path(sys.argv[1])
 for module in (camera_node, camera_node._core, calib, fusion):
     assert here in pathlib.Path(module.__file__).parents, module.__file__
+from web.demo import default_scene
+assert here in default_scene().parents, default_scene()
 """
 
 
@@ -38,7 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
-    """Installed without the checkout, the native core loads and no module comes from the source tree.
+    """Installed without the checkout, the native core loads, the demo's configs are there, and nothing is the source tree's.
 
     `-S` keeps the editable install's import hook out; the dependencies come by PYTHONPATH, after the wheel.
     """
