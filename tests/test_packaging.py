@@ -40,7 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
-    """Installed without the checkout, the native core loads, the demo's configs are there, and nothing is the source tree's.
+    """Installed without the checkout, the native core and the demo's configs are its own.
 
     `-S` keeps the editable install's import hook out; the dependencies come by PYTHONPATH, after the wheel.
     """
