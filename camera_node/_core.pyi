@@ -1,7 +1,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-def class_means(image: NDArray[np.uint8], theta: int) -> tuple[float, float, int]: ...
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 
 class Detector:

@@ -32,15 +32,6 @@ static Table table(const std::vector<roundel::Fit>& fits) {
 }
 
 NB_MODULE(_core, m) {
-    m.def(
-        "class_means",
-        [](const Grey& image, uint8_t theta) {
-            const auto pixels = view(image);
-            nb::gil_scoped_release release;
-            const auto levels = roundel::class_means(pixels, theta);
-            return std::tuple(levels.dark, levels.bright, levels.dark_count);
-        },
-        nb::arg("image").noconvert(), nb::arg("theta"));
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
     nb::class_<roundel::Detector>(m, "Detector")

@@ -8,16 +8,6 @@
 
 namespace roundel {
 
-/// Mean grey levels of the two classes that the grey level `theta` separates, and how many pixels are dark.
-struct Levels {
-    double dark, bright;
-    size_t dark_count;
-};
-
-/// m_d and m_b of the paper's adaptive threshold theta = (m_d + m_b) / 2 (Faigl et al., Section III-B).
-/// A class without pixels has the mean `theta`.
-Levels class_means(const ImageView& image, uint8_t theta);
-
 /// Share of the pixels that are 250 or brighter.
 double saturated_share(const ImageView& image);
 
