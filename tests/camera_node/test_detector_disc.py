@@ -149,7 +149,7 @@ def test_distance_by_the_principal_axis(tilt: float, diameter_m: float, place: t
     """Right to the fourth order in d_o / L at any slant and place; uncorrected it is off by the second order."""
     centre = np.array(place)
     normal = np.array([0.6 * np.sin(tilt), 0.8 * np.sin(tilt), -np.cos(tilt)])
-    roundel, L = project_circle(PINHOLE, centre, normal, diameter_m / 2), np.linalg.norm(centre)
+    roundel, L = project_circle(PINHOLE, centre, normal, diameter_m / 2), float(np.linalg.norm(centre))
     found = distance_by_principal_axis(roundel, PINHOLE, diameter_m)
     assert found / L == pytest.approx(1, abs=0.02 * (diameter_m / L) ** 4 + 1e-8)
     if place[0] == 0:
