@@ -15,7 +15,8 @@ from calib.camera import Camera
 from calib.errors import CalibrationError
 from calib.rig import Rig
 from camera_node.errors import CameraError
-from camera_node.source import Grey, read_grey
+from camera_node.pixels import Grey
+from camera_node.source import read_grey
 
 Array = NDArray[np.float64]
 

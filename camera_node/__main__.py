@@ -44,7 +44,7 @@ class Publish:
     gain: float | None = None
     """Gain in the driver's units (cameras)."""
     fourcc: str | None = None
-    """Pixel format, four letters such as MJPG or YUYV (cameras)."""
+    """Pixel format, four letters such as MJPG, YUYV, GREY, "Y10 " or RGGB (cameras)."""
     scene: Path | None = None
     """The simulated arena (--source sim)."""
     epoch_ns: int | None = None

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
 from camera_node.errors import ConfigError
+from camera_node.pixels import grey
 from camera_node.roundels import Roundels
 
 Array = NDArray[np.float64]
@@ -93,17 +94,18 @@ class Detector:
         """
         return self._offsets[:, :2], self._offsets[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
-    def detect(self, image: NDArray[np.uint8]) -> Roundels:
-        """All roundels of a grey image (h, w), uint8.
+    def detect(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Roundels:
+        """All roundels of a grey image (h, w), uint8, or uint16 of 10 to 16 bits, which are narrowed to 8.
 
         Raises:
             ValueError: the array is no grey image.
         """
-        if image.dtype != np.uint8 or image.ndim != 2:
-            raise ValueError(f"a grey image (h, w) of uint8 is needed, got {image.dtype} {image.shape}")
-        if image.strides[1] != 1 and image.size:
-            image = np.ascontiguousarray(image)
-        table = self._core.detect(image)
+        if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
+            raise ValueError(
+                f"a grey image (h, w) of uint8 or uint16 is needed, got {image.dtype} {image.shape}"
+            )
+        pixels = grey(image)
+        table = self._core.detect(pixels)
         table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
         self._offsets = table[:, 11:16]
         uv, axes = table[:, :2], table[:, 5:7]

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from camera_node.detector import Detector
 from camera_node.errors import ConfigError
 from camera_node.messages import Settings
+from camera_node.pixels import Grey
 from camera_node.roundels import Roundels
-from camera_node.source import Grey, Source
+from camera_node.source import Source
 
 OF_THE_SOURCE = ("exposure_us", "gain")
 OF_THE_DETECTOR = ("min_contrast", "min_diameter_px", "max_diameter_px")

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.messages import CameraStatus
-from camera_node.source import Frame, Grey
+from camera_node.pixels import Grey
+from camera_node.source import Frame
 
 THERMAL = Path("/sys/class/thermal")
 FULL = 250  # grey levels from which a pixel counts as saturated

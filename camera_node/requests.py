@@ -12,7 +12,7 @@ import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.messages import MessageError, Settings, decode, encode
-from camera_node.source import Grey
+from camera_node.pixels import Grey
 
 log = logging.getLogger("camera_node.requests")
 

@@ -12,11 +12,9 @@ from typing import Literal, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.errors import CameraError, ConfigError
-
-Grey = NDArray[np.uint8]
+from camera_node.pixels import Grey, grey
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,20 +219,15 @@ class Replay:
 
 
 def read_grey(path: Path) -> Grey:
-    """The grey image (h, w) uint8 of a file.
+    """The grey image (h, w) uint8 of a file of 8 to 16 bits.
 
     Raises:
         CameraError: the file is missing or is no image.
     """
     if not path.is_file():
         raise CameraError(f"{path} does not exist; check the path")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    depth = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    image = cv2.imdecode(np.fromfile(path, np.uint8), depth) if path.stat().st_size else None
     if image is None:
         raise CameraError(f"{path} is no image that OpenCV reads; give a PNG or JPEG file")
-    return np.ascontiguousarray(image, np.uint8)
-
-
-def grey(image: NDArray) -> Grey:
-    """The grey levels (h, w) of a grey or BGR image."""
-    image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return np.ascontiguousarray(image, np.uint8)
+    return grey(image)
