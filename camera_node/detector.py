@@ -2,7 +2,7 @@
 """The typed face of the native detector."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -28,7 +28,10 @@ class Detector:
         min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
         search_share: of each frame's rows that is searched for new roundels; those that were in the last frame are
             looked for where they are expected, whatever this is. Less costs less, and finds what is new later.
-        mask: polygons (N, 2) of pixels; a roundel whose centre lies in one is left out.
+        mask: polygons (N, 2) of raw pixels; a roundel whose centre lies in one is left out.
+
+    Attributes:
+        settings: what is in force, by the names above.
 
     Raises:
         ConfigError: a setting is out of its range.
@@ -56,9 +59,7 @@ class Detector:
             raise ConfigError(
                 f"diameters of {min_diameter_px} to {max_diameter_px} px; give two in rising order in [6, 10000]"
             )
-        self._mask = [np.asarray(polygon, np.float32) for polygon in mask]
-        if any(p.ndim != 2 or p.shape[1] != 2 or len(p) < 3 or not np.isfinite(p).all() for p in self._mask):
-            raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
+        self._mask = [_check_polygon(polygon) for polygon in mask]
         if not 5 <= min_contrast <= 250:
             raise ConfigError(f"min_contrast is {min_contrast}; give grey levels in [5, 250]")
         if not 0.01 <= search_share <= 1:
@@ -73,6 +74,15 @@ class Detector:
             detector == "paper",
         )
         self._offsets = np.empty((0, 5))
+        self.settings: dict[str, Any] = {
+            "inner_ratios": tuple(inner_ratios),
+            "ratio_tolerance": ratio_tolerance,
+            "min_diameter_px": min_diameter_px,
+            "max_diameter_px": max_diameter_px,
+            "min_contrast": min_contrast,
+            "search_share": search_share,
+            "mask": tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in self._mask),
+        }
 
     @property
     def threshold(self) -> float:
@@ -118,3 +128,10 @@ class Detector:
     def _is_masked(self, uv: Array) -> bool:
         at = (float(uv[0]), float(uv[1]))
         return any(cv2.pointPolygonTest(polygon, at, False) >= 0 for polygon in self._mask)
+
+
+def _check_polygon(polygon: ArrayLike) -> NDArray[np.float32]:
+    corners = np.asarray(polygon, np.float32)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
+        raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
+    return corners
