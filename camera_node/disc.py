@@ -12,6 +12,9 @@ from camera_node.roundels import Roundel, Roundels
 
 Array = NDArray[np.float64]
 BOUNDARY = 24  # points of an ellipse that are taken through the lens
+SCATTER = (
+    1.5  # squared errors of small roundels' offsets over their covariance, which is to first order (measured)
+)
 AROUND = np.linspace(0, 2 * np.pi, BOUNDARY, endpoint=False)
 
 
@@ -85,7 +88,7 @@ def locate_all(
 
     The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: the probability is that
     of chi-square with two degrees of the measured `offsets` from the ellipses' centres (N, 2) and their covariances
-    (N, 2, 2), as `Detector.disc_offsets` gives them. Without them all are 0.5.
+    (N, 2, 2), as `Detector.disc_offsets` gives them, widened by `SCATTER`. Without them all are 0.5.
     """
     ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
     return _locate(ellipses, lens, diameter_m, offsets)
@@ -186,7 +189,7 @@ def _odds(predicted: Array, offset: Array, cov: Array) -> Array:
     """Probabilities (N, 2) of predicted offsets (N, 2, 2) by their chi-square; 0.5 where nothing was predicted."""
     error = predicted - offset[:, None]
     chi2 = np.einsum("nki,nij,nkj->nk", error, np.linalg.inv(cov), error)
-    weight = np.exp(-(chi2 - chi2.min(axis=1, keepdims=True)) / 2)
+    weight = np.exp(-(chi2 - chi2.min(axis=1, keepdims=True)) / 2 / SCATTER)
     return np.nan_to_num(weight / weight.sum(axis=1, keepdims=True), nan=0.5)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the detector reaches, a part of `python -m tests.benchmarks.detector`, and that it sees what the paper's sees."""
+"""What the detector reaches (a part of `python -m tests.benchmarks.detector`), and that chords and paper agree."""
 
 import numpy as np
 import pytest
