@@ -188,6 +188,7 @@ Fit Fitter::fit() const {
             .bright = p[kBright],
             .blur = p[kBlur],
             .residual = std::sqrt(sums_.rr / std::max(1.0, sums_.n)),
+            .edge_residual = std::sqrt(sums_.ring_rr / sums_.ring),
             .agreeing_residual = agreeing_,
             .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};
 }

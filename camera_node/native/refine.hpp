@@ -23,8 +23,9 @@ struct Fit {
     double ratio;                 // inner over outer diameter
     double card;                  // the white card's over the outer diameter, where the card's edge is near
     double dark, bright;          // grey levels
-    double blur;      // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double residual;  // RMS over all pixels used that are on the card, grey levels
+    double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
+    double residual;       // RMS over all pixels used that are on the card, grey levels
+    double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double agreeing_residual;  // over those that agree
     double support;            // share of the ring's edges that is in the image and agrees
 };
