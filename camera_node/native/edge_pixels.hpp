@@ -18,7 +18,7 @@ struct EdgePixels {
 };
 
 /// Fills `pixels` by what lies within `band` pixels of the three edges that `p` says, in every n-th row: n is
-/// the least that leaves about `limit` pixels or less, or a dozen rows. Gives n.
+/// the least that leaves about `limit` pixels or less, or ten rows. Gives n.
 int select_pixels(const ImageView& image, const Parameters& p, double band, int limit, EdgePixels& pixels);
 
 }  // namespace roundel

@@ -14,17 +14,22 @@ struct Start {
     double ratio, dark, bright;
 };
 
+/// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
+/// of the offset x, y to where the disc's own centre projects; pixels.
+using PoseCovariance = std::array<std::array<double, 7>, 7>;
+
 /// A roundel fitted to the grey levels around its edges.
 struct Fit {
     Ellipse outer;
     Symmetric covariance;         // of the centre, square pixels
     double offset_x, offset_y;    // from the ellipse's centre to where the disc's own centre projects, pixels
     Symmetric offset_covariance;  // square pixels
-    double ratio;                 // inner over outer diameter
-    double card;                  // the white card's over the outer diameter, where the card's edge is near
-    double dark, bright;          // grey levels
-    double blur;      // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double residual;  // RMS over all pixels used that are on the card, grey levels
+    PoseCovariance pose_covariance;
+    double ratio;         // inner over outer diameter
+    double card;          // the white card's over the outer diameter, where the card's edge is near
+    double dark, bright;  // grey levels
+    double blur;          // standard deviation of the edges' spread, the pixel's own width included, pixels
+    double residual;      // RMS over all pixels used that are on the card, grey levels
     double agreeing_residual;  // over those that agree
     double support;            // share of the ring's edges that is in the image and agrees
 };
