@@ -23,6 +23,7 @@ constexpr double kNoiseFloor = 1;  // grey levels
 constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kStartBlur = 0.8;
 constexpr double kCardRatio = 9.0 / 7;
+constexpr double kBeyond = 64;          // grey levels off the scale that a small or clipped roundel may need
 constexpr double kShortestFocal = 400;  // pixels: no lens shows more perspective
 
 /// Starting values: A is the symmetric square root that maps the unit circle to the ellipse.
@@ -173,6 +174,7 @@ class Fitter {
         return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * std::sqrt(size) &&
                p[kAxx] > 0 && area > square(0.7) && area < square(1.4) && p[kRatio] > 0.1 &&
                p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * std::sqrt(size) && p[kCard] > 1 &&
+               p[kDark] > -kBeyond && p[kBright] < 255 + kBeyond &&
                square(p[kGx]) + square(p[kGy]) < square(0.5 / p[kCard]);
     }
 
