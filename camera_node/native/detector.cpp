@@ -29,7 +29,11 @@ bool is_roundel(const Fit& fit, const Settings& settings, double noise) {
 
 /// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
 /// softened one.
-std::optional<Fit> fit_roundel(const ImageView& image, const Start& start, const Settings& settings) {
+std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings) {
+    const auto& ratios = settings.inner_ratios;
+    start.print = *std::min_element(ratios.begin(), ratios.end(), [&](double a, double b) {
+        return std::abs(a - start.ratio) < std::abs(b - start.ratio);
+    });
     const auto fit = refine(image, start);
     if (fit && is_roundel(*fit, settings, kNoise)) return fit;
     const auto soft = refine_softened(image, start);

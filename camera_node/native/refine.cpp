@@ -16,14 +16,17 @@ constexpr double kBand = 2.5;       // pixels on either side of an edge that are
 constexpr double kBandBlurs = 2.5;  // blurs, likewise
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
-constexpr int kSample = 128;
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
 constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kStartBlur = 0.8;
 constexpr double kCardRatio = 9.0 / 7;
-constexpr double kBeyond = 64;          // grey levels off the scale that a small or clipped roundel may need
+constexpr double kBeyond = 64;     // grey levels off the scale that a small or clipped roundel may need
+constexpr double kPrint = 0.002;   // standard deviation of ratios among prints of one kind
+constexpr double kOtherPrint = 3;  // standard deviations
+constexpr double kStrict = 0.5;    // of it at first, when the model still bends to what it disagrees with
+constexpr double kSlack = 1.3;     // of a median of few, over the deviation it stands for
 constexpr double kShortestFocal = 400;  // pixels: no lens shows more perspective
 
 /// Starting values: A is the symmetric square root that maps the unit circle to the ellipse.
@@ -65,13 +68,13 @@ class Fitter {
         const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
         if (!select(kBand + unknown, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card();
-        scale_ = edge_scale();
         if (!iterate(2)) return false;
         const double band = std::max(kBand, kBandBlurs * p[kBlur]);
         if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
         return iterate(1);
     }
 
+    void learn_print(double ratio);
     Fit fit() const;
     Parameters p;
 
@@ -100,7 +103,7 @@ class Fitter {
     /// The median of the residuals of a sample of the ring's edges (1.48 of it is a standard deviation).
     double edge_scale() const {
         float residuals[kSample + kLanes];
-        const int n = sample_residuals(pixels_, p, kSample, residuals);
+        const int n = sample_residuals(pixels_, p, residuals);
         if (n < kLanes) return (p[kBright] - p[kDark]) / 4;
         std::nth_element(residuals, residuals + n / 2, residuals + n);
         return std::max(kNoiseFloor, 1.48 * residuals[n / 2]);
@@ -110,7 +113,7 @@ class Fitter {
     /// standard deviation `ahead` steps later.
     bool iterate(int ahead) {
         for (int k = 0; k < kMaxSteps; ++k) {
-            const double used = scale_;
+            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * edge_scale());
             sums_ = accumulate(pixels_, p, used);
             add_prior();
             factor_.emplace(sums_.H);
@@ -183,9 +186,10 @@ class Fitter {
     Parameters start_, prior_;
     NormalEquations sums_;
     std::optional<Cholesky<kCount>> factor_;
+    Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
     int step_ = 1;
     bool is_noise_known_ = false;
-    double scale_ = 0, noise_ = 0, agreeing_ = 0;
+    double scale_ = 255, noise_ = 0, agreeing_ = 0;
 };
 
 /// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
@@ -199,8 +203,21 @@ std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) 
     return T;
 }
 
+/// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
+void Fitter::learn_print(double ratio) {
+    Parameters unit{};
+    unit[kRatio] = square(noise_);
+    const Parameters with = factor_->solve(unit);  // covariance of all with the ratio
+    const double off = ratio - p[kRatio], variance = with[kRatio] + square(kPrint);
+    if (square(off) > square(kOtherPrint) * variance) return;
+    for (int i = 0; i < kCount; ++i) p[i] += with[i] * off / variance;
+    for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
+}
+
 PoseCovariance Fitter::covariance() const {
-    const auto inverse = factor_->inverse_tail<kPoseCount>();
+    auto inverse = factor_->inverse_tail<kPoseCount>();
+    for (int i = 0; i < kPoseCount; ++i)
+        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
     const auto T = outputs_by_pose(p);
     PoseCovariance half{}, whole{};
     for (int a = 0; a < kPoseCount; ++a)
@@ -238,6 +255,7 @@ Fit Fitter::fit() const {
 std::optional<Fit> refine(const ImageView& image, const Start& start) {
     Fitter fitter(image, start);
     if (!fitter.solve()) return std::nullopt;
+    if (start.print > 0) fitter.learn_print(start.print);
     return fitter.fit();
 }
 

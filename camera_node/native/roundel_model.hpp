@@ -75,9 +75,6 @@ class Model {
         for (int k = 0; k < count; ++k) differentiate(at, outer, inner, card, k, to);
     }
 
-    /// Change of level a pixel, in the middle of the ring's edges.
-    float steepest() const { return -fall_ * peak_; }
-
   private:
     /// Where pixels are: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the shift of
     /// an edge of radius 1 by blur, and by how much the distance changes with g . q.
