@@ -57,8 +57,11 @@ bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings
 
 }  // namespace
 
-std::optional<Fit> fit_roundel(const ImageView& image, const Start& start, const Settings& settings,
-                               double noise) {
+std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise) {
+    const auto& ratios = settings.inner_ratios;
+    start.print = *std::min_element(ratios.begin(), ratios.end(), [&](double a, double b) {
+        return std::abs(a - start.ratio) < std::abs(b - start.ratio);
+    });
     const auto fit = refine(image, start);
     if (fit && is_roundel(image, *fit, settings, noise)) return fit;
     const auto soft = refine_softened(image, start);

@@ -2,7 +2,6 @@
 #include "normal_equations.hpp"
 
 #include <algorithm>
-#include <cmath>
 
 #include "simd.hpp"
 
@@ -80,14 +79,16 @@ ROUNDEL_CLONES void add_up(const EdgePixels& pixels, const Model& model, float p
     }
 }
 
-ROUNDEL_CLONES int add_residuals(const EdgePixels& pixels, const Model& model, int step, float* residuals) {
+ROUNDEL_CLONES int add_residuals(const EdgePixels& pixels, const Model& model, int step, float* residuals,
+                                 float* slopes) {
     Gradient gradient;
     int n = 0;
-    for (int begin = 0; begin + kLanes <= pixels.used; begin += step * kLanes) {
+    for (int begin = 0; begin + kLanes <= pixels.used; begin += step * kLanes, n += kLanes) {
         model.evaluate(pixels.x + begin, pixels.y + begin, 1, gradient);
-        const Lanes r = load(pixels.level + begin) - gradient.level[0];
-        for (int lane = 0; lane < kLanes; ++lane)
-            if (std::abs(gradient.ring[0][lane]) > model.steepest() / 2) residuals[n++] = std::abs(r[lane]);
+        const Lanes r = magnitude(load(pixels.level + begin) - gradient.level[0]);
+        const Lanes slope = magnitude(gradient.ring[0]);
+        __builtin_memcpy(residuals + n, &r, sizeof r);
+        __builtin_memcpy(slopes + n, &slope, sizeof slope);
     }
     return n;
 }
@@ -110,8 +111,15 @@ NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double
     return e;
 }
 
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, int limit, float* residuals) {
-    return add_residuals(pixels, Model(p), (pixels.count + limit - 1) / limit, residuals);
+int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals) {
+    float slopes[kSample + kLanes];
+    const int step = (pixels.count + kSample - 1) / kSample;
+    const int n = add_residuals(pixels, Model(p), step, residuals, slopes);
+    const float steep = n > 0 ? *std::max_element(slopes, slopes + n) / 2 : 0;
+    int kept = 0;
+    for (int k = 0; k < n; ++k)
+        if (slopes[k] > steep) residuals[kept++] = residuals[k];
+    return kept;
 }
 
 }  // namespace roundel

@@ -23,7 +23,10 @@ constexpr float kTukey = 6;
 
 NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double scale);
 
-/// Absolute residuals on the ring's edges, of about `limit` pixels spread over all; gives their number.
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, int limit, float* residuals);
+constexpr int kSample = 192;
+
+/// Absolute residuals where the ring's edges are steep, of about kSample pixels spread over all; gives their
+/// number. There is room for kSample and eight.
+int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals);
 
 }  // namespace roundel
