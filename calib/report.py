@@ -3,7 +3,6 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console
@@ -65,11 +64,9 @@ class WandReport:
         """Frames of placed cameras that were not used, by reason."""
         return sum((Counter(row.left_out) for row in self.cameras), Counter())
 
-    def as_dict(self, command: str) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """For the `calibration` map of `rig.yaml`."""
         return {
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "command": command,
             "metric": self.metric,
             "instants": self.instants,
             "residual_px": round(self.residual_px, 4),

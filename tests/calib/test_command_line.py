@@ -2,6 +2,7 @@
 """`python -m calib` end to end: files in, a rig out; faults are one line and exit code 2."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -82,6 +83,20 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert len(done.stderr.splitlines()) == 1
     assert fault in done.stderr
     assert (tmp_path / "rig.yaml").read_text() == "precious"
+
+
+@pytest.mark.parametrize("word", ["undo", "--undo"])
+def test_undo_brings_the_rig_before_back(tmp_path: Path, waved: Arena, word: str):
+    before = (tmp_path / "rig.yaml", tmp_path / "rig.1.yaml")
+    for path in before:
+        shutil.copy(tmp_path / "lenses.yaml", path)
+    (tmp_path / "rig.yaml").write_text("a mistake")
+    done = calib(word, "--rig", tmp_path / "rig.yaml")
+    assert (done.returncode, "is again rig.1.yaml" in done.stdout) == (0, True), done.stderr
+    assert load_rig(tmp_path / "rig.yaml") == load_rig(tmp_path / "lenses.yaml")
+    assert (tmp_path / "rig.undone.yaml").read_text() == "a mistake"
+    done = calib(word, "--rig", tmp_path / "rig.yaml")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
 
 
 def test_a_folder_of_one_camera_or_of_a_stranger_is_named(tmp_path: Path, waved: Arena):

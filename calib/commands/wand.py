@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`calib wand`: where cameras stand, by a wand waved before them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+
+from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.errors import CalibrationError
+from calib.live import collect, publish
+from calib.report import print_report
+from calib.rig import Rig, load_rig
+from camera_node.body import Body
+from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
+from camera_node.messages import Detections
+from camera_node.network import open_client
+from camera_node.observations import detect_frames, read_observations
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wand:
+    """Place the cameras by a wand that was waved before them."""
+
+    wand: Path = Path("configs/wand.yaml")
+    """The wand: diameter_m and markers, metres."""
+    rig: Path
+    """Intrinsics of every camera; poses in it are not used."""
+    out: Path
+    """Where the rig with poses is written; a rig that is there is kept as rig.1.yaml, ..."""
+    frames: Path | None = None
+    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
+    observations: Path | None = None
+    """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    live: bool = False
+    """Or subscribe to the running cameras, and hand them the result."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name in the keys."""
+    seconds: float = 30.0
+    """How long to wave."""
+    zenoh: Path | None = None
+    """A Zenoh configuration of your own."""
+
+    def execute(self, console: Console) -> None:
+        """Nothing is written unless two cameras or more were placed."""
+        check_folder(self.out)
+        if (self.frames is not None) + (self.observations is not None) + self.live != 1:
+            raise ConfigError("give one of --frames FOLDER, --observations CSV and --live")
+        if self.live and not self.seconds > 0:
+            raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
+        rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        if self.live:
+            self._run_live(rig, wand, console)
+        else:
+            self._place(rig, wand, read_recording(rig, wand, self.frames, self.observations), console)
+
+    def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
+        from calib.wand import calibrate
+
+        with console.status("placing cameras"):
+            result = calibrate(rig, wand, messages)
+        print_report(result.report, console)
+        told = {**_of_lenses(rig), **provenance(), **result.report.as_dict()}
+        placed = msgspec.structs.replace(result.rig, calibration=told)
+        write_rig(placed, self.out, console)
+        return placed
+
+    def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
+        with open_client(self.connect, self.zenoh) as session:
+            messages, bad = collect(session, self.arena, self.seconds)
+            if bad:
+                say(console, f"warning: {bad} messages were none and were skipped")
+            placed = self._place(rig, wand, messages, console)
+            if not publish(session, self.arena, placed):
+                say(console, "warning: nobody took the rig; give the server the file that was written")
+
+
+def _of_lenses(rig: Rig) -> dict:
+    """What the lenses' own calibration said stays true."""
+    return {key: value for key, value in rig.calibration.items() if key == "lenses"}
+
+
+def read_recording(rig: Rig, body: Body, frames: Path | None, observations: Path | None) -> list[Detections]:
+    """The detections of a folder of frames, or of a CSV, that was recorded with the cameras of a rig.
+
+    Raises:
+        ConfigError, CameraError, CalibrationError: nothing usable is there, or a camera is not of the rig.
+    """
+    if frames is not None:
+        _check_folders(frames, rig)
+        return detect_frames(frames, inner_ratios=(body.inner_ratio,))
+    assert observations is not None
+    sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
+    return read_observations(observations, sizes)
+
+
+def _check_folders(folder: Path, rig: Rig) -> None:
+    """Say before the minutes of detection what would be said after them."""
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if unknown := [name for name in names if name not in rig.cameras]:
+        raise CalibrationError(
+            f"{folder / unknown[0]} is no camera of the rig, which has {', '.join(sorted(rig.cameras))}; rename "
+            f"the folder, or run python -m calib intrinsics --camera {unknown[0]}"
+        )
+    if len(names) == 1:
+        raise CalibrationError(
+            f"{folder} holds one camera, '{names[0]}'; a wand calibration needs two or more"
+        )
