@@ -20,6 +20,7 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     T_world_cam: Pose | None = None
     time_offset_ms: float = 0.0
     covariance: tuple[tuple[float, ...], ...] | None = None
+    lens_sigma: tuple[float, ...] | None = None
 
     def project_world(self, p_world: ArrayLike) -> Array:
         """Raw pixels (N, 2) of points (N, 3) in the world; NaN for those not before the camera."""
