@@ -17,7 +17,9 @@ from camera_node.messages import Detections, Keys, MessageError, decode, encode
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
 
 
-def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[Detections], int]:
+def collect(
+    session: zenoh.Session, arena: str, seconds: float, doing: str = "wave the wand"
+) -> tuple[list[Detections], int]:
     """Detections of all cameras of an arena for a while, with a line of progress; and the number of bad messages.
 
     Raises:
@@ -29,7 +31,7 @@ def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[De
     )
     messages, bad = [], 0
     seen: Counter[str] = Counter()
-    columns = (TextColumn("wave the wand"), BarColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(doing), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, transient=True) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
         end = time.monotonic() + seconds

@@ -9,7 +9,7 @@ import msgspec
 from rich.console import Console
 
 from calib.commands.output import check_folder, provenance, say, write_rig
-from calib.errors import CalibrationError
+from calib.commands.recording import read_recording
 from calib.live import collect, publish
 from calib.report import print_report
 from calib.rig import Rig, load_rig
@@ -18,7 +18,6 @@ from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
 from camera_node.network import open_client
-from camera_node.observations import detect_frames, read_observations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +56,7 @@ class Wand:
         if self.live:
             self._run_live(rig, wand, console)
         else:
-            self._place(rig, wand, read_recording(rig, wand, self.frames, self.observations), console)
+            self._place(rig, wand, read_recording(rig, self.frames, self.observations, wand), console)
 
     def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
         from calib.wand import calibrate
@@ -83,31 +82,3 @@ class Wand:
 def _of_lenses(rig: Rig) -> dict:
     """What the lenses' own calibration said stays true."""
     return {key: value for key, value in rig.calibration.items() if key == "lenses"}
-
-
-def read_recording(rig: Rig, body: Body, frames: Path | None, observations: Path | None) -> list[Detections]:
-    """The detections of a folder of frames, or of a CSV, that was recorded with the cameras of a rig.
-
-    Raises:
-        ConfigError, CameraError, CalibrationError: nothing usable is there, or a camera is not of the rig.
-    """
-    if frames is not None:
-        _check_folders(frames, rig)
-        return detect_frames(frames, inner_ratios=(body.inner_ratio,))
-    assert observations is not None
-    sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
-    return read_observations(observations, sizes)
-
-
-def _check_folders(folder: Path, rig: Rig) -> None:
-    """Say before the minutes of detection what would be said after them."""
-    names = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
-    if unknown := [name for name in names if name not in rig.cameras]:
-        raise CalibrationError(
-            f"{folder / unknown[0]} is no camera of the rig, which has {', '.join(sorted(rig.cameras))}; rename "
-            f"the folder, or run python -m calib intrinsics --camera {unknown[0]}"
-        )
-    if len(names) == 1:
-        raise CalibrationError(
-            f"{folder} holds one camera, '{names[0]}'; a wand calibration needs two or more"
-        )

@@ -17,6 +17,7 @@ from calib.rig import Rig, load_rig, save_rig
 from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
 from tests.calib.synthetic import Arena, errors, record, ring
+from tests.calib.test_world import L_FRAME, elsewhere, lie_still
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
@@ -83,6 +84,24 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert len(done.stderr.splitlines()) == 1
     assert fault in done.stderr
     assert (tmp_path / "rig.yaml").read_text() == "precious"
+
+
+def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
+    """Observations of an L and its YAML in, the true world out; what fixes no world is one line, and no file."""
+    arena = ring()
+    save_rig(elsewhere(arena.truth), tmp_path / "rig.yaml")
+    write_observations(tmp_path / "floor.csv", lie_still(arena, L_FRAME))
+    (tmp_path / "l.yaml").write_text(f"diameter_m: 0.1\nmarkers: {list(L_FRAME.values())}\n")
+    options = ["--rig", tmp_path / "rig.yaml", "--observations", tmp_path / "floor.csv", "--out"]
+    done = calib("world", "--frame", tmp_path / "l.yaml", *options, tmp_path / "world.yaml")
+    assert done.returncode == 0, done.stderr
+    for name, camera in load_rig(tmp_path / "world.yaml").cameras.items():
+        assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+    (tmp_path / "line.csv").write_text("name,x,y,z\na,0,0,0\nb,1,0,0\nc,2,0,0\n")
+    done = calib("world", "--points", tmp_path / "line.csv", *options, tmp_path / "none.yaml")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "line.csv lie on a line" in done.stderr
+    assert not (tmp_path / "none.yaml").exists()
 
 
 @pytest.mark.parametrize("word", ["undo", "--undo"])
