@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from calib.commands.check import Check
 from calib.commands.intrinsics import Intrinsics
 from calib.commands.undo import Undo
 from calib.commands.wand import Wand
@@ -17,6 +18,7 @@ Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]
     | Annotated[Wand, tyro.conf.subcommand("wand")]
     | Annotated[World, tyro.conf.subcommand("world")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Undo, tyro.conf.subcommand("undo")]
 )
 

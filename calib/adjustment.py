@@ -44,14 +44,12 @@ class Adjusted:
     information: Array
     iterations: int
 
-    def covariance(self) -> Array:
-        """(C, 6, 6) covariance of every camera, the world being where the cameras themselves are on average
+    def joint_covariance(self) -> Array:
+        """(6C, 6C) covariance of all cameras, the world being where the cameras themselves are on average
         (inner constraints; Triggs et al., Bundle Adjustment, section 9.3)."""
         gauge = world_motions(self.state.cameras)
         rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-        full = rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T
-        n = len(self.state.cameras)
-        return np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)], float)
+        return np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
 
 
 def world_motions(cameras: Array) -> Array:

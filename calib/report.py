@@ -3,10 +3,13 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from calib.trust import Trust
 
 WORST = 5  # outliers that are listed one by one
 
@@ -90,17 +93,24 @@ def _figures(mean: float | None, std: float | None) -> dict[str, float] | None:
     return None if mean is None or std is None else {"mean": round(mean, 3), "std": round(std, 3)}
 
 
-def print_report(report: WandReport, console: Console) -> None:
-    """A table of the cameras, then what else a person has to know."""
-    unit = "mm" if report.metric else "mm at this scale"
-    table = Table("camera", "frames used", "markers", "rejected", "residual px", f"expected error {unit}")
+def print_report(report: WandReport, trust: "Trust", console: Console) -> None:
+    """A table of the cameras, then what else a person has to know; the grade comes last."""
+    error = "error mm" if report.metric else "error %"
+    table = Table("camera", "grade", "frames", "markers", "rejected", "residual px", error, "waved")
+    judged = {camera.name: camera for camera in trust.cameras}
     for row in report.cameras:
-        figures = (f"{row.residual_px:.3f}", f"{row.sigma_mm:.2f}")
-        table.add_row(
-            row.name, f"{row.frames_used} of {row.frames}", str(row.observations), str(row.outliers), *figures
+        camera = judged[row.name]
+        counts = (f"{row.frames_used}/{row.frames}", str(row.observations), str(row.outliers))
+        figures = (
+            f"{row.residual_px:.3f}",
+            f"{row.sigma_mm / (1 if report.metric else 10):.2f}",
+            f"{1 - camera.figures['unused']:.0%}",
         )
+        table.add_row(row.name, camera.grade, *counts, *figures)
     console.print(table)
-    for line in _remarks(report):
+    foretold = trust.expected.lines() if trust.expected else []
+    wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
+    for line in [*_remarks(report), *foretold, *wave, trust.sentence()]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 

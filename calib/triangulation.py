@@ -61,46 +61,65 @@ def _linearise(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, A
     return np.vstack(rows), np.concatenate(rest)
 
 
-def point_covariances(cameras: Sequence[Camera], points: ArrayLike, sigma_px: float) -> Array:
-    """What cameras of a rig could know of points, each camera's covariance included.
+def point_covariances(
+    cameras: Sequence[Camera], points: ArrayLike, sigma_px: float, joint: ArrayLike | None = None
+) -> Array:
+    """How well points would be known that all these cameras see, by their pixels and by their own poses.
 
-    A pixel of camera c is off by its own noise and by what a small motion of the camera, in its own frame, does to the
-    point: S_c = sigma^2 I + J_c C_c J_c^T. Poses of different cameras count as independent.
+    Least squares that takes the poses for exact, as tracking does: with A = sum J^T J / sigma^2, pixel noise leaves
+    A^-1, and pose errors xi move the point by A^-1 G xi, G = sum J^T (dpixel / dxi) / sigma^2.
 
     Args:
-        cameras: placed cameras; a camera without covariance counts as known.
+        cameras: C placed cameras; a camera without covariance counts as known.
         points: (N, 3) world.
         sigma_px: standard deviation of a pixel coordinate.
+        joint: (6C, 6C) covariance of all poses together; without it they count as independent.
 
     Returns:
         (N, 3, 3) square metres; infinite where fewer than two cameras see the point, or their rays are parallel.
     """
     points = np.asarray(points, float).reshape(-1, 3)
-    information, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
-    for camera in cameras:
-        seen, J, S = pixel_covariances(camera, points, sigma_px)
-        information[seen] += np.swapaxes(J, 1, 2) @ np.linalg.solve(S, J)
+    A, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
+    G = np.zeros((len(points), 3, 6 * len(cameras)))
+    for k, camera in enumerate(cameras):
+        seen, J, by_pose = _pixel_jacobians(camera, points)
+        A[seen] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
+        G[seen, :, 6 * k : 6 * k + 6] = np.swapaxes(J, 1, 2) @ by_pose / sigma_px**2
         views[seen] += 1
+    poses = _independent(cameras) if joint is None else np.asarray(joint, float)
+    spread = np.linalg.eigvalsh(A)
+    known = (views >= 2) & (spread[:, 0] > MIN_ANGLE**2 / 100 * spread[:, 2])
+    inverse = np.linalg.inv(A[known])
+    moved = inverse @ G[known]
     covariance = np.full((len(points), 3, 3), np.inf)
-    spread = np.linalg.eigvalsh(information)
-    known = (views >= 2) & (spread[:, 0] > 1e-9 * spread[:, 2])
-    covariance[known] = np.linalg.inv(information[known])
+    covariance[known] = inverse + moved @ poses @ np.swapaxes(moved, 1, 2)
     return covariance
 
 
-def pixel_covariances(
-    camera: Camera, points: Array, sigma_px: float
-) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Which of the points (N, 3) a camera sees; of those, J (n, 2, 3) of the pixel by the point, in the world, and the
-    covariance (n, 2, 2) of the pixel, by its noise and the camera's pose."""
+def _independent(cameras: Sequence[Camera]) -> Array:
+    joint = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    for k, camera in enumerate(cameras):
+        if camera.covariance is not None:
+            joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = camera.covariance
+    return joint
+
+
+def _pixel_jacobians(camera: Camera, points: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Which of the points (N, 3) a camera sees; of those, how the pixel changes with the point in the world (n, 2, 3),
+    and with the camera's pose (n, 2, 6)."""
     T = camera.matrix()
     local = transform(invert(T), points)
     uv, J = camera.project_with_jacobian(local)
     seen = camera.sees(uv)
-    local, J = local[seen], J[seen]
-    S = np.tile(sigma_px**2 * np.eye(2), (len(J), 1, 1))
-    if camera.covariance is not None:
-        # A turn w and a shift t of the camera in its own frame move the point there by p x w - t.
-        by_pose = np.concatenate([np.cross(J, local[:, None, :]), -J], axis=2)
-        S = S + by_pose @ np.array(camera.covariance) @ np.swapaxes(by_pose, 1, 2)
-    return seen, J @ T[:3, :3].T, S
+    return seen, J[seen] @ T[:3, :3].T, pose_jacobians(J[seen], local[seen])
+
+
+def pose_jacobians(J: Array, points: Array) -> Array:
+    """(N, 2, 6) how pixels change with a turn w and a shift t of the camera in its own frame: points there move by
+    p x w - t.
+
+    Args:
+        J: (N, 2, 3) derivative of the pixels by the points.
+        points: (N, 3) camera frame.
+    """
+    return np.concatenate([np.cross(J, points[:, None, :]), -J], axis=2)

@@ -32,11 +32,22 @@ LENGTH_SLACK = 0.25  # of a wand length at the start: beyond, a detection is wro
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A rig with poses and covariances, what there is to say of it, and the adjustment (cameras in order of names)."""
+    """A rig with poses and covariances, what there is to say of it, and the adjustment.
+
+    Attributes:
+        rig, report: the result.
+        names: of the C placed cameras, the order of all below.
+        adjusted: the adjustment; `observations` are its rows.
+        covariance: (6C, 6C) of all poses together, each in its camera's own frame, rotation then translation, the world
+            being where the cameras are on average.
+    """
 
     rig: Rig
     report: WandReport
+    names: list[str]
     adjusted: Adjusted
+    observations: Observations
+    covariance: Array
 
 
 def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibration:
@@ -207,7 +218,8 @@ def _conclude(
     cameras = dict(rig.cameras)
     for name in unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
-    covariances = adjusted.covariance()
+    joint = adjusted.joint_covariance()
+    covariances = np.array([joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(names))])
     for name, T, cov in zip(names, adjusted.state.cameras, covariances, strict=True):
         rows = tuple(tuple(row) for row in cov.tolist())
         cameras[name] = msgspec.structs.replace(
@@ -230,7 +242,8 @@ def _conclude(
         outliers=_outliers(names, observations, adjusted),
         metric=metric,
     )
-    return Calibration(move(msgspec.structs.replace(rig, cameras=cameras), T_world), report, adjusted)
+    placed = move(msgspec.structs.replace(rig, cameras=cameras), T_world)
+    return Calibration(placed, report, names, adjusted, observations, joint)
 
 
 def _report_camera(

@@ -42,6 +42,8 @@ class Wand:
     """The arena's name in the keys."""
     seconds: float = 30.0
     """How long to wave."""
+    height: float = 0.1
+    """Metres above the floor at which robots carry their roundels: where errors are foretold."""
     zenoh: Path | None = None
     """A Zenoh configuration of your own."""
 
@@ -59,12 +61,14 @@ class Wand:
             self._place(rig, wand, read_recording(rig, self.frames, self.observations, wand), console)
 
     def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
+        from calib.trust import assess
         from calib.wand import calibrate
 
         with console.status("placing cameras"):
             result = calibrate(rig, wand, messages)
-        print_report(result.report, console)
-        told = {**_of_lenses(rig), **provenance(), **result.report.as_dict()}
+        trust = assess(result, wand, self.height)
+        print_report(result.report, trust, console)
+        told = {**_of_lenses(rig), **provenance(), **trust.as_dict(), **result.report.as_dict()}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed

@@ -86,6 +86,25 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert (tmp_path / "rig.yaml").read_text() == "precious"
 
 
+def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, waved: Arena):
+    """The rig of the recording itself: it stands as it says, halves agree, and the figures land in the copy."""
+    observations = ("--observations", tmp_path / "observations.csv")
+    assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
+    before = (tmp_path / "rig.yaml").read_text()
+    wrote = ("--out", tmp_path / "checked.yaml", "--map", tmp_path / "map.png")
+    done = calib(
+        "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *wrote
+    )
+    assert done.returncode == 0, done.stderr
+    for said in ("the two halves of the recording agree", "the rig and the recording agree", "grade "):
+        assert said in done.stdout
+    assert (tmp_path / "rig.yaml").read_text() == before
+    check = load_rig(tmp_path / "checked.yaml").calibration["check"]
+    assert check["halves"]["agree"]
+    assert check["expected_mm"]["median"] < 2
+    assert cv2.imread(str(tmp_path / "map.png")) is not None
+
+
 def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
     """Observations of an L and its YAML in, the true world out; what fixes no world is one line, and no file."""
     arena = ring()
