@@ -48,11 +48,16 @@ def collect(
             progress.update(task, completed=seconds - left, description=told or "waiting for cameras")
     subscriber.undeclare()
     if not messages:
-        raise CalibrationError(
-            f"no detections on {Keys(arena).detections()} in {seconds:g} s ({bad} bad messages); "
-            "are the server and the cameras running, and --connect and --arena right?"
-        )
+        raise CalibrationError(nothing_came(Keys(arena).detections(), seconds, bad))
     return messages, bad
+
+
+def nothing_came(key: str, seconds: float, bad: int) -> str:
+    """What to say where cameras are silent."""
+    return (
+        f"no detections on {key} in {seconds:g} s ({bad} bad messages); are the server and the cameras running, and "
+        "--connect and --arena right?"
+    )
 
 
 def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:

@@ -5,11 +5,13 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from calib.trust import Trust
+    from calib.waving import Progress
 
 WORST = 5  # outliers that are listed one by one
 
@@ -112,6 +114,20 @@ def print_report(report: WandReport, trust: "Trust", console: Console) -> None:
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
     for line in [*_remarks(report), *foretold, *wave, trust.sentence()]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def show_progress(told: "Progress") -> Group:
+    """A wave as it goes: what each camera has seen, what it would give now, and what to do next."""
+    table = Table("camera", "frames", "image", "shared part", "place over noise")
+    trial = told.trial
+    for name, frames in told.frames.items():
+        used = f"{trial.used[name]:.0%}" if trial and name in trial.used else ""
+        strain = f"{trial.strain[name]:.2f}" if trial and name in trial.strain else ""
+        table.add_row(name, str(frames), f"{told.covered.get(name, 0):.0%}", used, strain)
+    now = f"{told.seconds:.0f} s"
+    if trial and trial.expected_mm is not None:
+        now += f", grade {trial.grade}, expected error {trial.expected_mm:.2f} mm"
+    return Group(Text(now, "bold"), table, Text(told.advice, "green" if told.enough else "yellow"))
 
 
 def _remarks(report: WandReport) -> list[str]:

@@ -63,6 +63,11 @@ class CameraTrust:
     figures: dict[str, float]
 
     @property
+    def strain(self) -> float:
+        """What the camera's covariance moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
+        return self.figures["pose_px"] / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
+
+    @property
     def grade(self) -> str:
         """A to D."""
         return max(grade(name, value) for name, value in self.figures.items())

@@ -7,17 +7,22 @@ from pathlib import Path
 
 import msgspec
 from rich.console import Console
+from rich.live import Live
+from zenoh import Session
 
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
-from calib.live import collect, publish
-from calib.report import print_report
+from calib.live import publish
+from calib.report import print_report, show_progress
 from calib.rig import Rig, load_rig
+from calib.waving import wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
 from camera_node.network import open_client
+
+MOST_S = 180.0  # that a wave may last when it ends by itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +45,8 @@ class Wand:
     """Zenoh endpoints of the server."""
     arena: str = "arena"
     """The arena's name in the keys."""
-    seconds: float = 30.0
-    """How long to wave."""
+    seconds: float | None = None
+    """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels: where errors are foretold."""
     zenoh: Path | None = None
@@ -52,7 +57,7 @@ class Wand:
         check_folder(self.out)
         if (self.frames is not None) + (self.observations is not None) + self.live != 1:
             raise ConfigError("give one of --frames FOLDER, --observations CSV and --live")
-        if self.live and not self.seconds > 0:
+        if self.seconds is not None and not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
         if self.live:
@@ -75,12 +80,30 @@ class Wand:
 
     def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
         with open_client(self.connect, self.zenoh) as session:
-            messages, bad = collect(session, self.arena, self.seconds)
+            messages, bad, why = self._wave(session, rig, wand, console)
+            say(console, f"the wave ended: {why}")
             if bad:
                 say(console, f"warning: {bad} messages were none and were skipped")
             placed = self._place(rig, wand, messages, console)
             if not publish(session, self.arena, placed):
                 say(console, "warning: nobody took the rig; give the server the file that was written")
+
+    def _wave(
+        self, session: Session, rig: Rig, wand: Body, console: Console
+    ) -> tuple[list[Detections], int, str]:
+        # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
+        trials = self.seconds is None or console.is_terminal
+        with Live(console=console, transient=True) as live:
+            return wave(
+                session,
+                self.arena,
+                rig,
+                wand,
+                self.seconds or MOST_S,
+                lambda told: live.update(show_progress(told)),
+                by_itself=trials and self.seconds is None,
+                trials=trials,
+            )
 
 
 def _of_lenses(rig: Rig) -> dict:
