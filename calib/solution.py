@@ -36,7 +36,7 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
         metric: whether the start has the world's scale.
 
     Raises:
-        CalibrationError: the wand's lengths fit nothing that was seen, or the adjustment does not converge.
+        CalibrationError: the wand's lengths fit nothing that was seen.
     """
     if not metric:
         cameras = cameras.copy()
