@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from calib.outcome import Calibration
     from calib.trust import Trust
     from calib.waving import Progress
 
@@ -95,25 +96,48 @@ def _figures(mean: float | None, std: float | None) -> dict[str, float] | None:
     return None if mean is None or std is None else {"mean": round(mean, 3), "std": round(std, 3)}
 
 
-def print_report(report: WandReport, trust: "Trust", console: Console) -> None:
+def print_report(result: "Calibration", trust: "Trust", console: Console) -> None:
     """A table of the cameras, then what else a person has to know; the grade comes last."""
+    report, clocks = result.report, bool((result.time_sigma_ms > 0).any())
     error = "error mm" if report.metric else "error %"
-    table = Table("camera", "grade", "frames", "markers", "rejected", "residual px", error, "waved")
+    heads = ["camera", "grade", "frames", "used", "outliers", "residual", error, "waved"]
+    table = Table(*heads, *["clock ms"] * clocks)
     judged = {camera.name: camera for camera in trust.cameras}
-    for row in report.cameras:
+    for k, row in enumerate(report.cameras):
         camera = judged[row.name]
         counts = (f"{row.frames_used}/{row.frames}", str(row.observations), str(row.outliers))
-        figures = (
-            f"{row.residual_px:.3f}",
-            f"{row.sigma_mm / (1 if report.metric else 10):.2f}",
-            f"{1 - camera.figures['unused']:.0%}",
-        )
-        table.add_row(row.name, camera.grade, *counts, *figures)
+        error_mm = row.sigma_mm if report.metric else row.sigma_mm / 10
+        figures = (f"{row.residual_px:.3f} px", f"{error_mm:.2f}", f"{1 - camera.figures['unused']:.0%}")
+        clock = f"{result.time_offset_ms[k]:+.2f} ± {result.time_sigma_ms[k]:.2f}"
+        table.add_row(row.name, camera.grade, *counts, *figures, *[clock] * clocks)
     console.print(table)
     foretold = trust.expected.lines() if trust.expected else []
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
-    for line in [*_remarks(report), *foretold, *wave, trust.sentence()]:
+    for line in [*_remarks(report), *_drifts(result), *foretold, *wave, trust.sentence()]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _drifts(result: "Calibration") -> list[str]:
+    if not (result.drift_sigma_ppm > 0).any():
+        return []
+    rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
+    return ["clocks drift apart, in ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]
+
+
+def clocks_as_dict(result: "Calibration") -> dict[str, Any]:
+    """Time offsets and drifts for the `calibration` map of `rig.yaml`; empty where the data want none."""
+    columns = {
+        "time_offset_ms": (result.time_offset_ms, result.time_sigma_ms),
+        "drift_ppm": (result.drift_ppm, result.drift_sigma_ppm),
+    }
+    return {
+        what: {
+            name: {"value": round(float(value), 4), "sigma": round(float(sigma), 4)}
+            for name, value, sigma in zip(result.names, values, sigmas, strict=True)
+        }
+        for what, (values, sigmas) in columns.items()
+        if (sigmas > 0).any()
+    }
 
 
 def show_progress(told: "Progress") -> Group:

@@ -42,6 +42,7 @@ ADVICE = {
     "length": "measure the wand, and calibrate the lenses again",
     "unplaced": "wave where it and another camera see the wand",
 }
+NOT_RECORDED = "is not in the recording"  # the reason of a camera that was not there, which is nobody's fault
 CELLS = (4, 6)  # rows and columns in which an image is counted
 MANY = 4  # thirds of an image: more are not worth naming
 DEPTHS = (0.1, 0.5, 0.9)  # quantiles of the wand's distances, at which another camera may see too
@@ -192,7 +193,8 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
         placed = [result.rig.cameras[name] for name in result.names]
         expected = map_precision(placed, low, high, height_m, sigma_px, result.covariance)
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
-    return Trust(cameras, sorted(result.report.unplaced), off, expected)
+    unplaced = sorted(name for name, why in result.report.unplaced.items() if why != NOT_RECORDED)
+    return Trust(cameras, unplaced, off, expected)
 
 
 def waved_points(result: Calibration) -> Array:

@@ -67,7 +67,7 @@ class Check:
         with console.status("placing cameras"):
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
-        print_report(result.report, trust, console)
+        print_report(result, trust, console)
         halves = _compare_halves(rig, wand, messages, console)
         stands = _compare_with_rig(rig, result, console)
         if self.map is not None and trust.expected is not None:

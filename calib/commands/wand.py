@@ -13,7 +13,7 @@ from zenoh import Session
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
 from calib.live import publish
-from calib.report import print_report, show_progress
+from calib.report import clocks_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.waving import wave
 from camera_node.body import Body
@@ -72,8 +72,9 @@ class Wand:
         with console.status("placing cameras"):
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
-        print_report(result.report, trust, console)
-        told = {**_of_lenses(rig), **provenance(), **trust.as_dict(), **result.report.as_dict()}
+        print_report(result, trust, console)
+        told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
+        told |= _of_lenses(rig)
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From a rough rig to the adjusted one: robustly on few moments, then exactly on more; clocks only where they tell."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjustment import Adjusted, adjust, find_robustly
+from calib.discs import centre_offsets
+from calib.errors import CalibrationError
+from calib.linearisation import DRIFT, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.wave import Wave
+
+Array = NDArray[np.float64]
+
+FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
+DRIFT_S = 20.0  # a recording must last to show clocks that drift
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The adjusted rig of a wave, and the observations it stands on, with discs' own centres."""
+
+    adjusted: Adjusted
+    observations: Observations
+
+
+def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution:
+    """Adjust from a rough start.
+
+    Args:
+        wave: the recording.
+        cameras: (C, 4, 4) T_world_cam; where nothing tells the scale, its two farthest cameras keep their distance.
+        offset_s: (C,) true time = stamp + offset.
+        metric: whether the start has the world's scale.
+
+    Raises:
+        CalibrationError: the wand's lengths fit nothing that was seen.
+    """
+    if not metric:
+        cameras = cameras.copy()
+        cameras[:, :3, 3] /= _farthest(cameras)[2]
+    problem, state, observations = _around(wave, cameras, offset_s, FEW)
+    clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
+    problem = problem.freeing(POSE, *clocks)
+    state = find_robustly(problem, observations, state)
+    few = adjust(problem, _with_disc_centres(wave, problem, state, observations), state)
+    free = [part for part in clocks if _tells(few, part)]
+    offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
+    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
+    start = replace(start, clocks=np.column_stack([offset_s, few.state.clocks[:, 1] * (DRIFT in free)]))
+    problem = problem.freeing(POSE, *free)
+    observations = _with_disc_centres(wave, problem, start, observations)
+    return Solution(adjust(problem, observations, start), observations)
+
+
+def _around(wave: Wave, cameras: Array, offset_s: Array, budget: int) -> tuple[Problem, State, Observations]:
+    found = wave.pose_problem(cameras, offset_s, budget)
+    if found is None:
+        raise CalibrationError(
+            "the wand's lengths do not fit what the cameras saw: is the wand file right, "
+            "and are the intrinsics those of these cameras?"
+        )
+    problem, state, observations = found
+    if len(problem.wand.lengths) == 0:
+        problem = replace(problem, fixed_distance=_farthest(cameras))
+    return problem, state, observations
+
+
+def _farthest(cameras: Array) -> tuple[int, int, float]:
+    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
+    return int(a), int(b), float(gaps[a, b])
+
+
+def _with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observations) -> Observations:
+    points = Linearisation(problem, seen).positions(state)
+    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    return replace(
+        seen, uv=seen.uv - centre_offsets(lenses, state.cameras, seen, points, wave.wand.diameter_m / 2)
+    )
+
+
+def _tells(adjusted: Adjusted, part: tuple[int, ...]) -> bool:
+    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters."""
+    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
+    values = values - values.mean()
+    cov = adjusted.covariance(part)[:, 0, :, 0]
+    squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
+    return bool(squared > (len(values) - 1) * np.log(2 * adjusted.used.sum()))
