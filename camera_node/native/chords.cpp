@@ -61,6 +61,16 @@ ROUNDEL_CLONES int collect(const int* flags, int count, int* numbers) {
     return n;
 }
 
+/// The darkest of three pixels in the middle of a run: a thin ring is that dark on one of them only.
+template <typename Level>
+int darkest(const Level& level, int begin, int end) {
+    const int middle = (begin + end) / 2;
+    int least = level(middle);
+    for (const int k : {middle - 1, middle + 1})
+        if (k >= begin && k < end) least = std::min(least, level(k));
+    return least;
+}
+
 }  // namespace
 
 ChordSearch::ChordSearch(const Settings& settings) {
@@ -68,7 +78,7 @@ ChordSearch::ChordSearch(const Settings& settings) {
     const double r = std::max(0.05, *low - settings.ratio_tolerance);
     const double R = std::min(0.95, *high + settings.ratio_tolerance);
     // The shortest chord through the centre is the minor axis.
-    limits_ = {int(0.75 * settings.min_diameter), int(settings.max_diameter + 2),
+    limits_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2),
                int(std::lround(16 * (1 - r) / (2 * r))), int(std::lround(16 * (1 - R) / (2 * R)))};
     min_contrast_ = int(settings.min_contrast / 2);
 }
@@ -121,9 +131,9 @@ void ChordSearch::close(const Stack& stack) {
     const int d = c < across.length ? across.run_end(line, c) : c;
     if (!is_diametral(b - a, c - b) && !is_diametral(d - c, c - b)) return;
     if (6 * (stack.last - stack.first + 1) < c - b) return;  // much of the hole's lines are diametral
-    const auto level = [&](int k) { return along_rows_ ? image_->row(k)[at] : image_->row(at)[k]; };
+    const auto level = [&](int k) -> int { return along_rows_ ? image_->row(k)[at] : image_->row(at)[k]; };
     const bool upper = b > a && (d == c || b - a <= d - c);
-    const int m_d = level(upper ? (a + b - 1) / 2 : (c + d - 1) / 2), m_b = level((b + c - 1) / 2);
+    const int m_d = upper ? darkest(level, a, b) : darkest(level, c, d), m_b = level((b + c - 1) / 2);
     if (m_b - m_d < min_contrast_) return;
     const float x = float(at), y = float(b + c - 1) / 2;
     const auto reach =

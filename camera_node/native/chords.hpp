@@ -11,7 +11,7 @@ namespace roundel {
 struct Seed {
     float x, y;
     float reach;       // how far from here the hole's edge may be, pixels
-    int dark, bright;  // m_d and m_b of the paper, from one pixel each
+    int dark, bright;  // m_d and m_b of the paper, from a few pixels
 };
 
 /// What a chord of a roundel may be: the least and the most of its length, pixels, and of one dark run over

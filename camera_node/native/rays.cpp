@@ -62,8 +62,9 @@ class Ray {
     }
 
   private:
-    /// How far a ray goes until half a pixel before the image's last one.
+    /// How far a ray goes until half a pixel before the image's last one; nothing is seen from outside.
     static float room(float at, float step, int length) {
+        if (!(at >= 0 && at <= float(length - 1))) return 0;
         const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
         return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
     }
@@ -95,13 +96,14 @@ class Ray {
 struct Crossing {
     double x, y;
     bool outer;
+    float ratio;  // of the ray's inner distance to its outer one; 0 where it has one only
 };
 
 struct Crossings {
     std::array<Crossing, 2 * kRays> list;
     int count = 0;
-    void add(Direction direction, double at, bool outer) {
-        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer};
+    void add(Direction direction, double at, bool outer, float ratio) {
+        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer, ratio};
     }
 };
 
@@ -130,12 +132,16 @@ Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
         const float inner = ray.turn(true, theta, seed.reach);
         const float outer = inner < 0 ? -1 : ray.turn(false, theta, inner / float(ratios.least) + 2);
         const bool both = outer >= 0 && double(inner) < ratios.most * double(outer) + 1;
-        if (inner >= 0) crossings.add(direction, double(inner), false);
-        if (both) crossings.add(direction, double(outer), true);
+        const float ratio = both ? inner / outer : 0;
+        if (inner >= 0) crossings.add(direction, double(inner), false, ratio);
+        if (both) crossings.add(direction, double(outer), true, ratio);
         missed += !both;
     }
     return crossings;
 }
+
+/// The weight of what is off by so many scales (Geman and McClure).
+double redescend(double off) { return 1 / ((1 + off * off) * (1 + off * off)); }
 
 /// Two ellipses of one centre and shape: p^T M p + v p = 1 is the outer one and = level the inner one.
 struct Conics {
@@ -186,14 +192,26 @@ int reweigh(const Crossings& crossings, const Conics& conics, std::array<double,
         const double share = (conics.at(p.x, p.y) - 1 + frame.outer) / (p.outer ? frame.outer : frame.inner);
         const double off = radius * (std::sqrt(std::max(share, 0.0)) - 1) / (kRelative * radius + kAbsolute);
         agree[p.outer] += std::abs(off) < 1;
-        weights[size_t(k)] = 1 / (1 + 4 * off * off) / (p.outer ? 1 : frame.inner / frame.outer);
+        weights[size_t(k)] = redescend(2 * off) / (p.outer ? 1 : frame.inner / frame.outer);
     }
     return std::min(agree[0], agree[1]);
 }
 
-std::optional<Conics> fit(const Crossings& crossings) {
+/// Weights to begin with: from near the middle, rays that nothing covers have about the same ratio.
+std::array<double, 2 * kRays> weigh(const Crossings& crossings) {
+    std::array<float, 2 * kRays> ratios;
+    int n = 0;
+    for (int k = 0; k < crossings.count; ++k)
+        if (const Crossing& p = crossings.list[size_t(k)]; p.outer) ratios[size_t(n++)] = p.ratio;
+    std::nth_element(ratios.begin(), ratios.begin() + n / 2, ratios.begin() + n);
     std::array<double, 2 * kRays> weights;
-    weights.fill(1);
+    for (int k = 0; k < crossings.count; ++k)
+        weights[size_t(k)] = redescend(double(crossings.list[size_t(k)].ratio - ratios[size_t(n / 2)]) / 0.1);
+    return weights;
+}
+
+std::optional<Conics> fit(const Crossings& crossings) {
+    std::array<double, 2 * kRays> weights = weigh(crossings);
     std::optional<Conics> conics;
     for (int k = 0, agree = 0; k < kReweights && 2 * agree < crossings.count; ++k) {
         conics = solve(crossings, weights);
@@ -244,6 +262,7 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
         const Frame frame(*conics);
         Ellipse outer = outer_ellipse(*conics, frame);
         const double ratio = std::sqrt(frame.inner / frame.outer), moved = std::hypot(frame.x, frame.y);
+        if (!(moved < outer.major)) return std::nullopt;
         outer.x += double(from.x), outer.y += double(from.y);
         const double m_d = median_level(image, outer, (1 + ratio) / 2);
         const double m_b = median_level(image, outer, ratio / 3);
