@@ -9,6 +9,7 @@ from rich.console import Console
 
 from calib.commands.check import Check
 from calib.commands.intrinsics import Intrinsics
+from calib.commands.plan import PlanArena
 from calib.commands.undo import Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
@@ -19,6 +20,7 @@ Command = (
     | Annotated[Wand, tyro.conf.subcommand("wand")]
     | Annotated[World, tyro.conf.subcommand("world")]
     | Annotated[Check, tyro.conf.subcommand("check")]
+    | Annotated[PlanArena, tyro.conf.subcommand("plan")]
     | Annotated[Undo, tyro.conf.subcommand("undo")]
 )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.camera import Camera
-from calib.triangulation import point_covariances
+from calib.triangulation import Sees, in_image, point_covariances
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ class PrecisionMap:
     Attributes:
         x, y: (X,) and (Y,) places of the grid, metres, ascending.
         z: the height, metres.
+        sigma_px: standard deviation of a roundel's centre, pixels.
         sigma_mm: (Y, X) standard deviation along the worst axis; infinite where fewer than two cameras see.
         views: (Y, X) cameras that see.
     """
@@ -34,8 +35,14 @@ class PrecisionMap:
     x: Array
     y: Array
     z: float
+    sigma_px: float
     sigma_mm: Array
     views: NDArray[np.intp]
+
+    @property
+    def points(self) -> Array:
+        """(Y X, 3) the grid's points, row by row."""
+        return grid_points(self.x, self.y, self.z)
 
     @property
     def typical_mm(self) -> float:
@@ -57,7 +64,7 @@ class PrecisionMap:
     def lines(self) -> list[str]:
         """The map in text, north (y) up, a dot where fewer than two cameras see."""
         said = [
-            f"expected error in mm at z = {self.z:.2f} m (1 sigma, worst axis, centres to {SIGMA_PX} px):"
+            f"expected error in mm at z = {self.z:.2f} m (1 sigma, worst axis, centres to {self.sigma_px:g} px):"
         ]
         for row in reversed(range(len(self.y))):
             cells = "".join(f"{_figure(value):>6}" for value in self.sigma_mm[row])
@@ -83,6 +90,7 @@ def map_precision(
     z: float,
     sigma_px: float = SIGMA_PX,
     joint: ArrayLike | None = None,
+    sees: Sees = in_image,
 ) -> PrecisionMap:
     """The map of a rectangle (2,) to (2,) of the floor, at a height.
 
@@ -92,22 +100,26 @@ def map_precision(
         z: the height at which robots carry their roundels, metres.
         sigma_px: standard deviation of a roundel's centre, pixels.
         joint: (6C, 6C) covariance of all poses together; without it they count as independent.
+        sees: which points a camera sees.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     step = next((s for s in STEPS if (high - low).max() / s <= COLUMNS), STEPS[-1])
     x, y = (
         np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step for a, b in zip(low, high, strict=True)
     )
-    grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1)
-    covariance = point_covariances(cameras, grid, sigma_px, joint)
+    grid = grid_points(x, y, z)
+    covariance = point_covariances(cameras, grid, sigma_px, joint, sees)
     known = np.isfinite(covariance).all(axis=(1, 2))
     sigma = np.full(len(covariance), np.inf)
     sigma[known] = 1e3 * np.sqrt(np.linalg.eigvalsh(covariance[known])[:, -1])
-    views = sum(
-        (c.sees(c.project_world(grid)).astype(np.intp) for c in cameras), np.zeros(len(sigma), np.intp)
-    )
+    views = np.array([sees(camera, grid) for camera in cameras]).astype(np.intp).sum(axis=0)
     shape = (len(y), len(x))
-    return PrecisionMap(x, y, z, sigma.reshape(shape), views.reshape(shape))
+    return PrecisionMap(x, y, z, sigma_px, sigma.reshape(shape), views.reshape(shape))
+
+
+def grid_points(x: Array, y: Array, z: float) -> Array:
+    """(Y X, 3) the points of a grid, row by row."""
+    return np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
 
 
 def _draw(told: PrecisionMap, cameras: Mapping[str, Camera]) -> NDArray[np.uint8]:

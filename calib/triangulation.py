@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A point seen by several placed cameras, and how well it is known: by their pixels and by their own poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,7 @@ from calib.errors import CalibrationError
 from camera_node.pose import invert
 
 Array = NDArray[np.float64]
+Sees = Callable[[Camera, Array], NDArray[np.bool_]]
 
 MIN_ANGLE = 0.01  # radians between rays, about: nearer to parallel, they fix no point
 ITERATIONS = 8
@@ -61,8 +62,17 @@ def _linearise(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, A
     return np.vstack(rows), np.concatenate(rest)
 
 
+def in_image(camera: Camera, points: Array) -> NDArray[np.bool_]:
+    """Which of the points (N, 3), world, lie in a camera's image."""
+    return camera.sees(camera.project_world(points))
+
+
 def point_covariances(
-    cameras: Sequence[Camera], points: ArrayLike, sigma_px: float, joint: ArrayLike | None = None
+    cameras: Sequence[Camera],
+    points: ArrayLike,
+    sigma_px: float,
+    joint: ArrayLike | None = None,
+    sees: Sees = in_image,
 ) -> Array:
     """How well points would be known that all these cameras see, by their pixels and by their own poses.
 
@@ -74,6 +84,7 @@ def point_covariances(
         points: (N, 3) world.
         sigma_px: standard deviation of a pixel coordinate.
         joint: (6C, 6C) covariance of all poses together; without it they count as independent.
+        sees: which points a camera sees.
 
     Returns:
         (N, 3, 3) square metres; infinite where fewer than two cameras see the point, or their rays are parallel.
@@ -82,7 +93,8 @@ def point_covariances(
     A, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
     G = np.zeros((len(points), 3, 6 * len(cameras)))
     for k, camera in enumerate(cameras):
-        seen, J, by_pose = _pixel_jacobians(camera, points)
+        seen = sees(camera, points)
+        J, by_pose = _pixel_jacobians(camera, points[seen])
         A[seen] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
         G[seen, :, 6 * k : 6 * k + 6] = np.swapaxes(J, 1, 2) @ by_pose / sigma_px**2
         views[seen] += 1
@@ -104,14 +116,13 @@ def _independent(cameras: Sequence[Camera]) -> Array:
     return joint
 
 
-def _pixel_jacobians(camera: Camera, points: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Which of the points (N, 3) a camera sees; of those, how the pixel changes with the point in the world (n, 2, 3),
-    and with the camera's pose (n, 2, 6)."""
+def _pixel_jacobians(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """How the pixels of points (N, 3) change with the point in the world (N, 2, 3), and with the camera's pose
+    (N, 2, 6)."""
     T = camera.matrix()
     local = transform(invert(T), points)
-    uv, J = camera.project_with_jacobian(local)
-    seen = camera.sees(uv)
-    return seen, J[seen] @ T[:3, :3].T, pose_jacobians(J[seen], local[seen])
+    J = camera.project_with_jacobian(local)[1]
+    return J @ T[:3, :3].T, pose_jacobians(J, local)
 
 
 def pose_jacobians(J: Array, points: Array) -> Array:
