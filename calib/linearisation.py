@@ -20,16 +20,16 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians, right-hand side
 
-RIGID_M = 5e-5  # by which a wand bends while it is waved
+RIGID_M = 2e-4  # by which a wand bends while it is waved
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
-STEP_M = 0.1  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
+STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
 # Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
 FIXED = 1e-6  # to which a distance that carries the scale is kept
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-# What is known of a camera before: of clocks, of crystals, and of lenses that were calibrated some time ago.
-PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 1e-4, 0.02, 20.0, 20.0, 0.05])
+# What is known of a camera before: of clocks, which may be slewed, and of lenses that were calibrated some time ago.
+PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +178,10 @@ class Linearisation:
         self.smooth = np.zeros((len(dt), 2, 4))
         for k in np.flatnonzero((dt <= self.problem.gap_s) & (dt > 0)):
             self.smooth[k] = whitened_motion(dt[k], self.problem.density)
+
+    def linked(self) -> int:
+        """The number of intervals between knots that are no gaps."""
+        return int(self.smooth.any(axis=(1, 2)).sum())
 
     def times(self, state: State) -> Array:
         """True capture times (n,) as the clocks stand."""

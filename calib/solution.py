@@ -10,12 +10,13 @@ from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
 from calib.linearisation import DRIFT, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
 Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
-DRIFT_S = 20.0  # a recording must last to show clocks that drift
+DRIFT_S = 2.0  # a recording must last to show clocks that drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
     start = replace(start, clocks=np.column_stack([offset_s, few.state.clocks[:, 1] * (DRIFT in free)]))
-    problem = problem.freeing(POSE, *free)
+    density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
+    problem = replace(problem.freeing(POSE, *free), density=density)
     observations = _with_disc_centres(wave, problem, start, observations)
     return Solution(adjust(problem, observations, start), observations)
 
