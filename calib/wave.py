@@ -57,8 +57,10 @@ class Wave:
         knot = np.unique(instant[rows], return_inverse=True)[1]
         knot_s = middles(true_s[rows], knot)
         affine = AffineWand.of(self.wand)
-        basis = find_basis(triangulate(self.tracks, cameras, offset_s, knot_s, self.gap_s), affine)
-        basis = bridge(knot_s, without_spikes(knot_s, basis, self.gap_s), self.gap_s)
+        markers, agreeing = triangulate(self.tracks, cameras, offset_s, knot_s, self.gap_s)
+        sure = (np.isnan(markers[:, :, 0]) | (agreeing >= 3)).all(axis=1)
+        basis = without_spikes(knot_s, find_basis(markers, affine), sure, self.gap_s)
+        basis = bridge(knot_s, basis, self.gap_s)
         good = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
         if good.sum() < MIN_KNOTS:
             return None
@@ -110,8 +112,9 @@ def find_basis(markers: Array, affine: AffineWand) -> Array:
     return basis
 
 
-def without_spikes(knot_s: Array, basis: Array, gap_s: float) -> Array:
-    """The basis without knots that are much farther from between their neighbours than is usual, and than these are."""
+def without_spikes(knot_s: Array, basis: Array, sure: NDArray[np.bool_], gap_s: float) -> Array:
+    """The basis without knots that are much farther from between their neighbours than is usual, and than these are,
+    unless they are `sure` (K,)."""
     if len(knot_s) < 3:
         return basis
     share = ((knot_s[1:-1] - knot_s[:-2]) / (knot_s[2:] - knot_s[:-2]))[:, None, None]
@@ -121,7 +124,7 @@ def without_spikes(knot_s: Array, basis: Array, gap_s: float) -> Array:
     beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
     spikes = 1 + np.flatnonzero((off > SPIKE * usual) & (off >= beside))
     basis = basis.copy()
-    basis[spikes] = np.nan
+    basis[spikes[~sure[spikes]]] = np.nan
     return basis
 
 
