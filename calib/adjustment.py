@@ -110,7 +110,9 @@ def _variance_factor(linearisation: Linearisation, state: State) -> float:
     B, knots, linked = len(problem.wand.basis), len(problem.knot_s), linearisation.linked()
     equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
     free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6
-    return float(np.sqrt(2 * linearisation.cost(state, np.inf, np.inf) / max(equations - free, equations / 10)))
+    return float(
+        np.sqrt(2 * linearisation.cost(state, np.inf, np.inf) / max(equations - free, equations / 10))
+    )
 
 
 def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[State, int]:

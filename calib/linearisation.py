@@ -169,7 +169,9 @@ class Linearisation:
 
     problem: Problem
     observations: Observations
-    broken: NDArray[np.bool_] | None = None  # (L,) intervals over which the hand was not as smooth as elsewhere
+    broken: NDArray[np.bool_] | None = (
+        None  # (L,) intervals over which the hand was not as smooth as elsewhere
+    )
     smooth: Array = field(init=False)  # (L, 2, 4) whitened constant velocity between knots; 0 across gaps
     root: Array = field(init=False)  # (n, 2, 2) whitens residuals
     views: Index = field(init=False)  # (V,) link times C plus camera, ascending

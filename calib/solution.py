@@ -17,7 +17,12 @@ Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
 NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
-LENS_SIGMA = (0.002, 2.0, 2.0, 0.002)  # of log f, cx, cy and k1: a recording that leaves more open fixes no lens
+LENS_SIGMA = (
+    0.002,
+    2.0,
+    2.0,
+    0.002,
+)  # of log f, cx, cy and k1: a recording that leaves more open fixes no lens
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
 
 
