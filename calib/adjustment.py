@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 
 CAUCHY = 2.3849  # 95 % efficient on normal residuals
 REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
+BREAK = 4.0  # sigmas, over all coordinates: the hand was knocked, or frames are missing from the count
 MAX_ITERATIONS = 60
 MIN_DAMPING = 1e-9
-NOTHING = (
-    1e-4  # gained in half of chi-square: every parameter is within a hundredth of its standard deviation
-)
+ROUGHLY, NOTHING = 5e-3, 1e-4  # of the cost: gained by a step that is the last
+TINY = 1e-4  # of half of chi-square
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Adjusted:
         state: cameras, clocks, lenses and motion.
         used: (n,) the observations that were not rejected.
         residuals: (n, 2) seen less expected, pixels, of all observations.
-        scale: what the residuals are over what their covariances claim; covariances are grown by it if above 1.
+        scale: what the residuals are over what their covariances claim; all covariances are scaled by it.
         information: (C d, C d) of the cameras' free parameters, poses in their own frames, rotation then translation;
             its null space is the choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
@@ -78,23 +78,23 @@ def find_robustly(problem: Problem, observations: Observations, start: State) ->
 def adjust(problem: Problem, observations: Observations, start: State) -> Adjusted:
     """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals."""
     every, state, rounds = Linearisation(problem, observations), start, 0
-    used = np.zeros(len(observations), bool)
+    used, broken = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
     for _ in range(5):
         every.weigh(state)
-        norms = np.linalg.norm(every.whitened(state), axis=1)
-        scale = _spread(norms[used] if used.any() else norms)
-        keep = norms < REJECT * max(scale, 1.0)
-        if (keep == used).all():
+        norms, strain = np.linalg.norm(every.whitened(state), axis=1), every.strain(state)
+        keep = norms < REJECT * max(_spread(norms[used] if used.any() else norms), 1.0)
+        torn = strain > BREAK
+        if (keep == used).all() and (torn == broken).all():
             break
-        used = keep
-        kept = Linearisation(problem, observations.select(used))
+        used, broken = keep, torn
+        kept = Linearisation(problem, observations.select(used), broken)
         kept.weigh(state)
         state, more = _descend(kept, state, robust=False)
         rounds += more
-    kept = Linearisation(problem, observations.select(used))
+    kept = Linearisation(problem, observations.select(used), broken)
     kept.weigh(state)
     scale = _variance_factor(kept, state)
-    information = kept.camera_information(state) / max(scale, 1.0) ** 2
+    information = kept.camera_information(state) / scale**2
     return Adjusted(problem, state, used, every.residuals(state), scale, information, rounds)
 
 
@@ -104,27 +104,29 @@ def _spread(norms: Array) -> float:
 
 
 def _variance_factor(linearisation: Linearisation, state: State) -> float:
-    """Square root of chi-square by degrees of freedom: those of the residuals, less the free ones of cameras and of the
-    wand's places; velocities are mostly fixed by the prior that brings as many equations."""
-    problem, residuals = linearisation.problem, linearisation.whitened(state)
-    wand = problem.wand
-    seen = len(np.unique(linearisation.observations.knot))
-    free = seen * (3 * len(wand.basis) - len(wand.lengths)) + len(problem.free) * len(problem.lenses) - 6
-    return float(np.sqrt((residuals**2).sum() / max(residuals.size - free, residuals.size / 10)))
+    """Square root of chi-square by degrees of freedom: of all that is measured, and that is known of the motion, less
+    the parameters. Of the latter all but a few velocities at gaps are fixed."""
+    problem = linearisation.problem
+    B, knots, linked = len(problem.wand.basis), len(problem.knot_s), linearisation.linked()
+    equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
+    free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6
+    return float(
+        np.sqrt(2 * linearisation.cost(state, np.inf, np.inf) / max(equations - free, equations / 10))
+    )
 
 
 def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[State, int]:
     """Levenberg-Marquardt; with `robust`, Cauchy's weights at the scale of the current residuals."""
-    damping = 1e-4 if robust else 1e-6
+    damping, slack = (1e-4, CAUCHY) if robust else (1e-6, np.inf)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        norms = np.linalg.norm(linearisation.whitened(state), axis=1)
+        norms, strain = np.linalg.norm(linearisation.whitened(state), axis=1), linearisation.strain(state)
         scale = CAUCHY * max(_spread(norms), 1.0) if robust else np.inf
-        before = linearisation.cost(state, scale)
-        linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2))
+        before = linearisation.cost(state, scale, slack)
+        linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2), 1 / (1 + (strain / slack) ** 2))
         while True:
             try:
                 trial = state.moved(*linearisation.solve(damping))
-                if (after := linearisation.cost(trial, scale)) <= before:
+                if (after := linearisation.cost(trial, scale, slack)) <= before:
                     break
             except RuntimeError:  # GTSAM's word for a system too near to singular
                 pass
@@ -132,6 +134,6 @@ def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[
             if damping > 1e6:
                 return state, iteration
         state, damping = trial, max(damping / 10, MIN_DAMPING)
-        if before - after < (1e-3 if robust else 1e-6) * before + NOTHING:
+        if before - after < (ROUGHLY if robust else NOTHING) * before + TINY:
             return state, iteration
     return state, MAX_ITERATIONS

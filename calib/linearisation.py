@@ -20,16 +20,16 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians, right-hand side
 
-RIGID_M = 5e-5  # by which a wand bends while it is waved
+RIGID_M = 2e-4  # by which a wand bends while it is waved
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
-STEP_M = 0.1  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
+STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
 # Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
 FIXED = 1e-6  # to which a distance that carries the scale is kept
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-# What is known of a camera before: of clocks, of crystals, and of lenses that were calibrated some time ago.
-PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 1e-4, 0.02, 20.0, 20.0, 0.05])
+# What is known of a camera before: of clocks, which may be slewed, and of lenses that were calibrated some time ago.
+PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +140,11 @@ class Problem:
         return replace(self, free=tuple(sorted(sum(parameters, ()))))
 
 
+def cauchy(squares: Array, scale: float) -> float:
+    """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
+    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
+
+
 def skew(v: Array) -> Array:
     """(..., 3, 3) the matrix of the cross product with v (..., 3)."""
     S = np.zeros((*v.shape, 3))
@@ -164,6 +169,9 @@ class Linearisation:
 
     problem: Problem
     observations: Observations
+    broken: NDArray[np.bool_] | None = (
+        None  # (L,) intervals over which the hand was not as smooth as elsewhere
+    )
     smooth: Array = field(init=False)  # (L, 2, 4) whitened constant velocity between knots; 0 across gaps
     root: Array = field(init=False)  # (n, 2, 2) whitens residuals
     views: Index = field(init=False)  # (V,) link times C plus camera, ascending
@@ -178,6 +186,17 @@ class Linearisation:
         self.smooth = np.zeros((len(dt), 2, 4))
         for k in np.flatnonzero((dt <= self.problem.gap_s) & (dt > 0)):
             self.smooth[k] = whitened_motion(dt[k], self.problem.density)
+        if self.broken is not None:
+            self.smooth[self.broken] = 0.0
+
+    def strain(self, state: State) -> Array:
+        """(L,) how far the motion is from constant velocity over each interval, in sigmas of one coordinate."""
+        smooth = self._motion_terms(state)[0]
+        return np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / (6 * len(self.problem.wand.basis)))
+
+    def linked(self) -> int:
+        """The number of intervals between knots that are no gaps."""
+        return int(self.smooth.any(axis=(1, 2)).sum())
 
     def times(self, state: State) -> Array:
         """True capture times (n,) as the clocks stand."""
@@ -218,15 +237,14 @@ class Linearisation:
         """Residuals in units of their standard deviation (n, 2); 1e4 behind the camera."""
         return np.nan_to_num(np.einsum("nij,nj->ni", self.root, self.residuals(state)), nan=1e4)
 
-    def cost(self, state: State, scale: float) -> float:
-        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`."""
-        squares = (self.whitened(state) ** 2).sum(axis=1)
-        robust = squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum()
-        smooth, lengths, speed = self._motion_terms(state)
-        rest = sum(
-            (term**2).sum() for term in (smooth, lengths, speed, *(t[2] for t in self._rig_terms(state)))
-        )
-        return 0.5 * float(robust + rest)
+    def cost(self, state: State, scale: float, slack: float) -> float:
+        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`, those of the motion's
+        smoothness at `slack`; either may be infinite."""
+        seen = (self.whitened(state) ** 2).sum(axis=1)
+        _, lengths, speed = self._motion_terms(state)
+        size = 6 * len(self.problem.wand.basis)
+        rest = sum((term**2).sum() for term in (lengths, speed, *(t[2] for t in self._rig_terms(state))))
+        return 0.5 * float(cauchy(seen, scale) + size * cauchy(self.strain(state) ** 2, slack) + rest)
 
     def _motion_terms(self, state: State) -> tuple[Array, Array, Array]:
         """Whitened: constant velocity (L, 2, B, 3), lengths (K, E), speed (K, B, 3)."""
@@ -276,8 +294,8 @@ class Linearisation:
                 J_camera[rows, :, 8:] = np.nan_to_num(_by_lens(lens, local, uv))
         return error, J_camera[:, :, free], J_point
 
-    def relinearise(self, state: State, weight: Array) -> None:
-        """Make the Hessians around `state`, each observation weighted by `weight` (n,)."""
+    def relinearise(self, state: State, weight: Array, link_weight: Array) -> None:
+        """Make the Hessians around `state`, observations weighted by `weight` (n,), smoothness by `link_weight` (L,)."""
         link, h, _, _ = self._place(state)
         error, J_camera, J_point = self._jacobians(state)
         root = np.sqrt(weight)[:, None, None] * self.root
@@ -294,19 +312,20 @@ class Linearisation:
         A[group, slot] = rows
         A = A.reshape(len(A), -1, rows.shape[2])
         self.blocks = np.swapaxes(A, 1, 2) @ A
-        self._hold_motion(state)
+        self._hold_motion(state, link_weight)
         self.rig = self._rig_terms(state)
 
-    def _hold_motion(self, state: State) -> None:
+    def _hold_motion(self, state: State, weight: Array) -> None:
         """Hessians of what is known of the motion: knot k stands in link k, the last in the last link."""
         wand, motion = self.problem.wand, state.motion
         smooth, lengths, speed = self._motion_terms(state)
         B, K = len(wand.basis), len(motion)
         local = 12 * B
         self.chain = np.zeros((K - 1, local + 1, local + 1))
-        H = np.einsum("lri,lrj->lij", self.smooth, self.smooth)
+        weighted = weight[:, None, None] * self.smooth
+        H = np.einsum("lri,lrj->lij", weighted, self.smooth)
         self.chain[:, :local, :local] = np.kron(H, np.eye(3 * B)[None])
-        self.chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", self.smooth, smooth).reshape(K - 1, local)
+        self.chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
         J = np.zeros((K, len(wand.pairs) + 3 * B, 2, B, 3))
         for e, (i, j) in enumerate(wand.pairs):
             gap = motion[:, 0, i] - motion[:, 0, j]
@@ -371,7 +390,7 @@ class Linearisation:
 
     def camera_information(self, state: State) -> Array:
         """(C d, C d) information of the cameras' free parameters with the motion eliminated (Schur complement)."""
-        self.relinearise(state, np.ones(len(self.observations)))
+        self.relinearise(state, np.ones(len(self.observations)), np.ones(len(self.smooth)))
         count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
         rest = self._graph(0.0).eliminatePartialMultifrontal(self._ordering(0, count))[1]
         return np.asarray(rest.hessian(self._ordering(count, total))[0])

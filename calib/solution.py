@@ -9,13 +9,21 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
-from calib.linearisation import DRIFT, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.linearisation import DRIFT, LENS, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
 Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
-DRIFT_S = 20.0  # a recording must last to show clocks that drift
+NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
+LENS_SIGMA = (
+    0.002,
+    2.0,
+    2.0,
+    0.002,
+)  # of log f, cx, cy and k1: a recording that leaves more open fixes no lens
+DRIFT_S = 2.0  # a recording must last to show clocks that drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +54,32 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
     few = adjust(problem, _with_disc_centres(wave, problem, state, observations), state)
-    free = [part for part in clocks if _tells(few, part)]
+    free = [part for part in clocks if _tells(few, part, wave.period_s)]
+    few = _with_lenses(few, wave, observations)
+    free += [LENS] if LENS[0] in few.problem.free else []
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
+    drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
     problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
-    start = replace(start, clocks=np.column_stack([offset_s, few.state.clocks[:, 1] * (DRIFT in free)]))
-    problem = problem.freeing(POSE, *free)
+    start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
+    density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
+    problem = replace(problem.freeing(POSE, *free), density=density)
     observations = _with_disc_centres(wave, problem, start, observations)
     return Solution(adjust(problem, observations, start), observations)
+
+
+def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:
+    """The adjustment with lenses sought too, where the recording fixes every one of them well, and they are not those
+    that were given; else as it is."""
+    if any(lens.model != "pinhole" for lens in wave.lenses):
+        return few
+    problem = few.problem.freeing(few.problem.free, LENS)
+    freed = adjust(problem, _with_disc_centres(wave, problem, few.state, observations), few.state)
+    cov, values = freed.covariance(LENS), freed.state.lenses.ravel()
+    sigma = np.sqrt(np.einsum("cpcp->cp", cov))
+    squared = values @ np.linalg.solve(cov.reshape(len(values), -1), values)
+    if (sigma > LENS_SIGMA).any() or squared < len(values) * np.log(2 * freed.used.sum()):
+        return few
+    return freed
 
 
 def _around(wave: Wave, cameras: Array, offset_s: Array, budget: int) -> tuple[Problem, State, Observations]:
@@ -82,10 +109,14 @@ def _with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observa
     )
 
 
-def _tells(adjusted: Adjusted, part: tuple[int, ...]) -> bool:
-    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters."""
+def _tells(adjusted: Adjusted, part: tuple[int, ...], period_s: float) -> bool:
+    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, and by so
+    much that it matters."""
     values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
     values = values - values.mean()
+    reach_s = 1.0 if part == OFFSET else np.ptp(adjusted.problem.knot_s) / 2
+    if np.abs(values).max() * reach_s < NEGLIGIBLE_S + NEGLIGIBLE * period_s:
+        return False
     cov = adjusted.covariance(part)[:, 0, :, 0]
     squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
     return bool(squared > (len(values) - 1) * np.log(2 * adjusted.used.sum()))

@@ -119,10 +119,11 @@ def triangulate(
     t_s: Array,
     gap_s: float,
     rounds: int = 8,
-) -> Array:
+) -> tuple[Array, NDArray[np.intp]]:
     """Markers (K, M, 3) at times (K,): nearest to all viewing rays, rays that miss by more counting less.
 
-    NaN where fewer than two cameras saw the marker about then, or their rays are nearly parallel.
+    NaN where fewer than two cameras saw the marker about then, or their rays are nearly parallel. Also the number of
+    rays (K, M) that agree to each, as well as rays usually do.
 
     Args:
         tracks: by camera and marker, by stamps.
@@ -141,7 +142,7 @@ def triangulate(
     across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
     toward = np.einsum("cmkij,cj->cmki", across, poses[:, :3, 3])
     weight = known.astype(float)
-    points = np.full((*known.shape[1:], 3), np.nan)
+    points, miss = np.full((*known.shape[1:], 3), np.nan), np.zeros(known.shape)
     for _ in range(rounds):
         A, b = np.einsum("cmk,cmkij->mkij", weight, across), np.einsum("cmk,cmki->mki", weight, toward)
         spread = np.linalg.eigvalsh(A)
@@ -150,5 +151,8 @@ def triangulate(
         points[solvable] = np.linalg.solve(A[solvable], b[solvable][:, :, None])[:, :, 0]
         away = np.nan_to_num(points) - poses[:, None, None, :3, 3]
         miss = np.linalg.norm(np.einsum("cmkij,cmkj->cmki", across, away), axis=3)
-        weight = known / ((miss / np.maximum(np.linalg.norm(away, axis=3), 1e-9)) ** 2 + 0.003**2) * 0.003**2
-    return np.swapaxes(points, 0, 1)
+        miss /= np.maximum(np.linalg.norm(away, axis=3), 1e-9)
+        weight = known / (miss**2 + 0.003**2) * 0.003**2
+    usual = float(np.median(miss[known])) if known.any() else 0.0
+    agreeing = (known & (miss <= 4 * usual)).sum(axis=0)
+    return np.swapaxes(points, 0, 1), agreeing.T

@@ -21,6 +21,7 @@ Index = NDArray[np.intp]
 
 MIN_SIGMA_PX = 0.02  # no lens model is better than this, whatever a detector claims
 LENGTH_SLACK = 0.25  # of a wand length at the start: beyond, a detection is wrong
+SPIKE = 5.0  # of the usual distance from between the neighbours
 MIN_KNOTS = 2
 
 
@@ -56,7 +57,9 @@ class Wave:
         knot = np.unique(instant[rows], return_inverse=True)[1]
         knot_s = middles(true_s[rows], knot)
         affine = AffineWand.of(self.wand)
-        basis = find_basis(triangulate(self.tracks, cameras, offset_s, knot_s, self.gap_s), affine)
+        markers, agreeing = triangulate(self.tracks, cameras, offset_s, knot_s, self.gap_s)
+        sure = (np.isnan(markers[:, :, 0]) | (agreeing >= 3)).all(axis=1)
+        basis = without_spikes(knot_s, find_basis(markers, affine), sure, self.gap_s)
         basis = bridge(knot_s, basis, self.gap_s)
         good = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
         if good.sum() < MIN_KNOTS:
@@ -106,6 +109,22 @@ def find_basis(markers: Array, affine: AffineWand) -> Array:
     ends = basis[:, affine.pairs]
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
     basis[(np.abs(lengths - affine.lengths) > LENGTH_SLACK * affine.lengths).any(axis=1)] = np.nan
+    return basis
+
+
+def without_spikes(knot_s: Array, basis: Array, sure: NDArray[np.bool_], gap_s: float) -> Array:
+    """The basis without knots that are much farther from between their neighbours than is usual, and than these are,
+    unless they are `sure` (K,)."""
+    if len(knot_s) < 3:
+        return basis
+    share = ((knot_s[1:-1] - knot_s[:-2]) / (knot_s[2:] - knot_s[:-2]))[:, None, None]
+    off = np.linalg.norm(basis[1:-1] - (1 - share) * basis[:-2] - share * basis[2:], axis=2).max(axis=1)
+    off = np.where(np.diff(knot_s)[1:] + np.diff(knot_s)[:-1] <= 2 * gap_s, np.nan_to_num(off), 0.0)
+    usual = np.median(off[off > 0]) if (off > 0).any() else np.inf
+    beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
+    spikes = 1 + np.flatnonzero((off > SPIKE * usual) & (off >= beside))
+    basis = basis.copy()
+    basis[spikes[~sure[spikes]]] = np.nan
     return basis
 
 
