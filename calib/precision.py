@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.camera import Camera
-from calib.triangulation import Sees, in_image, point_covariances
+from calib.triangulation import Joint, Sees, in_image, point_covariances
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def map_precision(
     high: ArrayLike,
     z: float,
     sigma_px: float = SIGMA_PX,
-    joint: ArrayLike | None = None,
+    joint: Joint | None = None,
     sees: Sees = in_image,
 ) -> PrecisionMap:
     """The map of a rectangle (2,) to (2,) of the floor, at a height.
@@ -99,7 +99,7 @@ def map_precision(
         low, high: corners x, y, metres.
         z: the height at which robots carry their roundels, metres.
         sigma_px: standard deviation of a roundel's centre, pixels.
-        joint: (6C, 6C) covariance of all poses together; without it they count as independent.
+        joint: covariance of all cameras together; without it their poses count as independent.
         sees: which points a camera sees.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)

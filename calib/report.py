@@ -100,14 +100,14 @@ def print_report(result: "Calibration", trust: "Trust", console: Console) -> Non
     """A table of the cameras, then what else a person has to know; the grade comes last."""
     report, clocks = result.report, bool((result.time_sigma_ms > 0).any())
     error = "error mm" if report.metric else "error %"
-    heads = ["camera", "grade", "frames", "used", "outliers", "residual", error, "waved"]
+    heads = ["camera", "grade", "frames", "outliers", "residual px", error, "waved"]
     table = Table(*heads, *["clock ms"] * clocks)
     judged = {camera.name: camera for camera in trust.cameras}
     for k, row in enumerate(report.cameras):
         camera = judged[row.name]
-        counts = (f"{row.frames_used}/{row.frames}", str(row.observations), str(row.outliers))
+        counts = (f"{row.frames_used}/{row.frames}", str(row.outliers))
         error_mm = row.sigma_mm if report.metric else row.sigma_mm / 10
-        figures = (f"{row.residual_px:.3f} px", f"{error_mm:.2f}", f"{1 - camera.figures['unused']:.0%}")
+        figures = (f"{row.residual_px:.3f}", f"{error_mm:.2f}", f"{1 - camera.figures['unused']:.0%}")
         clock = f"{result.time_offset_ms[k]:+.2f} ± {result.time_sigma_ms[k]:.2f}"
         table.add_row(row.name, camera.grade, *counts, *figures, *[clock] * clocks)
     console.print(table)

@@ -2,12 +2,15 @@
 """A point seen by several placed cameras, and how well it is known: by their pixels and by their own poses."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.camera import Camera, transform
 from calib.errors import CalibrationError
+from calib.linearisation import POSE
+from camera_node.lens import Lens
 from camera_node.pose import invert
 
 Array = NDArray[np.float64]
@@ -62,6 +65,14 @@ def _linearise(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, A
     return np.vstack(rows), np.concatenate(rest)
 
 
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """Covariance (C d, C d) of d `parameters` of C cameras together, numbered as in `linearisation`."""
+
+    parameters: tuple[int, ...]
+    covariance: Array
+
+
 def in_image(camera: Camera, points: Array) -> NDArray[np.bool_]:
     """Which of the points (N, 3), world, lie in a camera's image."""
     return camera.sees(camera.project_world(points))
@@ -71,19 +82,19 @@ def point_covariances(
     cameras: Sequence[Camera],
     points: ArrayLike,
     sigma_px: float,
-    joint: ArrayLike | None = None,
+    joint: Joint | None = None,
     sees: Sees = in_image,
 ) -> Array:
     """How well points would be known that all these cameras see, by their pixels and by their own poses.
 
-    Least squares that takes the poses for exact, as tracking does: with A = sum J^T J / sigma^2, pixel noise leaves
-    A^-1, and pose errors xi move the point by A^-1 G xi, G = sum J^T (dpixel / dxi) / sigma^2.
+    Least squares that takes the cameras for exact, as tracking does: with A = sum J^T J / sigma^2, pixel noise leaves
+    A^-1, and errors xi of the cameras move the point by A^-1 G xi, G = sum J^T (dpixel / dxi) / sigma^2.
 
     Args:
         cameras: C placed cameras; a camera without covariance counts as known.
         points: (N, 3) world.
         sigma_px: standard deviation of a pixel coordinate.
-        joint: (6C, 6C) covariance of all poses together; without it they count as independent.
+        joint: covariance of all cameras together; without it their poses count as independent, and lenses as exact.
         sees: which points a camera sees.
 
     Returns:
@@ -91,20 +102,21 @@ def point_covariances(
     """
     points = np.asarray(points, float).reshape(-1, 3)
     A, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
-    G = np.zeros((len(points), 3, 6 * len(cameras)))
+    joint = joint or Joint(POSE, _independent(cameras))
+    d = len(joint.parameters)
+    G = np.zeros((len(points), 3, d * len(cameras)))
     for k, camera in enumerate(cameras):
         seen = sees(camera, points)
-        J, by_pose = _pixel_jacobians(camera, points[seen])
+        J, by_camera = _pixel_jacobians(camera, points[seen], joint.parameters)
         A[seen] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
-        G[seen, :, 6 * k : 6 * k + 6] = np.swapaxes(J, 1, 2) @ by_pose / sigma_px**2
+        G[seen, :, d * k : d * k + d] = np.swapaxes(J, 1, 2) @ by_camera / sigma_px**2
         views[seen] += 1
-    poses = _independent(cameras) if joint is None else np.asarray(joint, float)
     spread = np.linalg.eigvalsh(A)
     known = (views >= 2) & (spread[:, 0] > MIN_ANGLE**2 / 100 * spread[:, 2])
     inverse = np.linalg.inv(A[known])
     moved = inverse @ G[known]
     covariance = np.full((len(points), 3, 3), np.inf)
-    covariance[known] = inverse + moved @ poses @ np.swapaxes(moved, 1, 2)
+    covariance[known] = inverse + moved @ joint.covariance @ np.swapaxes(moved, 1, 2)
     return covariance
 
 
@@ -116,21 +128,25 @@ def _independent(cameras: Sequence[Camera]) -> Array:
     return joint
 
 
-def _pixel_jacobians(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """How the pixels of points (N, 3) change with the point in the world (N, 2, 3), and with the camera's pose
-    (N, 2, 6)."""
+def _pixel_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...]) -> tuple[Array, Array]:
+    """How the pixels of points (N, 3) change with the point in the world (N, 2, 3), and with the camera (N, 2, d)."""
     T = camera.matrix()
     local = transform(invert(T), points)
     J = camera.project_with_jacobian(local)[1]
-    return J @ T[:3, :3].T, pose_jacobians(J, local)
+    return J @ T[:3, :3].T, camera_jacobians(camera, local, parameters)
 
 
-def pose_jacobians(J: Array, points: Array) -> Array:
-    """(N, 2, 6) how pixels change with a turn w and a shift t of the camera in its own frame: points there move by
-    p x w - t.
+def camera_jacobians(camera: Lens, points: Array, parameters: tuple[int, ...] = POSE) -> Array:
+    """(N, 2, d) how the pixels of points (N, 3), camera frame, change with the camera's `parameters`.
 
-    Args:
-        J: (N, 2, 3) derivative of the pixels by the points.
-        points: (N, 3) camera frame.
+    They are numbered as in `linearisation`: a turn w and a shift t of the camera in its own frame, which move points
+    there by p x w - t; time offset and drift, which leave points at rest where they are; the log of the focal length,
+    cx, cy, k1.
     """
-    return np.concatenate([np.cross(J, points[:, None, :]), -J], axis=2)
+    if not camera.distortion:
+        camera = camera.with_parameters([*camera.parameters, 0.0, 0.0, 0.0, 0.0])
+    _, J, by_lens = camera.project_with_jacobians(points)
+    focal = by_lens[:, :, :1] * camera.fx + by_lens[:, :, 1:2] * camera.fy
+    still = np.zeros((len(points), 2, 2))
+    every = [np.cross(J, points[:, None, :]), -J, still, focal, by_lens[:, :, 2:5]]
+    return np.concatenate(every, axis=2)[:, :, list(parameters)]

@@ -15,7 +15,7 @@ from calib.camera import Camera, transform
 from calib.coverage import Coverage, cell_centres, enumerate_words
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.report import CameraReport
-from calib.triangulation import pose_jacobians
+from calib.triangulation import Joint, camera_jacobians
 from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.pose import invert
@@ -191,7 +191,7 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
     if result.report.metric:
         low, high = np.quantile(wave[:, :2], [0.02, 0.98], axis=0)
         placed = [result.rig.cameras[name] for name in result.names]
-        expected = map_precision(placed, low, high, height_m, sigma_px, result.covariance)
+        expected = map_precision(placed, low, high, height_m, sigma_px, joint_of(result))
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
     unplaced = sorted(name for name, why in result.report.unplaced.items() if why != NOT_RECORDED)
     return Trust(cameras, unplaced, off, expected)
@@ -215,7 +215,7 @@ def _assess_camera(
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": pose_px(camera, uv, float(np.median(distances))),
+        "pose_px": pose_px(result, k, uv, float(np.median(distances))),
         "unused": 1 - coverage.share(useful),
     }
     return CameraTrust(row.name, coverage, useful, figures)
@@ -232,13 +232,19 @@ def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> NDAr
     return shared.reshape(CELLS)
 
 
-def pose_px(camera: Camera, uv: Array, distance: float) -> float:
-    """RMS, per coordinate, by which the camera's own covariance moves points at a distance in its image; pixels."""
-    if camera.covariance is None or not len(uv):
+def joint_of(result: Calibration) -> Joint:
+    """The covariance of everything that the adjustment sought of the cameras: poses, clocks, lenses."""
+    covariance = result.adjusted.joint_covariance()
+    size = covariance.shape[0] * covariance.shape[1]
+    return Joint(result.adjusted.problem.free, covariance.reshape(size, size))
+
+
+def pose_px(result: Calibration, k: int, uv: Array, distance: float) -> float:
+    """RMS, per coordinate, by which the covariance of camera k moves points at a distance in its image; pixels."""
+    if not len(uv):
         return float("nan")
+    camera, free = result.rig.cameras[result.names[k]], result.adjusted.problem.free
     rays = camera.rays(uv)
-    points = rays[np.isfinite(rays).all(axis=1)] * distance
-    J = camera.project_with_jacobian(points)[1]
-    by_pose = pose_jacobians(J, points)
-    moved = by_pose @ np.array(camera.covariance) @ np.swapaxes(by_pose, 1, 2)
+    J = camera_jacobians(camera, rays[np.isfinite(rays).all(axis=1)] * distance, free)
+    moved = J @ result.adjusted.joint_covariance()[k, :, k] @ np.swapaxes(J, 1, 2)
     return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))

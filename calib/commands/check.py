@@ -68,7 +68,7 @@ class Check:
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
-        halves = _compare_halves(rig, wand, messages, console)
+        halves = _compare_halves(result.rig, wand, messages, console)
         stands = _compare_with_rig(rig, result, console)
         if self.map is not None and trust.expected is not None:
             save_map(self.map, trust.expected.draw(result.rig.placed()))
@@ -79,6 +79,8 @@ class Check:
 def _compare_halves(
     rig: Rig, wand: Body, messages: Sequence[Detections], console: Console
 ) -> Agreement | None:
+    """Both halves start from the lenses that the whole recording gave: where these were refined, a half that refines
+    them less would turn its cameras instead."""
     from calib.wand import calibrate
 
     try:

@@ -9,8 +9,9 @@ from scipy.stats import chi2
 
 from calib.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.errors import CalibrationError
+from calib.linearisation import PER_CAMERA, POSE, State
 from calib.precision import map_precision
-from calib.triangulation import point_covariances, triangulate_point
+from calib.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
 from calib.trust import GRADES, LIMITS, CameraTrust, Trust, assess, grade
 from calib.wand import Calibration, calibrate
 from tests.calib.synthetic import record, ring
@@ -36,7 +37,9 @@ def test_expected_errors_are_honest():
         off = (np.linalg.cholesky(C) @ rng.standard_normal(24)).reshape(-1, 6)
         uv = [_see(camera.matrix(), camera, xi, point) for camera, xi in zip(cameras, off, strict=True)]
         error = triangulate_point(cameras, np.array(uv) + 0.1 * rng.standard_normal((4, 2))) - point
-        total += float(error @ np.linalg.solve(point_covariances(cameras, point, 0.1, C)[0], error))
+        total += float(
+            error @ np.linalg.solve(point_covariances(cameras, point, 0.1, Joint(POSE, C))[0], error)
+        )
     low, high = chi2.ppf([0.001, 0.999], 3 * runs)
     assert low < total < high
 
@@ -47,6 +50,24 @@ def _see(T, camera, xi, point):
     home = disturb(T[None], np.zeros(6), np.random.default_rng(0))[0]
     moved = T @ np.linalg.inv(home) @ world
     return camera.project((point - moved[:3, 3]) @ moved[:3, :3])[0]
+
+
+def test_the_camera_s_jacobians_are_those_of_the_adjustment():
+    """What a step of the adjustment's state does to a pixel, by central differences: in the same order and sense."""
+    camera = next(iter(ring(2).truth.cameras.values()))
+    rng, h = np.random.default_rng(1), 1e-6
+    points = np.column_stack([rng.uniform(-1, 1, (5, 2)), rng.uniform(2, 4, 5)])
+    everything = tuple(range(PER_CAMERA))
+    J = camera_jacobians(camera, points, everything)
+    state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
+
+    def see(step):
+        moved = state.moved(step[None], np.zeros(12))
+        T = moved.cameras[0]
+        return moved.lens(0, camera).project((points - T[:3, 3]) @ T[:3, :3])
+
+    for k, step in enumerate(h * np.eye(PER_CAMERA)):
+        assert J[:, :, k] == pytest.approx((see(step) - see(-step)) / (2 * h), abs=1e-3)
 
 
 def test_parallel_rays_fix_no_point():
