@@ -295,7 +295,7 @@ class Linearisation:
         return error, J_camera[:, :, free], J_point
 
     def relinearise(self, state: State, weight: Array, link_weight: Array) -> None:
-        """Make the Hessians around `state`, observations weighted by `weight` (n,), smoothness by `link_weight` (L,)."""
+        """Make the Hessians around `state`, observations weighted by `weight` (n,), smoothness by `link_weight`."""
         link, h, _, _ = self._place(state)
         error, J_camera, J_point = self._jacobians(state)
         root = np.sqrt(weight)[:, None, None] * self.root

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,19 @@ from camera_node.messages import Detections
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+
+class Ellipses(Protocol):
+    """Columns of detections with their ellipses, as `Sightings` has them."""
+
+    @property
+    def camera(self) -> Index: ...
+    @property
+    def uv(self) -> Array: ...
+    @property
+    def axes_px(self) -> Array: ...
+    @property
+    def angle_rad(self) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +124,7 @@ def _column(messages: Sequence[Detections], name: str, dtype: str, width: int) -
     return np.frombuffer(data, dtype).reshape(-1, width).astype(float)
 
 
-def ranges(lenses: Sequence[Lens], seen: Sightings, diameter_m: float) -> Array:
+def ranges(lenses: Sequence[Lens], seen: Ellipses, diameter_m: float) -> Array:
     """Distances (n,) of discs, metres, from the angle under which their major axis appears.
 
     A disc of diameter d at distance r, seen at any tilt, appears under the angle 2 atan(d / 2r) along its major axis.
@@ -118,7 +132,7 @@ def ranges(lenses: Sequence[Lens], seen: Sightings, diameter_m: float) -> Array:
     """
     along = np.column_stack([np.cos(seen.angle_rad), np.sin(seen.angle_rad)])
     half = seen.axes_px[:, :1] / 2 * along
-    distances = np.full(len(seen), np.nan)
+    distances = np.full(len(seen.uv), np.nan)
     for k, lens in enumerate(lenses):
         rows = np.flatnonzero((seen.camera == k) & np.isfinite(half).all(axis=1))
         if len(rows):

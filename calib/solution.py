@@ -10,6 +10,7 @@ from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
 from calib.linearisation import DRIFT, LENS, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.plausibility import check_agreement, check_lenses, check_sizes
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
@@ -17,12 +18,8 @@ Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
 NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
-LENS_SIGMA = (
-    0.002,
-    2.0,
-    2.0,
-    0.002,
-)  # of log f, cx, cy and k1: a recording that leaves more open fixes no lens
+# Of log f, cx, cy and k1: a recording that leaves more open fixes no lens.
+LENS_SIGMA = (0.005, 4.0, 4.0, 0.01)
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
 
 
@@ -44,7 +41,8 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
         metric: whether the start has the world's scale.
 
     Raises:
-        CalibrationError: the wand's lengths fit nothing that was seen.
+        CalibrationError: the wand's lengths fit nothing that was seen, or not its roundels' sizes; or a camera's lens
+            is not the one that was given.
     """
     if not metric:
         cameras = cameras.copy()
@@ -64,12 +62,20 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     problem = replace(problem.freeing(POSE, *free), density=density)
     observations = _with_disc_centres(wave, problem, start, observations)
-    return Solution(adjust(problem, observations, start), observations)
+    adjusted = adjust(problem, observations, start)
+    check_agreement(wave.names, adjusted, observations)
+    if metric:
+        check_sizes(wave.wand, adjusted, observations)
+    return Solution(adjusted, observations)
 
 
 def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:
     """The adjustment with lenses sought too, where the recording fixes every one of them well, and they are not those
-    that were given; else as it is."""
+    that were given; else as it is.
+
+    Raises:
+        CalibrationError: a lens is another camera's, or far from what was given.
+    """
     if any(lens.model != "pinhole" for lens in wave.lenses):
         return few
     problem = few.problem.freeing(few.problem.free, LENS)
@@ -79,6 +85,7 @@ def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjus
     squared = values @ np.linalg.solve(cov.reshape(len(values), -1), values)
     if (sigma > LENS_SIGMA).any() or squared < len(values) * np.log(2 * freed.used.sum()):
         return few
+    check_lenses(wave.names, problem.lenses, freed)
     return freed
 
 

@@ -125,6 +125,7 @@ def _wave(recording: _Recording, pairs: Pairs, wand: Body, placed: list[int]) ->
     t_s = recording.frames.t_s
     return Wave(
         seen,
+        [recording.names[k] for k in placed],
         [recording.lenses[k] for k in placed],
         [pairs.tracks[k] for k in placed],
         wand,

@@ -30,6 +30,7 @@ class Wave:
     """Sightings of the C cameras that stand somewhere, numbered 0 to C - 1, and what is known of the recording."""
 
     seen: Sightings
+    names: Sequence[str]
     lenses: Sequence[Lens]
     tracks: Sequence[Sequence[Track]]
     wand: Body
@@ -58,7 +59,7 @@ class Wave:
         knot_s = middles(true_s[rows], knot)
         affine = AffineWand.of(self.wand)
         markers, agreeing = triangulate(self.tracks, cameras, offset_s, knot_s, self.gap_s)
-        sure = (np.isnan(markers[:, :, 0]) | (agreeing >= 3)).all(axis=1)
+        sure = np.asarray((np.isnan(markers[:, :, 0]) | (agreeing >= 3)).all(axis=1))
         basis = without_spikes(knot_s, find_basis(markers, affine), sure, self.gap_s)
         basis = bridge(knot_s, basis, self.gap_s)
         good = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
