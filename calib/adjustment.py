@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bundle adjustment of cameras and a waved wand, every frame at its own capture time.
+"""Bundle adjustment of cameras, their clocks and a waved wand, every frame at its own capture time.
 
-Unknown are the cameras' poses and the wand's motion (`trajectory`); measured are roundel centres, the wand's lengths
-and, weakly, that a hand moves smoothly. Each iteration linearises all observations in numpy, once; GTSAM eliminates the
-sparse system (`linearisation`). Robust by iteratively reweighted least squares: Cauchy's weights at a scale that the
-residuals themselves give, then plain least squares without what the statistics reject.
+Unknown are the cameras' poses and time offsets and the wand's motion (`trajectory`); measured are roundel centres, the
+wand's lengths and, weakly, that a hand moves smoothly. Each iteration linearises all observations in numpy, once; GTSAM
+eliminates the sparse system (`linearisation`). Robust by iteratively reweighted least squares: Cauchy's weights at a
+scale that the residuals themselves give, then plain least squares without what the statistics reject.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import CalibrationError
-from calib.linearisation import Linearisation, Observations, Problem, State, skew
+from calib.linearisation import Linearisation, Observations, Problem, State, unobserved
 
 Array = NDArray[np.float64]
 
 CAUCHY = 2.3849  # 95 % efficient on normal residuals
 REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
+BREAK = 4.0  # sigmas, over all coordinates: the hand was knocked, or frames are missing from the count
 MAX_ITERATIONS = 60
-MIN_DAMPING = 1e-3
+MIN_DAMPING = 1e-9
+ROUGHLY, NOTHING = 5e-3, 1e-4  # of the cost: gained by a step that is the last
+TINY = 1e-4  # of half of chi-square
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +30,17 @@ class Adjusted:
     """The best state.
 
     Attributes:
-        state: cameras and motion.
+        problem: what was adjusted, with the parameters that were sought.
+        state: cameras, clocks, lenses and motion.
         used: (n,) the observations that were not rejected.
         residuals: (n, 2) seen less expected, pixels, of all observations.
-        scale: what the residuals are over what their covariances claim; covariances below are grown by it if above 1.
-        information: (6C, 6C) of the cameras alone, their own frames, rotation then translation; its null space is the
-            choice of the world.
+        scale: what the residuals are over what their covariances claim; all covariances are scaled by it.
+        information: (C d, C d) of the cameras' free parameters, poses in their own frames, rotation then translation;
+            its null space is the choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
     """
 
+    problem: Problem
     state: State
     used: NDArray[np.bool_]
     residuals: Array
@@ -44,47 +48,54 @@ class Adjusted:
     information: Array
     iterations: int
 
-    def covariance(self) -> Array:
-        """(C, 6, 6) covariance of every camera, the world being where the cameras themselves are on average
-        (inner constraints; Triggs et al., Bundle Adjustment, section 9.3)."""
-        gauge = world_motions(self.state.cameras)
+    def joint_covariance(self) -> Array:
+        """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
+        and the time what their clocks say on average (inner constraints; Triggs et al., Bundle Adjustment, section
+        9.3)."""
+        gauge = unobserved(self.state, self.problem.free)
         rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-        full = rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T
-        n = len(self.state.cameras)
-        return np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)], float)
+        full = np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
+        count, d = len(self.state.cameras), len(self.problem.free)
+        return full.reshape(count, d, count, d)
+
+    def covariance(self, parameters: tuple[int, ...]) -> Array:
+        """(C, p, C, p) that of some of a camera's parameters; zero where they were not sought."""
+        full = np.zeros((len(self.state.cameras), len(parameters)) * 2)
+        held = [k for k, p in enumerate(parameters) if p in self.problem.free]
+        at = [self.problem.free.index(parameters[k]) for k in held]
+        joint = self.joint_covariance()
+        full[np.ix_(range(len(full)), held, range(len(full)), held)] = joint[:, at][:, :, :, at]
+        return full
 
 
-def world_motions(cameras: Array) -> Array:
-    """(6C, 6) how the cameras move in their own frames when the world turns and shifts: nothing observes it."""
-    rows = []
-    for T in cameras:
-        R, p = T[:3, :3], T[:3, 3]
-        rows.append(np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]]))
-    return np.vstack(rows)
+def find_robustly(problem: Problem, observations: Observations, start: State) -> State:
+    """The state that most observations agree to, from a rough start."""
+    every = Linearisation(problem, observations)
+    every.weigh(start)
+    return _descend(every, start, robust=True)[0]
 
 
 def adjust(problem: Problem, observations: Observations, start: State) -> Adjusted:
-    """Bundle adjustment from `start`; gross outliers are rejected by the statistics of the residuals.
-
-    Raises:
-        CalibrationError: it does not converge.
-    """
-    every = Linearisation(problem, observations)
-    state, rounds = _descend(every, start, robust=True)
-    used = np.ones(len(observations), bool)
-    for _ in range(4):
-        norms = np.linalg.norm(every.whitened(state), axis=1)
-        scale = _spread(norms[used])
-        keep = norms < REJECT * max(scale, 1.0)
-        state, more = _descend(Linearisation(problem, observations.select(keep)), state, robust=False)
-        rounds += more
-        if (keep == used).all():
+    """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals."""
+    every, state, rounds = Linearisation(problem, observations), start, 0
+    used, broken = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
+    for _ in range(5):
+        every.weigh(state)
+        norms, strain = np.linalg.norm(every.whitened(state), axis=1), every.strain(state)
+        keep = norms < REJECT * max(_spread(norms[used] if used.any() else norms), 1.0)
+        torn = strain > BREAK
+        if (keep == used).all() and (torn == broken).all():
             break
-        used = keep
-    kept = Linearisation(problem, observations.select(used))
+        used, broken = keep, torn
+        kept = Linearisation(problem, observations.select(used), broken)
+        kept.weigh(state)
+        state, more = _descend(kept, state, robust=False)
+        rounds += more
+    kept = Linearisation(problem, observations.select(used), broken)
+    kept.weigh(state)
     scale = _variance_factor(kept, state)
-    information = kept.camera_information(state) / max(scale, 1.0) ** 2
-    return Adjusted(state, used, every.residuals(state), scale, information, rounds)
+    information = kept.camera_information(state) / scale**2
+    return Adjusted(problem, state, used, every.residuals(state), scale, information, rounds)
 
 
 def _spread(norms: Array) -> float:
@@ -93,37 +104,36 @@ def _spread(norms: Array) -> float:
 
 
 def _variance_factor(linearisation: Linearisation, state: State) -> float:
-    """Square root of chi-square by degrees of freedom; velocities are not counted as free, which errs upwards."""
-    problem, residuals = linearisation.problem, linearisation.whitened(state)
-    wand = problem.wand
-    free = len(problem.knot_s) * (3 * len(wand.basis) - len(wand.lengths)) + 6 * len(problem.lenses) - 6
-    return float(np.sqrt((residuals**2).sum() / max(residuals.size - free, residuals.size / 10)))
+    """Square root of chi-square by degrees of freedom: of all that is measured, and that is known of the motion, less
+    the parameters. Of the latter all but a few velocities at gaps are fixed."""
+    problem = linearisation.problem
+    B, knots, linked = len(problem.wand.basis), len(problem.knot_s), linearisation.linked()
+    equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
+    free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6
+    return float(
+        np.sqrt(2 * linearisation.cost(state, np.inf, np.inf) / max(equations - free, equations / 10))
+    )
 
 
 def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[State, int]:
     """Levenberg-Marquardt; with `robust`, Cauchy's weights at the scale of the current residuals."""
-    damping = 10.0
+    damping, slack = (1e-4, CAUCHY) if robust else (1e-6, np.inf)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        residuals = linearisation.whitened(state)
-        norms = np.linalg.norm(residuals, axis=1)
+        norms, strain = np.linalg.norm(linearisation.whitened(state), axis=1), linearisation.strain(state)
         scale = CAUCHY * max(_spread(norms), 1.0) if robust else np.inf
-        before = linearisation.cost(state, scale)
-        linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2))
+        before = linearisation.cost(state, scale, slack)
+        linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2), 1 / (1 + (strain / slack) ** 2))
         while True:
             try:
                 trial = state.moved(*linearisation.solve(damping))
-                if (after := linearisation.cost(trial, scale)) <= before:
+                if (after := linearisation.cost(trial, scale, slack)) <= before:
                     break
             except RuntimeError:  # GTSAM's word for a system too near to singular
                 pass
             damping *= 10
-            if damping > 1e12:
+            if damping > 1e6:
                 return state, iteration
         state, damping = trial, max(damping / 10, MIN_DAMPING)
-        if before - after < 1e-7 * before + 1e-12:
+        if before - after < (ROUGHLY if robust else NOTHING) * before + TINY:
             return state, iteration
-    if robust:
-        return state, MAX_ITERATIONS
-    raise CalibrationError(
-        f"the adjustment did not converge in {MAX_ITERATIONS} iterations; are intrinsics and wand right?"
-    )
+    return state, MAX_ITERATIONS

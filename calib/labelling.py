@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which roundel of a frame is which marker of the wand.
+"""Which detection of a frame is which marker of the wand.
 
-The markers look alike: their spacing tells them apart. Three detections fix where the wand would be (`hypotheses`);
-the size of every roundel and the other markers confirm it or don't. What two hypotheses explain stays unlabelled.
+The markers look alike: their spacing tells them apart. Three detections fix where the wand would be; the size of every
+roundel and the other markers confirm it or don't. What two hypotheses explain stays unlabelled. Frames of which a
+marker is missing take their labels from the frames before and after. All frames of a camera are looked at at once.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -15,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
-from calib.views import View, place_on_line, ranges
+from calib.sightings import Frames, Sightings, ranges
+from calib.tracks import follow
 from camera_node.body import Body
 from camera_node.lens import Lens
-from camera_node.messages import Detections
-from camera_node.roundels import Roundels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -32,6 +32,7 @@ SIGMA_LOG_SLANT = 0.2  # where sizes are unknown: a wand is rarely as near as it
 MARGIN = 12.0  # by which the second best must be worse; of a squared Mahalanobis distance
 SYMMETRY = 0.15  # spacings that differ by less are not told apart
 MAX_ROUNDELS = 40  # in one frame: more is clutter, and triples grow with the cube
+BATCH = 200_000  # triples that are looked at at once
 
 
 def is_collinear(points: Array) -> bool:
@@ -60,191 +61,215 @@ def require_distinct(wand: Body) -> None:
             )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Detections `rows` are the markers `labels`; `points` (M, 3) is the wand in the camera's frame."""
-
-    labels: tuple[int, ...]
-    rows: tuple[int, ...]
-    points: Array
-    cost: float
-
-
-class Labeller:
-    """Labels frames of one camera."""
-
-    def __init__(self, wand: Body, lens: Lens) -> None:
-        self.wand, self.lens = wand, lens
-        self.focal = (lens.fx + lens.fy) / 2
-        self.collinear = is_collinear(wand.points)
-        centred = wand.points - wand.points[0]
-        self.axis = centred[np.argmax(np.linalg.norm(centred, axis=1))]
-        self.axis = self.axis / max(float(np.linalg.norm(self.axis)), 1e-12)
-        self.along = centred @ self.axis
-
-    def label(self, message: Detections) -> View | str:
-        """The wand in a frame, or the reason why it can't be told."""
-        roundels = message.unpack()
-        xy = self.lens.normalise(roundels.uv)
-        inside = np.flatnonzero(np.isfinite(xy).all(axis=1))
-        roundels, xy = roundels.select(inside), xy[inside]
-        if len(roundels) > MAX_ROUNDELS:
-            return f"more than {MAX_ROUNDELS} roundels in the frame"
-        if (roundels.id >= 0).any():
-            found = self._by_number(roundels)
-        elif len(self.wand.markers) == 1:
-            found = (np.array([0]), np.array([0])) if len(roundels) == 1 else self._say(len(roundels), 1)
-        else:
-            found = self._by_spacing(roundels, xy)
-        if isinstance(found, str):
-            return found
-        labels, rows = found
-        roundels, xy = roundels.select(rows), xy[rows]
-        points = self._place(labels, roundels)
-        return View(message.camera, message.t_ns, labels, roundels, xy, points)
-
-    def _say(self, seen: int, needed: int) -> str:
-        return "too few roundels in the frame" if seen < needed else "ambiguous"
-
-    def _by_number(self, roundels: Roundels) -> tuple[Index, Index] | str:
-        numbers, counts = np.unique(roundels.id, return_counts=True)
-        labels = numbers[(counts == 1) & (numbers >= 0) & (numbers < len(self.wand.markers))]
-        if not len(labels):
-            return "no marker of the wand in the frame"
-        return labels.astype(np.intp), np.array([np.flatnonzero(roundels.id == k)[0] for k in labels])
-
-    def _by_spacing(self, roundels: Roundels, xy: Array) -> tuple[Index, Index] | str:
-        if len(roundels) < 3:
-            return "too few roundels in the frame"
-        distances = ranges(self.lens, roundels, self.wand.diameter_m)
-        rays = np.column_stack([xy, np.ones(len(xy))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        fits = [
-            fit
-            for labels in combinations(np.argsort(self.along, kind="stable").tolist(), 3)
-            for fit in self._hypotheses(labels, rays, xy, distances)
-        ]
-        return self._choose(fits)
-
-    def _choose(self, fits: list[_Fit]) -> tuple[Index, Index] | str:
-        if not fits:
-            return "no wand among the roundels"
-        most = max(len(fit.rows) for fit in fits)
-        ranked = sorted((fit for fit in fits if len(fit.rows) == most), key=lambda fit: fit.cost)
-        best = dict(zip(ranked[0].labels, ranked[0].rows, strict=True))
-        for fit in ranked[1:]:
-            if dict(zip(fit.labels, fit.rows, strict=True)) != best and fit.cost < ranked[0].cost + MARGIN:
-                return "ambiguous"
-        labels = np.array(sorted(best), np.intp)
-        return labels, np.array([best[k] for k in labels], np.intp)
-
-    def _hypotheses(self, labels: tuple[int, ...], rays: Array, xy: Array, distances: Array) -> list[_Fit]:
-        """Fits in which some three detections are the markers `labels`."""
-        triples = np.array(list(permutations(range(len(rays)), 3)), np.intp)
-        if self.collinear:
-            wands, triples = self._on_line(labels, triples, rays, xy)
-        else:
-            wands, triples = self._by_p3p(labels, triples, xy, distances)
-        return [
-            fit
-            for points, rows in zip(wands, triples, strict=True)
-            if (fit := self._fit(points, dict(zip(labels, rows.tolist(), strict=True)), xy, distances))
-        ]
-
-    def _on_line(
-        self, labels: tuple[int, ...], triples: Index, rays: Array, xy: Array
-    ) -> tuple[Array, Index]:
-        a, b, c = (xy[triples[:, k]] for k in range(3))
-        chord = c - a
-        length = np.maximum(np.linalg.norm(chord, axis=1), 1e-12)
-        off = np.abs(chord[:, 0] * (b - a)[:, 1] - chord[:, 1] * (b - a)[:, 0]) / length
-        share = ((b - a) * chord).sum(axis=1) / length**2
-        triples = triples[(off * self.focal < GATE_PX) & (share > 0) & (share < 1)]
-        anchor, direction = place_on_line(rays[triples], self.along[list(labels)])
-        wands = anchor[:, None] + self.along[None, :, None] * direction[:, None]
-        good = np.isfinite(wands).all(axis=(1, 2))
-        return wands[good], triples[good]
-
-    def _by_p3p(self, labels: tuple[int, ...], triples: Index, xy: Array, distances: Array):
-        """Poses by P3P of the triples whose roundel sizes put them as far apart as the markers are."""
-        corners = self.wand.points[list(labels)]
-        rays = np.column_stack([xy, np.ones(len(xy))])
-        seen = rays / np.linalg.norm(rays, axis=1, keepdims=True) * distances[:, None]
-        apart = seen[triples] - np.roll(seen[triples], 1, axis=1)
-        known = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
-        slack = 0.2 * known + 3 * SIGMA_LOG_RANGE * distances[triples].mean(axis=1, keepdims=True)
-        triples = triples[~(np.abs(np.linalg.norm(apart, axis=2) - known) > slack).any(axis=1)]
-        wands, rows = [], []
-        for triple in triples:
-            _, turns, shifts = cv2.solveP3P(corners, xy[triple], np.eye(3), np.zeros(4), cv2.SOLVEPNP_AP3P)
-            for turn, shift in zip(turns, shifts, strict=True):
-                wands.append(self.wand.points @ cv2.Rodrigues(turn)[0].T + shift.ravel())
-                rows.append(triple)
-        points = np.array(wands).reshape(-1, len(self.wand.markers), 3)
-        triples = np.array(rows, np.intp).reshape(-1, 3)
-        # Nearly all poses put a roundel where its size can't be: they go at once, before each is looked at.
-        far = np.linalg.norm(points[:, list(labels)], axis=2)
-        good = ~(np.abs(np.log(distances[triples] / far)) > MAX_SIGMAS * SIGMA_LOG_RANGE).any(axis=1)
-        return points[good], triples[good]
-
-    def _fit(self, points: Array, rows: dict[int, int], xy: Array, distances: Array) -> _Fit | None:
-        """The hypothesis with the markers it was not made from, where it explains the frame; else None."""
-        if (points[:, 2] <= 0).any():
-            return None
-        expected = points[:, :2] / points[:, 2:]
-        for marker in set(range(len(points))) - set(rows):
-            off = np.linalg.norm(xy - expected[marker], axis=1) * self.focal
-            off[list(rows.values())] = np.inf
-            if off.min() < GATE_PX:
-                rows[marker] = int(off.argmin())
-        labels, chosen = list(rows), list(rows.values())
-        off = np.linalg.norm(xy[chosen] - expected[labels], axis=1) * self.focal
-        far = np.linalg.norm(points, axis=1)
-        sizes = np.log(distances[chosen] / far[labels])
-        if np.isfinite(sizes).all():
-            prior = (sizes / SIGMA_LOG_RANGE) ** 2
-        else:
-            prior = np.log(far.max() / far.min()) ** 2 / np.full(1, SIGMA_LOG_SLANT**2)
-        if (off > GATE_PX).any() or (prior > MAX_SIGMAS**2).any():
-            return None
-        return _Fit(tuple(labels), tuple(chosen), points, float(((off / SIGMA_PX) ** 2).sum() + prior.sum()))
-
-    def _place(self, labels: Index, roundels: Roundels) -> Array | None:
-        """Where this view alone puts the labelled markers: by the wand's lengths, or by the roundels' sizes."""
-        rays = self.lens.rays(roundels.uv)
-        if self.collinear and len(labels) >= 3:
-            order = labels[np.argsort(self.along[labels])]
-            ends = order[[0, len(order) // 2, -1]]
-            triple = rays[[int(np.flatnonzero(labels == k)[0]) for k in ends]]
-            anchor, direction = place_on_line(triple[None], self.along[ends])
-            points = anchor + self.along[labels][:, None] * direction
-        else:
-            points = rays * ranges(self.lens, roundels, self.wand.diameter_m)[:, None]
-        return points if np.isfinite(points).all() else None
-
-
-def label_views(
-    messages: Iterable[Detections], wand: Body, lenses: Mapping[str, Lens]
-) -> tuple[list[View], dict[str, Counter[str]]]:
-    """Label every frame.
+def label(
+    frames: Frames, seen: Sightings, wand: Body, lenses: Sequence[Lens]
+) -> tuple[Sightings, list[Counter[str]]]:
+    """The detections that are markers of the wand, labelled.
 
     Returns:
-        views: the frames in which markers could be told apart, in the order given.
-        left_out: the number of the other frames, by camera and reason.
+        labelled: its rows, at most one a frame and marker.
+        left_out: the number of frames without any, by camera and reason.
 
     Raises:
-        CalibrationError: the wand is symmetric and the detections carry no marker numbers.
+        CalibrationError: the wand is symmetric and the detections carry no numbers.
     """
-    messages = list(messages)
-    if not any((message.unpack().id >= 0).any() for message in messages):
+    numbered = seen.label >= 0
+    labels = np.full(len(seen), -1, np.intp)
+    counts = np.bincount(seen.frame, minlength=len(frames.t_s))
+    reason = np.where(
+        counts < min(3, len(wand.markers)), "too few roundels in the frame", "no wand among the roundels"
+    )
+    if numbered.any():
+        reason[counts > 0] = "no marker of the wand in the frame"
+        labels = _by_number(seen, len(wand.markers))
+    elif len(wand.markers) == 1:
+        reason[counts > 1] = "ambiguous"
+        labels[counts[seen.frame] == 1] = 0
+    else:
         require_distinct(wand)
-    labellers = {name: Labeller(wand, lens) for name, lens in lenses.items()}
-    views: list[View] = []
-    left_out: dict[str, Counter[str]] = {name: Counter() for name in lenses}
-    for message in messages:
-        found = labellers[message.camera].label(message)
-        if isinstance(found, str):
-            left_out[message.camera][found] += 1
-        else:
-            views.append(found)
-    return views, left_out
+        reason[counts > MAX_ROUNDELS] = f"more than {MAX_ROUNDELS} roundels in the frame"
+        _Spacing(wand, lenses, seen).label(labels, reason)
+        labels = follow(frames, seen, labels, len(wand.markers))
+    left_out = [Counter() for _ in lenses]
+    for frame in np.setdiff1d(np.arange(len(frames.t_s)), seen.frame[labels >= 0]).tolist():
+        left_out[frames.camera[frame]][str(reason[frame])] += 1
+    rows = np.flatnonzero(labels >= 0)
+    labelled = seen.select(rows)
+    labelled.label[:] = labels[rows]
+    return labelled, left_out
+
+
+def _by_number(seen: Sightings, markers: int) -> Index:
+    """The numbers that detections carry; -1 for those that no marker has, or twice in a frame."""
+    valid = (seen.label >= 0) & (seen.label < markers)
+    key = np.where(valid, seen.frame * markers + seen.label, -1)
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.where(valid & (count[inverse] == 1), seen.label, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fits:
+    """Hypotheses, one row each: the frame (by its place in the batch), the detection that each marker is or -1, what
+    speaks against it, and how many markers it explains."""
+
+    frame: Index
+    rows: Index
+    cost: Array
+    count: Index
+
+
+class _Spacing:
+    """Labels all frames that hold the same number of detections at once."""
+
+    def __init__(self, wand: Body, lenses: Sequence[Lens], seen: Sightings) -> None:
+        self.wand, self.seen = wand, seen
+        self.focal = np.array([(lens.fx + lens.fy) / 2 for lens in lenses])
+        self.distance = ranges(lenses, seen, wand.diameter_m)
+        self.rays = seen.rays()
+        self.collinear = is_collinear(wand.points)
+        centred = wand.points - wand.points[0]
+        axis = centred[np.argmax(np.linalg.norm(centred, axis=1))]
+        self.along = centred @ axis / np.linalg.norm(axis)
+
+    def label(self, labels: Index, reason: NDArray) -> None:
+        """Write the label of every row that has one, and why frames have none."""
+        for rows in self._batches():
+            fits = self._hypotheses(rows)
+            best, ambiguous = _choose(fits, len(rows))
+            frames = self.seen.frame[rows[:, 0]]
+            reason[frames[ambiguous]] = "ambiguous"
+            for at, chosen in zip(fits.frame[best], fits.rows[best], strict=True):
+                known = chosen >= 0
+                labels[rows[at, chosen[known]]] = np.flatnonzero(known)
+
+    def _batches(self) -> Iterator[Index]:
+        """(F, n) rows of frames of n detections."""
+        first = np.flatnonzero(np.diff(self.seen.frame, prepend=-1))
+        size = np.diff(first, append=len(self.seen))
+        for n in np.unique(size[(size >= 3) & (size <= MAX_ROUNDELS)]).tolist():
+            starts = first[size == n]
+            step = max(BATCH // (n * (n - 1) * (n - 2)), 1)
+            for k in range(0, len(starts), step):
+                yield starts[k : k + step, None] + np.arange(n)
+
+    def _hypotheses(self, rows: Index) -> _Fits:
+        """Hypotheses in which some three detections of a frame are some three markers."""
+        triples = np.array(list(permutations(range(rows.shape[1]), 3)), np.intp)
+        order = np.argsort(self.along, kind="stable").tolist()
+        found = [
+            self._confirm(rows, np.array(labels), *place(np.array(labels), rows, triples))
+            for labels in combinations(order, 3)
+            for place in [self._on_line if self.collinear else self._by_p3p]
+        ]
+        return _Fits(*(np.concatenate([getattr(f, name) for f in found]) for name in _Fits.__slots__))
+
+    def _on_line(self, labels: Index, rows: Index, triples: Index) -> tuple[Array, Index, Index]:
+        xy = self.seen.xy[rows]
+        a, b, c = (xy[:, triples[:, k]] for k in range(3))
+        chord = c - a
+        length = np.maximum(np.linalg.norm(chord, axis=2), 1e-12)
+        off = np.abs(chord[..., 0] * (b - a)[..., 1] - chord[..., 1] * (b - a)[..., 0]) / length
+        share = ((b - a) * chord).sum(axis=2) / length**2
+        focal = self.focal[self.seen.camera[rows[:, 0]]][:, None]
+        frame, triple = np.nonzero((off * focal < GATE_PX) & (share > 0) & (share < 1))
+        anchor, direction = place_on_line(
+            self.rays[rows[frame[:, None], triples[triple]]], self.along[labels]
+        )
+        wands = anchor[:, None] + self.along[None, :, None] * direction[:, None]
+        good = np.isfinite(wands).all(axis=(1, 2))
+        return wands[good], frame[good], triples[triple[good]]
+
+    def _by_p3p(self, labels: Index, rows: Index, triples: Index) -> tuple[Array, Index, Index]:
+        """Poses by P3P of the triples whose roundel sizes put them as far apart as the markers are."""
+        corners = self.wand.points[labels]
+        distances = self.distance[rows][:, triples]
+        seen = self.rays[rows][:, triples] * distances[..., None]
+        known = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        apart = np.linalg.norm(seen - np.roll(seen, 1, axis=2), axis=3)
+        slack = 0.2 * known + 3 * SIGMA_LOG_RANGE * distances.mean(axis=2, keepdims=True)
+        wands, where = [], []
+        for frame, triple in np.argwhere(~(np.abs(apart - known) > slack).any(axis=2)).tolist():
+            xy = self.seen.xy[rows[frame, triples[triple]]]
+            _, turns, shifts = cv2.solveP3P(corners, xy, np.eye(3), np.zeros(4), cv2.SOLVEPNP_AP3P)
+            for turn, shift in zip(turns, shifts, strict=True):
+                wands.append(self.wand.points @ cv2.Rodrigues(turn)[0].T + shift.ravel())
+                where.append((frame, triple))
+        points = np.array(wands).reshape(-1, len(self.wand.markers), 3)
+        frame, triple = np.array(where, np.intp).reshape(-1, 2).T
+        return points, frame, triples[triple]
+
+    def _confirm(self, rows: Index, labels: Index, points: Array, frame: Index, triple: Index) -> _Fits:
+        """The hypotheses that explain their frame, with the markers that they were not made from."""
+        count, every = len(points), np.arange(len(points))
+        focal = self.focal[self.seen.camera[rows[frame, 0]]]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = points[:, :, :2] / points[:, :, 2:]
+        off = np.linalg.norm(self.seen.xy[rows[frame]][:, None] - expected[:, :, None], axis=3)
+        off = np.where(np.isfinite(off), off * focal[:, None, None], np.inf)
+        chosen = np.full((count, len(self.wand.markers)), -1, np.intp)
+        chosen[:, labels] = triple
+        free = np.ones((count, rows.shape[1]), bool)
+        free[every[:, None], triple] = False
+        for marker in np.setdiff1d(np.arange(len(self.wand.markers)), labels):
+            away = np.where(free, off[:, marker], np.inf)
+            nearest = away.argmin(axis=1)
+            near = away[every, nearest] < GATE_PX
+            chosen[near, marker] = nearest[near]
+            free[every[near], nearest[near]] = False
+        known = chosen >= 0
+        miss = np.where(known, np.take_along_axis(off, np.maximum(chosen, 0)[:, :, None], axis=2)[:, :, 0], 0)
+        prior = self._prior(points, self.distance[rows[frame[:, None], np.maximum(chosen, 0)]], known)
+        good = (points[:, :, 2] > 0).all(axis=1) & (miss < GATE_PX).all(axis=1)
+        good &= (prior <= MAX_SIGMAS**2).all(axis=1)
+        cost = ((miss / SIGMA_PX) ** 2).sum(axis=1) + prior.sum(axis=1)
+        return _Fits(frame[good], chosen[good], cost[good], known[good].sum(axis=1))
+
+    def _prior(self, points: Array, distance: Array, known: NDArray[np.bool_]) -> Array:
+        """(H, M) squared sigmas by which sizes disagree; where they are not known, by which the wand is slanted."""
+        far = np.linalg.norm(points, axis=2)
+        sizes = np.where(known, (np.log(distance / far) / SIGMA_LOG_RANGE) ** 2, 0.0)
+        slant = np.zeros_like(sizes)
+        slant[:, 0] = (np.log(far.max(axis=1) / far.min(axis=1)) / SIGMA_LOG_SLANT) ** 2
+        return np.where(np.isfinite(sizes).all(axis=1, keepdims=True), sizes, slant)
+
+
+def _choose(fits: _Fits, frames: int) -> tuple[Index, Index]:
+    """The fit that explains most of each frame at the least cost; and the frames where another does as well."""
+    most = np.zeros(frames, np.intp)
+    np.maximum.at(most, fits.frame, fits.count)
+    rows = np.flatnonzero(fits.count == most[fits.frame])
+    rows = rows[np.lexsort((fits.cost[rows], fits.frame[rows]))]
+    first = np.flatnonzero(np.diff(fits.frame[rows], prepend=-1))
+    best = np.repeat(rows[first], np.diff(first, append=len(rows)))
+    rival = (fits.rows[rows] != fits.rows[best]).any(axis=1) & (fits.cost[rows] < fits.cost[best] + MARGIN)
+    ambiguous = np.unique(fits.frame[rows[rival]])
+    best = rows[first]
+    return best[~np.isin(fits.frame[best], ambiguous)], ambiguous
+
+
+def place_on_line(rays: Array, along: Array) -> tuple[Array, Array]:
+    """Where three points of a straight line stand, from one view and their places on the line.
+
+    The middle point divides the outer two in a known ratio, so s02 l1 r1 = s12 l0 r0 + s01 l2 r2 for the distances l
+    along the rays r: the null vector of three columns gives l up to scale, and the line's length fixes that.
+
+    Args:
+        rays: (H, 3, 3) viewing rays, one row a point, of H triples.
+        along: (3,) places of the points on the line, metres, ascending.
+
+    Returns:
+        anchors: (H, 3) the point at place 0, camera frame, metres.
+        directions: (H, 3) unit directions of the line. NaN in both where a distance would be negative.
+    """
+    t0, t1, t2 = along
+    columns = np.stack([(t2 - t1) * rays[:, 0], (t0 - t2) * rays[:, 1], (t1 - t0) * rays[:, 2]], axis=-1)
+    distances = np.linalg.svd(columns)[2][:, -1]
+    distances = distances * np.sign(distances.sum(axis=1, keepdims=True))
+    first, last = distances[:, :1] * rays[:, 0], distances[:, 2:] * rays[:, 2]
+    length = np.linalg.norm(last - first, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        direction = (last - first) / length
+        anchor = first / length * (t2 - t0) - t0 * direction
+    bad = ~((distances > 0).all(axis=1) & (length[:, 0] > 1e-12))
+    anchor[bad], direction[bad] = np.nan, np.nan
+    return anchor, direction

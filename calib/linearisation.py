@@ -1,45 +1,59 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The least squares problem of a bundle adjustment, linearised in numpy and handed to GTSAM as factors."""
+"""The least squares problem of a wand's bundle adjustment, linearised in numpy and eliminated by GTSAM.
 
-from dataclasses import dataclass
+Every observation depends on one camera and on the two knots around its time. All are linearised in one batch; those
+of one camera between two knots become one HessianFactor on (knot, next knot, camera). GTSAM eliminates knots first.
+"""
+
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.trajectory import MAX_GAP_S, AffineWand, interpolate, whitened_motion
+from calib.trajectory import AffineWand, hermite_rate, interpolate, locate, whitened_motion
 from camera_node.lens import Lens
 from camera_node.pose import rotation_from_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians, right-hand side
 
-LENGTH_SIGMA_M = 0.0005  # to which a wand is made
+RIGID_M = 2e-4  # by which a wand bends while it is waved
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
-ANCHOR = 1e8  # information that holds the first camera during a step: about what its observations give
+STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
+# Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
+ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
+FIXED = 1e-6  # to which a distance that carries the scale is kept
+PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
+POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+# What is known of a camera before: of clocks, which may be slewed, and of lenses that were calibrated some time ago.
+PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Marker centres, one row each, sorted by view.
+    """Marker centres, one row each.
 
     Attributes:
         camera: (n,) index of the camera.
         knot: (n,) the instant they belong to.
-        view: (n,) the frame they are from, ascending.
         label: (n,) marker of the wand.
-        t_s: (n,) capture time, seconds.
+        t_s: (n,) stamp, seconds.
         uv: (n, 2) raw pixels, where the disc's own centre is seen.
-        root: (n, 2, 2) square root of the inverse covariance of `uv`.
+        cov: (n, 2, 2) covariance of `uv`.
+        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
     """
 
     camera: Index
     knot: Index
-    view: Index
     label: Index
     t_s: Array
     uv: Array
-    root: Array
+    cov: Array
+    axes_px: Array
+    angle_rad: Array
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -51,32 +65,84 @@ class Observations:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The unknowns: T_world_cam (C, 4, 4); position and velocity (K, 2, B, 3) of the wand's basis markers at knots."""
+    """The unknowns.
+
+    Attributes:
+        cameras: (C, 4, 4) T_world_cam.
+        clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
+        lenses: (C, 4) log of the focal lengths' factor, and what is added to cx, cy and k1.
+        motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots.
+    """
 
     cameras: Array
+    clocks: Array
+    lenses: Array
     motion: Array
 
+    @classmethod
+    def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
+        """Cameras and motion, clocks without drift, lenses as they are given."""
+        clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
+        return cls(cameras, clocks, np.zeros((len(cameras), 4)), motion)
+
     def moved(self, by: Array, along: Array) -> "State":
-        """Cameras turned and shifted by `by` (C, 6) in their own frames, the motion by `along` (K, 6 B)."""
+        """Cameras changed by `by` (C, 12), turned and shifted in their own frames, the motion by `along` (K, 6 B)."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, by, strict=True):
-            T[:3, 3] += T[:3, :3] @ xi[3:]
+            T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        return State(cameras, self.motion + along.reshape(self.motion.shape))
+        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:]
+        return State(cameras, clocks, lenses, self.motion + along.reshape(self.motion.shape))
+
+    def lens(self, camera: int, lens: Lens) -> Lens:
+        """The camera's lens, as adjusted."""
+        scale, cx, cy, k1 = self.lenses[camera].tolist()
+        if not any((scale, cx, cy, k1)):
+            return lens
+        rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
+        factor = float(np.exp(scale))
+        return msgspec.structs.replace(
+            lens,
+            fx=lens.fx * factor,
+            fy=lens.fy * factor,
+            cx=lens.cx + cx,
+            cy=lens.cy + cy,
+            distortion=(rest[0] + k1, *rest[1:]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
     """What stays the same from iteration to iteration.
 
-    `fixed_distance` holds two cameras and their distance: it carries the scale where no wand length does.
+    Attributes:
+        lenses: of the C cameras.
+        wand: in affine coordinates.
+        knot_s: (K,) ascending, K >= 2.
+        gap_s: knots further apart say nothing of each other.
+        density: power spectral density of the wand's acceleration, m^2/s^3.
+        middle_s: the stamp to which time offsets refer.
+        free: which of a camera's 12 parameters are sought.
+        fixed_distance: two cameras and their distance, where no wand length carries the scale.
     """
 
     lenses: list[Lens]
     wand: AffineWand
     knot_s: Array
+    gap_s: float
     density: float
+    middle_s: float
+    free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
+
+    def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
+        """The same with other parameters sought."""
+        return replace(self, free=tuple(sorted(sum(parameters, ()))))
+
+
+def cauchy(squares: Array, scale: float) -> float:
+    """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
+    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
 
 
 def skew(v: Array) -> Array:
@@ -86,159 +152,269 @@ def skew(v: Array) -> Array:
     return S - np.swapaxes(S, -1, -2)
 
 
+def unobserved(state: State, free: tuple[int, ...]) -> Array:
+    """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
+    columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
+    for T, rows in zip(state.cameras, columns, strict=True):
+        R, p = T[:3, :3], T[:3, 3]
+        rows[:6, :6] = np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]])
+        rows[6, 6] = rows[7, 7] = 1.0
+    kept = [g for g in range(8) if g < 6 or g in free]
+    return columns[:, free][:, :, kept].reshape(-1, len(kept))
+
+
+@dataclass(slots=True)
 class Linearisation:
-    """The least squares problem around a state, as GTSAM factors: keys are cameras 0..C-1, then knots."""
+    """The problem with its observations; `relinearise` makes the factors around a state, `solve` the step."""
 
-    def __init__(self, problem: Problem, observations: Observations) -> None:
-        import gtsam
+    problem: Problem
+    observations: Observations
+    broken: NDArray[np.bool_] | None = (
+        None  # (L,) intervals over which the hand was not as smooth as elsewhere
+    )
+    smooth: Array = field(init=False)  # (L, 2, 4) whitened constant velocity between knots; 0 across gaps
+    root: Array = field(init=False)  # (n, 2, 2) whitens residuals
+    views: Index = field(init=False)  # (V,) link times C plus camera, ascending
+    blocks: Array = field(
+        init=False
+    )  # (V, m, m) their augmented Hessians: knot, next knot, camera, right-hand side
+    chain: Array = field(init=False)  # (L, m', m') those of what is known of the motion
+    rig: list[Term] = field(init=False)  # of what is known of the cameras
 
-        self.gtsam: Any = gtsam
-        self.problem, self.observations = problem, observations
-        self.knots, self.hermite = interpolate(problem.knot_s, observations.t_s, observations.knot)
-        self.weights = problem.wand.weights[observations.label]
-        self.starts = np.flatnonzero(np.diff(observations.view, prepend=-1))
-        dt = np.diff(problem.knot_s)
-        self.links = np.flatnonzero((dt <= MAX_GAP_S) & (dt > 0))
-        self.smooth = np.array([whitened_motion(dt[k], problem.density) for k in self.links]).reshape(
-            -1, 2, 4
-        )
-        self.models = {}
-        self.graph: Any = None
+    def __post_init__(self) -> None:
+        dt = np.diff(self.problem.knot_s)
+        self.smooth = np.zeros((len(dt), 2, 4))
+        for k in np.flatnonzero((dt <= self.problem.gap_s) & (dt > 0)):
+            self.smooth[k] = whitened_motion(dt[k], self.problem.density)
+        if self.broken is not None:
+            self.smooth[self.broken] = 0.0
+
+    def strain(self, state: State) -> Array:
+        """(L,) how far the motion is from constant velocity over each interval, in sigmas of one coordinate."""
+        smooth = self._motion_terms(state)[0]
+        return np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / (6 * len(self.problem.wand.basis)))
+
+    def linked(self) -> int:
+        """The number of intervals between knots that are no gaps."""
+        return int(self.smooth.any(axis=(1, 2)).sum())
+
+    def times(self, state: State) -> Array:
+        """True capture times (n,) as the clocks stand."""
+        seen, clocks = self.observations, state.clocks[self.observations.camera]
+        return seen.t_s + clocks[:, 0] + clocks[:, 1] * (seen.t_s - self.problem.middle_s)
 
     def positions(self, state: State) -> Array:
         """Where the observed markers were when they were observed, (n, 3), world."""
-        ends = state.motion[self.knots].reshape(len(self.knots), 4, -1, 3)
-        return np.einsum("nh,nb,nhbx->nx", self.hermite, self.weights, ends)
+        return self._place(state)[2]
+
+    def _place(self, state: State) -> tuple[Index, Array, Array, Array]:
+        """Links (n,), Hermite weights (n, 4) of positions, and positions and velocities (n, 3) of what was observed."""
+        t_s, knot_s = self.times(state), self.problem.knot_s
+        place = locate(knot_s, t_s, self.problem.gap_s)
+        h, rate = interpolate(knot_s, t_s, place), hermite_rate(knot_s, t_s, place)
+        ends = state.motion[place.link[:, None] + [0, 1]].reshape(len(t_s), 4, -1, 3)
+        marker = np.einsum("nb,nhbx->nhx", self.problem.wand.weights[self.observations.label], ends)
+        return place.link, h, np.einsum("nh,nhx->nx", h, marker), np.einsum("nh,nhx->nx", rate, marker)
 
     def residuals(self, state: State) -> Array:
         """Seen less expected (n, 2), pixels; NaN behind the camera."""
-        points, seen = self.positions(state), self.observations
-        out = np.empty((len(seen), 2))
+        points, out = self._place(state)[2], np.empty((len(self.observations), 2))
         for c, lens in enumerate(self.problem.lenses):
-            rows = seen.camera == c
-            T = state.cameras[c]
-            out[rows] = seen.uv[rows] - lens.project((points[rows] - T[:3, 3]) @ T[:3, :3])
+            rows, T = self.observations.camera == c, state.cameras[c]
+            local = (points[rows] - T[:3, 3]) @ T[:3, :3]
+            out[rows] = self.observations.uv[rows] - state.lens(c, lens).project(local)
         return out
+
+    def weigh(self, state: State) -> None:
+        """Set what whitens residuals: the detector's covariance, and what is not known of the motion between knots."""
+        place = locate(self.problem.knot_s, self.times(state), self.problem.gap_s)
+        spread = self.problem.density * place.spread
+        J = self._jacobians(state)[2]
+        cov = self.observations.cov + spread[:, None, None] * J @ np.swapaxes(J, 1, 2)
+        self.root = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), float)
 
     def whitened(self, state: State) -> Array:
         """Residuals in units of their standard deviation (n, 2); 1e4 behind the camera."""
-        return np.nan_to_num(np.einsum("nij,nj->ni", self.observations.root, self.residuals(state)), nan=1e4)
+        return np.nan_to_num(np.einsum("nij,nj->ni", self.root, self.residuals(state)), nan=1e4)
 
-    def cost(self, state: State, scale: float) -> float:
-        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`."""
-        squares = (self.whitened(state) ** 2).sum(axis=1)
-        robust = squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum()
-        return 0.5 * float(robust + sum((term**2).sum() for term in self._priors(state)))
+    def cost(self, state: State, scale: float, slack: float) -> float:
+        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`, those of the motion's
+        smoothness at `slack`; either may be infinite."""
+        seen = (self.whitened(state) ** 2).sum(axis=1)
+        _, lengths, speed = self._motion_terms(state)
+        size = 6 * len(self.problem.wand.basis)
+        rest = sum((term**2).sum() for term in (lengths, speed, *(t[2] for t in self._rig_terms(state))))
+        return 0.5 * float(cauchy(seen, scale) + size * cauchy(self.strain(state) ** 2, slack) + rest)
 
-    def _priors(self, state: State) -> list[Array]:
+    def _motion_terms(self, state: State) -> tuple[Array, Array, Array]:
+        """Whitened: constant velocity (L, 2, B, 3), lengths (K, E), speed (K, B, 3)."""
         wand, motion = self.problem.wand, state.motion
+        pairs = np.concatenate([motion[:-1], motion[1:]], axis=1)
         ends = motion[:, 0][:, wand.pairs]
         lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
-        pairs = np.concatenate([motion[self.links], motion[self.links + 1]], axis=1)
-        terms = [
-            (lengths - wand.lengths) / LENGTH_SIGMA_M,
-            motion[:, 1] / SPEED_SIGMA,
-            np.einsum("lij,ljbx->libx", self.smooth, pairs),
-        ]
+        smooth = np.einsum("lij,ljbx->libx", self.smooth, pairs)
+        return smooth, (lengths - wand.lengths) / RIGID_M, motion[:, 1] / SPEED_SIGMA
+
+    def _rig_terms(self, state: State) -> list[Term]:
+        """What is known of the cameras before: their numbers, Jacobians, and whitened errors with the sign turned."""
+        free = list(self.problem.free)
+        known = np.column_stack([np.zeros((len(state.cameras), 6)), state.clocks, state.lenses])[:, free]
+        sigma = PRIOR_SIGMA[free]
+        terms: list[Term] = [((c,), (np.diag(1 / sigma),), -values / sigma) for c, values in enumerate(known)]
         if self.problem.fixed_distance:
             a, b, distance = self.problem.fixed_distance
             gap = state.cameras[a, :3, 3] - state.cameras[b, :3, 3]
-            terms.append(np.array([np.linalg.norm(gap) / distance - 1]) / 1e-6)
+            along = gap / np.linalg.norm(gap) / distance / FIXED
+            rows = np.zeros((2, 1, len(free)))
+            rows[0, 0, 3:6], rows[1, 0, 3:6] = (
+                along @ state.cameras[a, :3, :3],
+                -along @ state.cameras[b, :3, :3],
+            )
+            terms.append(((a, b), tuple(rows), np.array([1 - np.linalg.norm(gap) / distance]) / FIXED))
         return terms
 
-    def relinearise(self, state: State, weight: Array) -> None:
-        """Build the factors around `state`, each observation weighted by `weight` (n,)."""
-        self.graph = self.gtsam.GaussianFactorGraph()
-        self._add_observations(state, np.sqrt(weight))
-        self._add_priors(state)
-
-    def _add(self, blocks: list[tuple[int, Array]], b: Array) -> None:
-        unit = self.models.setdefault(len(b), self.gtsam.noiseModel.Unit.Create(len(b)))
-        flat = [part for block in blocks for part in block]
-        self.graph.add(self.gtsam.JacobianFactor(*flat, b, unit))
-
-    def _add_observations(self, state: State, weight: Array) -> None:
-        seen, n, count = self.observations, len(self.observations), len(self.problem.lenses)
-        points = self.positions(state)
-        J_camera, J_point, error = np.zeros((n, 2, 6)), np.zeros((n, 2, 3)), np.zeros((n, 2))
-        for c, lens in enumerate(self.problem.lenses):
-            rows = seen.camera == c
-            T = state.cameras[c]
+    def _jacobians(self, state: State) -> tuple[Array, Array, Array]:
+        """Residuals (n, 2), and the derivatives of what is expected by the camera's parameters (n, 2, d) and by the
+        marker's place in the world (n, 2, 3)."""
+        seen, free = self.observations, list(self.problem.free)
+        _, _, points, velocity = self._place(state)
+        since = seen.t_s - self.problem.middle_s
+        error, J_point = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 3))
+        J_camera = np.zeros((len(seen), 2, PER_CAMERA))
+        for c, given in enumerate(self.problem.lenses):
+            rows, T, lens = np.flatnonzero(seen.camera == c), state.cameras[c], state.lens(c, given)
             local = (points[rows] - T[:3, 3]) @ T[:3, :3]
             uv, J = lens.project_with_jacobian(local)
-            J = np.nan_to_num(J)
-            J_camera[rows] = np.concatenate([J @ skew(local), -J], axis=2)
+            J, error[rows] = np.nan_to_num(J), np.nan_to_num(seen.uv[rows] - uv)
             J_point[rows] = J @ T[:3, :3].T
-            error[rows] = np.nan_to_num(seen.uv[rows] - uv)
-        root = weight[:, None, None] * seen.root
-        J_camera, J_point = root @ J_camera, root @ J_point
-        error = np.einsum("nij,nj->ni", root, error)
-        J_knots = np.einsum("nrx,nh,nb->nrhbx", J_point, self.hermite, self.weights).reshape(n, 2, 2, -1)
-        for first, last in zip(self.starts, [*self.starts[1:], n], strict=True):
-            k, after = self.knots[first]
-            blocks = [
-                (int(seen.camera[first]), J_camera[first:last].reshape(-1, 6)),
-                (count + int(k), J_knots[first:last, :, 0].reshape(2 * (last - first), -1)),
-            ]
-            if after != k:
-                blocks.append((count + int(after), J_knots[first:last, :, 1].reshape(2 * (last - first), -1)))
-            self._add(blocks, error[first:last].ravel())
+            J_camera[rows, :, :6] = np.concatenate([J @ skew(local), -J], axis=2)
+            J_camera[rows, :, 6] = np.einsum("nij,nj->ni", J_point[rows], velocity[rows])
+            J_camera[rows, :, 7] = J_camera[rows, :, 6] * since[rows, None]
+            if set(LENS) & set(free):
+                J_camera[rows, :, 8:] = np.nan_to_num(_by_lens(lens, local, uv))
+        return error, J_camera[:, :, free], J_point
 
-    def _add_priors(self, state: State) -> None:
-        wand, motion, count = self.problem.wand, state.motion, len(self.problem.lenses)
+    def relinearise(self, state: State, weight: Array, link_weight: Array) -> None:
+        """Make the Hessians around `state`, observations weighted by `weight` (n,), smoothness by `link_weight`."""
+        link, h, _, _ = self._place(state)
+        error, J_camera, J_point = self._jacobians(state)
+        root = np.sqrt(weight)[:, None, None] * self.root
+        weights = self.problem.wand.weights[self.observations.label]
+        J_knots = np.einsum("nrx,nh,nb->nrhbx", root @ J_point, h, weights).reshape(len(h), 2, -1)
+        error = np.einsum("nij,nj->ni", root, error)[:, :, None]
+        rows = np.concatenate([J_knots, root @ J_camera, error], axis=2)
+        view = link * len(self.problem.lenses) + self.observations.camera
+        self.views, group, size = np.unique(view, return_inverse=True, return_counts=True)
+        order = np.argsort(group, kind="stable")
+        slot = np.empty(len(group), np.intp)
+        slot[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
+        A = np.zeros((len(size), size.max(), *rows.shape[1:]))
+        A[group, slot] = rows
+        A = A.reshape(len(A), -1, rows.shape[2])
+        self.blocks = np.swapaxes(A, 1, 2) @ A
+        self._hold_motion(state, link_weight)
+        self.rig = self._rig_terms(state)
+
+    def _hold_motion(self, state: State, weight: Array) -> None:
+        """Hessians of what is known of the motion: knot k stands in link k, the last in the last link."""
+        wand, motion = self.problem.wand, state.motion
+        smooth, lengths, speed = self._motion_terms(state)
         B, K = len(wand.basis), len(motion)
-        terms = self._priors(state)
+        local = 12 * B
+        self.chain = np.zeros((K - 1, local + 1, local + 1))
+        weighted = weight[:, None, None] * self.smooth
+        H = np.einsum("lri,lrj->lij", weighted, self.smooth)
+        self.chain[:, :local, :local] = np.kron(H, np.eye(3 * B)[None])
+        self.chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
         J = np.zeros((K, len(wand.pairs) + 3 * B, 2, B, 3))
         for e, (i, j) in enumerate(wand.pairs):
             gap = motion[:, 0, i] - motion[:, 0, j]
-            along = gap / np.linalg.norm(gap, axis=1, keepdims=True) / LENGTH_SIGMA_M
+            along = gap / np.linalg.norm(gap, axis=1, keepdims=True) / RIGID_M
             J[:, e, 0, i], J[:, e, 0, j] = along, -along
         J[:, len(wand.pairs) :, 1] = (np.eye(3 * B) / SPEED_SIGMA).reshape(1, 3 * B, B, 3)
-        error = -np.concatenate([terms[0], terms[1].reshape(K, -1)], axis=1)
-        for k, (A, b) in enumerate(zip(J.reshape(K, -1, 6 * B), error, strict=True)):
-            self._add([(count + k, A)], b)
-        for k, S, e in zip(self.links.tolist(), self.smooth, terms[2], strict=True):
-            A = np.einsum("ij,pq->ipjq", S, np.eye(3 * B)).reshape(6 * B, 2, 6 * B)
-            self._add([(count + k, A[:, 0]), (count + k + 1, A[:, 1])], -e.ravel())
-        if self.problem.fixed_distance:
-            self._add_distance(state, *self.problem.fixed_distance, terms[3])
+        J = J.reshape(K, -1, 6 * B)
+        error = -np.concatenate([lengths, speed.reshape(K, -1)], axis=1)
+        H, g = np.swapaxes(J, 1, 2) @ J, np.einsum("kri,kr->ki", J, error)
+        H += np.diag(np.repeat([STEP_M**-2, 0.0], 3 * B))
+        for knots, links, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), 6 * B)):
+            self.chain[links, at : at + 6 * B, at : at + 6 * B] += H[knots]
+            self.chain[links, at : at + 6 * B, -1] += g[knots]
 
-    def _add_distance(self, state: State, a: int, b: int, distance: float, error: Array) -> None:
-        gap = state.cameras[a, :3, 3] - state.cameras[b, :3, 3]
-        along = gap / np.linalg.norm(gap) / distance / 1e-6
-        zero = np.zeros((1, 3))
-        blocks = [
-            (c, np.hstack([zero, sign * along[None] @ state.cameras[c, :3, :3]]))
-            for c, sign in ((a, 1), (b, -1))
-        ]
-        self._add(blocks, -error)
+    def _graph(self, damping: float) -> Any:
+        """GTSAM's graph: keys are the K knots, then the cameras."""
+        import gtsam
+
+        factor: Any = gtsam.JacobianFactor
+        half, d = 6 * len(self.problem.wand.basis), len(self.problem.free)
+        count, graph = len(self.problem.knot_s), gtsam.GaussianFactorGraph()
+        a, b, c = slice(0, half), slice(half, 2 * half), slice(2 * half, 2 * half + d)
+        links, cameras = np.divmod(self.views, len(self.problem.lenses))
+        for k, camera, H in zip(links.tolist(), cameras.tolist(), _damped(self.blocks, damping), strict=True):
+            upper = (H[a, a], H[a, b], H[a, c], H[a, -1], H[b, b], H[b, c], H[b, -1], H[c, c], H[c, -1])
+            graph.add(gtsam.HessianFactor(k, k + 1, count + camera, *upper, 0.0))
+        for k, H in enumerate(_damped(self.chain, damping)):
+            graph.add(gtsam.HessianFactor(k, k + 1, H[a, a], H[a, b], H[a, -1], H[b, b], H[b, -1], 0.0))
+        for keys, J, error in self.rig:
+            unit = gtsam.noiseModel.Unit.Create(len(error))
+            blocks: list[Any] = [
+                part for key, block in zip(keys, J, strict=True) for part in (count + key, block)
+            ]
+            graph.add(factor(*blocks, error, unit))
+        return graph
+
+    def _ordering(self, first: int, last: int) -> Any:
+        import gtsam
+
+        ordering = gtsam.Ordering()
+        for key in range(first, last):
+            ordering.push_back(key)
+        return ordering
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """The damped step: (C, 6) of cameras and (K, 6 B) of the motion; the first camera stays, as nothing observes
-        the world.
+        """Levenberg-Marquardt's step: (C, 12) of cameras and (K, 6 B) of the motion. The first camera and its clock
+        stay, as nothing observes the world and the time that all share.
 
         Raises:
             RuntimeError: the system is too near to singular; more damping helps.
         """
-        graph = self.graph.clone()
-        count, knots = len(self.problem.lenses), len(self.problem.knot_s)
-        dims = [6] * count + [6 * len(self.problem.wand.basis)] * knots
-        diagonal = np.sqrt([ANCHOR] + [damping] * (len(dims) - 1))
-        for key, (dim, weight) in enumerate(zip(dims, diagonal, strict=True)):
-            model = self.models.setdefault(dim, self.gtsam.noiseModel.Unit.Create(dim))
-            graph.add(self.gtsam.JacobianFactor(key, weight * np.eye(dim), np.zeros(dim), model))
-        step = graph.optimize()
-        return (
-            np.array([step.at(key) for key in range(count)]),
-            np.array([step.at(count + k) for k in range(knots)]),
-        )
+        import gtsam
+
+        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
+        free = list(self.problem.free)
+        graph = self._graph(damping)
+        graph.add(gtsam.HessianFactor(count, np.diag(ANCHOR[free]), 0 * ANCHOR[free], 0.0))
+        step = graph.optimize(self._ordering(0, total))
+        by = np.zeros((total - count, PER_CAMERA))
+        by[:, free] = [step.at(key) for key in range(count, total)]
+        return by, np.array([step.at(key) for key in range(count)])
 
     def camera_information(self, state: State) -> Array:
-        """(6C, 6C) information of the cameras with the motion eliminated (Schur complement)."""
-        self.relinearise(state, np.ones(len(self.observations)))
-        count, knots = len(self.problem.lenses), len(self.problem.knot_s)
-        rest = self.graph.eliminatePartialMultifrontal(list(range(count, count + knots)))[1]
-        order = self.gtsam.Ordering()
-        for key in range(count):
-            order.push_back(key)
-        return np.asarray(rest.hessian(order)[0])
+        """(C d, C d) information of the cameras' free parameters with the motion eliminated (Schur complement)."""
+        self.relinearise(state, np.ones(len(self.observations)), np.ones(len(self.smooth)))
+        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
+        rest = self._graph(0.0).eliminatePartialMultifrontal(self._ordering(0, count))[1]
+        return np.asarray(rest.hessian(self._ordering(count, total))[0])
+
+
+def _damped(blocks: Array, damping: float) -> Array:
+    """The Hessians with their diagonals grown (Marquardt), all but the right-hand side's."""
+    grown, diagonal = blocks.copy(), np.arange(blocks.shape[1] - 1)
+    grown[:, diagonal, diagonal] *= 1 + damping
+    return grown
+
+
+def _by_lens(lens: Lens, local: Array, uv: Array) -> Array:
+    """(n, 2, 4) derivative of pixels by the log of the focal lengths, cx, cy and k1."""
+    step = 1e-5
+    rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
+    bent = msgspec.structs.replace(lens, distortion=(rest[0] + step, *rest[1:])).project(local)
+    one = np.ones(len(uv))
+    return np.stack(
+        [
+            uv - [lens.cx, lens.cy],
+            np.column_stack([one, 0 * one]),
+            np.column_stack([0 * one, one]),
+            (bent - uv) / step,
+        ],
+        axis=2,
+    )

@@ -1,32 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Two-view geometry: where two cameras stand to each other, from the instants at which both saw the wand.
+"""Two-view geometry: how two cameras stand and how far their clocks are apart, from what both saw.
 
-Where each view alone places the markers (three on a line, or roundels of known size), the two sets of points are
-brought together by RANSAC over Kabsch's motion. Else the essential matrix (Nister 2004) gives the motion up to scale,
-and the wand's lengths the scale.
+The essential matrix (Nister 2004) gives the motion up to scale; the wand's lengths or the roundels' sizes the scale.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.alignment import rigid_motions
 from calib.camera import transform
-from calib.views import View
+from calib.shifts import Common, common_sightings, find_shift
+from calib.sightings import Sightings, ranges
+from calib.tracks import Track, tracks_of
 from camera_node.body import Body
 from camera_node.lens import Lens
 from camera_node.pose import invert
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 MIN_INSTANTS = 8  # that two cameras must share
-TRIALS = 300
-RELATIVE_GATE = 0.04  # of a one-view position, by the distance: sizes give it to one or two percent
+SAMPLE = 1500  # sightings that the essential matrix is fitted to
 GATE_PX = 3.0
+INTERPOLATED = 2.5  # frame periods over which a marker's place is interpolated
+SLOWEST_S = 0.5  # and never longer
+MAX_SPREAD = 0.15  # of the logarithm of lengths and sizes: a geometry that makes them differ by more is none
+MIN_SHARE = 0.5  # of the sightings that both have: a geometry that fewer agree to is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,116 +36,124 @@ class TwoView:
     """Camera b seen from camera a.
 
     Attributes:
-        a, b: names.
+        a, b: their numbers.
         T_a_b: (4, 4) p_a = T_a_b p_b, metres if `metric`, else its translation has length 1.
-        inliers: instants that agree with it.
-        depths: distance to a marker by (camera, instant, label), in the unit of T_a_b: ties scales together.
+        shift_s: by which b's stamps are later than a's.
+        inliers: sightings that agree with it; `share` of those that both have.
+        depth: distance to the marker by sighting (row), in the unit of T_a_b: ties scales together.
     """
 
-    a: str
-    b: str
+    a: int
+    b: int
     T_a_b: Array
+    shift_s: float
     inliers: int
+    share: float
     metric: bool
-    depths: dict[tuple[str, int, int], float] = field(default_factory=dict)
+    depth: dict[int, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Shared:
-    """Markers that two cameras saw at the same instants: (n,) instants and labels, (n, 2) image plane coordinates,
-    and (n, 3) one-view positions (NaN where unknown) in either camera."""
+class Pairs:
+    """What each two cameras of a recording have in common."""
 
-    instant: NDArray[np.intp]
-    label: NDArray[np.intp]
-    xy_a: Array
-    xy_b: Array
-    points_a: Array
-    points_b: Array
+    def __init__(self, seen: Sightings, lenses: Sequence[Lens], wand: Body, period_s: float) -> None:
+        self.seen, self.lenses, self.wand = seen, lenses, wand
+        self.rows = [np.flatnonzero(seen.camera == k) for k in range(len(lenses))]
+        self.tracks: list[list[Track]] = tracks_of(seen, len(lenses), len(wand.markers))
+        self.gap_s = min(INTERPOLATED * period_s, SLOWEST_S) if period_s else SLOWEST_S
+        self.period_s = period_s
+        self.range = ranges(lenses, seen, wand.diameter_m)
 
+    def shared(self) -> NDArray[np.intp]:
+        """(C, C) about how many moments, a frame period long, each two cameras share."""
+        bins = (self.seen.t_s / max(self.period_s, 0.02)).astype(np.intp)
+        held = np.zeros((len(self.lenses), int(bins.max(initial=0)) + 1))
+        held[self.seen.camera, bins] = 1
+        near = np.maximum(held, np.roll(held, 1, axis=1))
+        return (near @ near.T / 2).astype(np.intp)
 
-def shared_markers(instants: Sequence[Sequence[View]], a: str, b: str) -> Shared:
-    """What cameras a and b saw at the same instants."""
-    rows: list[tuple] = []
-    for k, instant in enumerate(instants):
-        seen = {view.camera: view for view in instant}
-        if a in seen and b in seen:
-            labels = np.intersect1d(seen[a].labels, seen[b].labels)
-            ra, rb = seen[a].rows_of(labels), seen[b].rows_of(labels)
-            for label, i, j in zip(labels, ra, rb, strict=True):
-                rows.append(
-                    (k, label, *seen[a].xy[i], *seen[b].xy[j], *_point(seen[a], i), *_point(seen[b], j))
-                )
-    table = np.array(rows, float).reshape(-1, 12)
-    index = table[:, :2].astype(np.intp)
-    return Shared(index[:, 0], index[:, 1], table[:, 2:4], table[:, 4:6], table[:, 6:9], table[:, 9:12])
-
-
-def _point(view: View, row: int) -> Array:
-    return np.full(3, np.nan) if view.points is None else view.points[row]
-
-
-def relate_all(
-    instants: Sequence[Sequence[View]], lenses: Mapping[str, Lens], wand: Body
-) -> tuple[list[TwoView], dict[tuple[str, str], int]]:
-    """The geometry of every pair of cameras that has one, and the number of instants that each pair shares."""
-    found, counts = [], {}
-    for a, b in combinations(sorted(lenses), 2):
-        shared = shared_markers(instants, a, b)
-        counts[a, b] = len(np.unique(shared.instant))
-        if counts[a, b] >= MIN_INSTANTS:
-            pair = relate_by_points(shared, a, b) or relate_by_rays(shared, a, b, lenses[a], wand)
-            if pair is not None and pair.inliers >= MIN_INSTANTS:
-                found.append(pair)
-    return found, counts
-
-
-def relate_by_points(shared: Shared, a: str, b: str) -> TwoView | None:
-    """The motion that brings the one-view positions in b to those in a, by RANSAC; None where too few have both."""
-    known = np.isfinite(shared.points_a).all(axis=1) & np.isfinite(shared.points_b).all(axis=1)
-    P, Q, instant = shared.points_a[known], shared.points_b[known], shared.instant[known]
-    if len(np.unique(instant)) < MIN_INSTANTS:
-        return None
-    rng = np.random.default_rng(0)
-    gate = RELATIVE_GATE * (np.linalg.norm(P, axis=1) + np.linalg.norm(Q, axis=1)) / 2
-    samples = rng.integers(len(P), size=(TRIALS, 4))
-    motions = rigid_motions(Q[samples], P[samples])
-    moved = np.einsum("sij,nj->sni", motions[:, :3, :3], Q) + motions[:, None, :3, 3]
-    inlier = np.linalg.norm(moved - P, axis=2) < gate
-    best = inlier[inlier.sum(axis=1).argmax()]
-    T = np.eye(4)
-    for _ in range(3):
-        if best.sum() < 4:
+    def relate(self, a: int, b: int) -> TwoView | None:
+        """Where two cameras stand to each other; None where it can't be told."""
+        seen, rows = self.seen, self.rows[a]
+        near = self._near(rows, b)
+        shift_s = find_shift(self.tracks[b], seen.label[near], seen.t_s[near], seen.xy[near], self.gap_s)
+        common = self._common(near, b, shift_s)
+        if len(np.unique(seen.frame[common.rows])) < MIN_INSTANTS:
             return None
-        T = rigid_motions(Q[best], P[best])
-        best = np.linalg.norm(transform(T, Q) - P, axis=1) < gate
-    return TwoView(a, b, T, len(np.unique(instant[best])), metric=True)
+        found = self._motion(a, common)
+        if found is None:
+            return None
+        T, good = found
+        inliers = common.rows[good]
+        if len(np.unique(seen.frame[inliers])) < MIN_INSTANTS:
+            return None
+        points = intersect_rays(T, common.xy_a[good], common.xy_b[good])
+        ratios = self._ratios(points, inliers)
+        scale = float(np.median(ratios)) if len(ratios) else 1.0
+        if len(ratios) and np.median(np.abs(np.log(ratios / scale))) > MAX_SPREAD:
+            return None
+        T[:3, 3] *= scale
+        depth = self._depths(T, inliers, points * scale, b, shift_s)
+        share = len(inliers) / len(common.rows)
+        return TwoView(a, b, T, shift_s, len(inliers), share, len(ratios) > 0, depth)
 
-
-def relate_by_rays(shared: Shared, a: str, b: str, lens: Lens, wand: Body) -> TwoView | None:
-    """The motion by the essential matrix, its scale by the wand's lengths; None where it can't be told."""
-    gate = GATE_PX / ((lens.fx + lens.fy) / 2)
-    E, mask = cv2.findEssentialMat(shared.xy_a, shared.xy_b, np.eye(3), cv2.RANSAC, 0.9999, gate)[:2]
-    if E is None or E.shape != (3, 3):
-        return None
-    _, R, t, mask = cv2.recoverPose(E, shared.xy_a, shared.xy_b, np.eye(3), mask=mask)[:4]
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
-    T = invert(T_b_a)
-    good = mask.ravel() > 0
-    if not good.any():
-        return None
-    points = intersect_rays(T, shared.xy_a[good], shared.xy_b[good])
-    instant, label = shared.instant[good], shared.label[good]
-    scale = _scale(points, instant, label, wand)
-    T[:3, 3] *= scale or 1.0
-    points = points * (scale or 1.0)
-    depths: dict[tuple[str, int, int], float] = {}
-    for camera, seen in ((a, points), (b, transform(invert(T), points))):
-        far = np.linalg.norm(seen, axis=1).tolist()
-        depths |= dict(
-            zip(zip([camera] * len(far), instant.tolist(), label.tolist(), strict=True), far, strict=True)
+    def _near(self, rows: Index, b: int) -> Index:
+        """Rows at whose time, clocks apart, camera b could have seen the wand; not more than are worth while."""
+        times = np.unique(self.seen.t_s[self.rows[b]])
+        if not len(times) or not len(rows):
+            return rows[:0]
+        after = np.clip(np.searchsorted(times, self.seen.t_s[rows]), 1, max(len(times) - 1, 1)) - 1
+        after = np.minimum(after, len(times) - 1)
+        other = np.minimum(after + 1, len(times) - 1)
+        gap = np.minimum(
+            np.abs(times[after] - self.seen.t_s[rows]), np.abs(times[other] - self.seen.t_s[rows])
         )
-    return TwoView(a, b, T, len(np.unique(instant)), scale is not None, depths)
+        near = rows[gap <= self.gap_s]
+        return near[np.linspace(0, len(near) - 1, min(SAMPLE, len(near))).round().astype(np.intp)]
+
+    def _common(self, rows: Index, b: int, shift_s: float) -> Common:
+        seen = self.seen
+        return common_sightings(
+            self.tracks[b], rows, seen.label[rows], seen.t_s[rows], seen.xy[rows], shift_s, self.gap_s
+        )
+
+    def _motion(self, a: int, common: Common) -> tuple[Array, NDArray[np.bool_]] | None:
+        gate = GATE_PX / ((self.lenses[a].fx + self.lenses[a].fy) / 2)
+        E, mask = cv2.findEssentialMat(common.xy_a, common.xy_b, np.eye(3), cv2.RANSAC, 0.9999, gate)[:2]
+        if E is None or E.shape != (3, 3):
+            return None
+        _, R, t, mask = cv2.recoverPose(E, common.xy_a, common.xy_b, np.eye(3), mask=mask)[:4]
+        T_b_a = np.eye(4)
+        T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
+        return invert(T_b_a), mask.ravel() > 0
+
+    def _ratios(self, points: Array, rows: Index) -> Array:
+        """By what to multiply the points so that the wand has its lengths, or else roundels their size; (r,) votes."""
+        frame, label = self.seen.frame[rows], self.seen.label[rows]
+        table = np.full((len(np.unique(frame)), len(self.wand.markers), 3), np.nan)
+        table[np.unique(frame, return_inverse=True)[1], label] = points
+        gaps = np.linalg.norm(table[:, :, None] - table[:, None], axis=3)
+        known = np.linalg.norm(self.wand.points[:, None] - self.wand.points[None], axis=2)
+        upper = np.triu(np.ones(known.shape, bool), 1)
+        ratios = (known / np.where(gaps > 0, gaps, np.nan))[:, upper].ravel()
+        if not np.isfinite(ratios).any():
+            ratios = self.range[rows] / np.linalg.norm(points, axis=1)
+        return ratios[np.isfinite(ratios)]
+
+    def _depths(self, T: Array, rows: Index, points: Array, b: int, shift_s: float) -> dict[int, float]:
+        """Distances from camera a at its sightings, and from camera b at its nearest ones."""
+        seen = self.seen
+        depth = dict(zip(rows.tolist(), np.linalg.norm(points, axis=1).tolist(), strict=True))
+        far = np.linalg.norm(transform(invert(T), points), axis=1)
+        for marker in range(len(self.wand.markers)):
+            mine = np.flatnonzero(seen.label[rows] == marker)
+            theirs = self.rows[b][seen.label[self.rows[b]] == marker]
+            if len(mine) and len(theirs):
+                at = np.searchsorted(seen.t_s[theirs], seen.t_s[rows[mine]] + shift_s)
+                depth |= dict(
+                    zip(theirs[np.minimum(at, len(theirs) - 1)].tolist(), far[mine].tolist(), strict=True)
+                )
+        return depth
 
 
 def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
@@ -151,15 +161,3 @@ def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
     P_a, P_b = np.eye(4)[:3], invert(T_a_b)[:3]
     homogeneous = cv2.triangulatePoints(P_a, P_b, xy_a.T, xy_b.T).T
     return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], float)
-
-
-def _scale(points: Array, instant: NDArray[np.intp], label: NDArray[np.intp], wand: Body) -> float | None:
-    """What to multiply the points with so that the wand has its length; None for a wand of one marker."""
-    where = {key: row for row, key in enumerate(zip(instant.tolist(), label.tolist(), strict=True))}
-    ratios = [
-        np.linalg.norm(wand.points[i] - wand.points[j]) / np.linalg.norm(points[row] - points[where[k, j]])
-        for (k, i), row in where.items()
-        for j in range(i + 1, len(wand.markers))
-        if (k, j) in where
-    ]
-    return float(np.median(ratios)) if ratios else None

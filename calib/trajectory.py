@@ -18,8 +18,6 @@ from camera_node.body import Body
 
 Array = NDArray[np.float64]
 
-MAX_GAP_S = 0.5  # knots further apart say nothing of each other
-
 
 @dataclass(frozen=True, slots=True)
 class AffineWand:
@@ -67,24 +65,51 @@ def hermite(tau: Array, dt: Array) -> Array:
     )
 
 
-def interpolate(knot_s: Array, t_s: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
-    """Which knots a frame at `t_s` (n,) depends on, given the knot `own` (n,) that is nearest to it.
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where on the trajectory frames are: `link` (n,) is the interval between knots, `own` (n,) tells 0 or 1, the knot
+    of it that a frame extrapolates, where it is not `inside` (n,) the interval; `spread` (n,) is the variance of a
+    position there, were both knots known, for an acceleration of power spectral density 1."""
 
-    Returns:
-        knots: (n, 2) the knots before and after; twice `own` where the next one is too far, or none.
-        weights: (n, 4) of p0, v0, p1, v1; there (1, tau, 0, 0): constant velocity.
-    """
-    first = np.where(t_s >= knot_s[own], own, own - 1)
-    inside = (first >= 0) & (first + 1 < len(knot_s))
-    first = np.clip(first, 0, max(len(knot_s) - 2, 0))
-    last = np.minimum(first + 1, len(knot_s) - 1)
-    dt = knot_s[last] - knot_s[first]
-    linked = inside & (dt <= MAX_GAP_S) & (dt > 0)
-    knots = np.where(linked[:, None], np.column_stack([first, last]), own[:, None])
-    tau = t_s - knot_s[own]
-    weights = np.column_stack([np.ones(len(tau)), tau, np.zeros(len(tau)), np.zeros(len(tau))])
-    weights[linked] = hermite((t_s - knot_s[first])[linked], dt[linked])
-    return knots, weights
+    link: NDArray[np.intp]
+    own: NDArray[np.intp]
+    inside: NDArray[np.bool_]
+    spread: Array
+
+
+def locate(knot_s: Array, t_s: Array, gap_s: float) -> Place:
+    """Place frames at `t_s` (n,) between K >= 2 ascending knots; intervals above `gap_s` are gaps."""
+    link = np.clip(np.searchsorted(knot_s, t_s, side="right") - 1, 0, len(knot_s) - 2)
+    dt, tau = knot_s[link + 1] - knot_s[link], t_s - knot_s[link]
+    inside = (dt <= gap_s) & (tau >= 0) & (tau <= dt)
+    own = (tau > dt / 2).astype(np.intp)
+    beyond = np.abs(t_s - knot_s[link + own])
+    spread = np.where(inside, (tau * (dt - tau) / dt) ** 3 / 3, beyond**3 / 3)
+    return Place(link, own, inside, spread)
+
+
+def interpolate(knot_s: Array, t_s: Array, place: Place) -> Array:
+    """(n, 4) weights of p0, v0, p1, v1 in the position at `t_s`; beyond a knot with constant velocity."""
+    tau = t_s - knot_s[place.link + place.own]
+    weights = np.zeros((len(tau), 4))
+    rows = np.arange(len(tau))
+    weights[rows, 2 * place.own], weights[rows, 2 * place.own + 1] = 1.0, tau
+    first = place.link[place.inside]
+    weights[place.inside] = hermite(t_s[place.inside] - knot_s[first], knot_s[first + 1] - knot_s[first])
+    return weights
+
+
+def hermite_rate(knot_s: Array, t_s: Array, place: Place) -> Array:
+    """(n, 4) derivative of `interpolate`'s weights by time: the weights of the velocity."""
+    weights = np.zeros((len(t_s), 4))
+    weights[np.arange(len(t_s)), 2 * place.own + 1] = 1.0
+    first = place.link[place.inside]
+    dt = knot_s[first + 1] - knot_s[first]
+    s = (t_s[place.inside] - knot_s[first]) / dt
+    weights[place.inside] = np.column_stack(
+        [6 * s * (s - 1) / dt, (1 - s) * (1 - 3 * s), 6 * s * (1 - s) / dt, s * (3 * s - 2)]
+    )
+    return weights
 
 
 def whitened_motion(dt: float, density: float) -> Array:
@@ -99,21 +124,21 @@ def whitened_motion(dt: float, density: float) -> Array:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(Q), error), float)
 
 
-def finite_velocities(knot_s: Array, points: Array) -> Array:
+def finite_velocities(knot_s: Array, points: Array, gap_s: float) -> Array:
     """Velocities (K, B, 3) at the knots by central differences of positions (K, B, 3); 0 where no knot is near."""
     velocity = np.zeros_like(points)
     if len(knot_s) < 2:
         return velocity
     dt = np.diff(knot_s)
     steps = np.diff(points, axis=0) / dt[:, None, None]
-    near = (dt <= MAX_GAP_S).astype(float)
+    near = (dt <= gap_s).astype(float)
     total = np.concatenate([near, [0.0]]) + np.concatenate([[0.0], near])
     velocity[:-1] += steps * near[:, None, None]
     velocity[1:] += steps * near[:, None, None]
     return velocity / np.maximum(total, 1.0)[:, None, None]
 
 
-def acceleration_density(knot_s: Array, points: Array) -> float:
+def acceleration_density(knot_s: Array, points: Array, gap_s: float) -> float:
     """Power spectral density of the acceleration, m^2/s^3, at least 1e-6, from positions (K, B, 3) at knots.
 
     Under the prior, the mean velocities of two neighbouring intervals dt differ with variance 2/3 density dt. Of these
@@ -122,7 +147,7 @@ def acceleration_density(knot_s: Array, points: Array) -> float:
     """
     dt = np.diff(knot_s)
     steps = np.diff(points, axis=0) / dt[:, None, None]
-    near = (dt[1:] <= MAX_GAP_S) & (dt[:-1] <= MAX_GAP_S)
+    near = (dt[1:] <= gap_s) & (dt[:-1] <= gap_s)
     if not near.any():
         return 1.0
     spread = np.abs(np.diff(steps, axis=0))[near] / np.sqrt((dt[1:] + dt[:-1])[near] / 3)[:, None, None]

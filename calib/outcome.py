@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What an adjusted wave says: the rig, its covariances, and a report that a person can act on."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjustment import Adjusted
+from calib.linearisation import DRIFT, OFFSET, POSE, Observations
+from calib.report import CameraReport, Outlier, WandReport
+from calib.rig import Rig
+from calib.solution import Solution
+from calib.world import move, upright
+from camera_node.pose import Pose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A rig with poses and covariances, what there is to say of it, and the adjustment.
+
+    Attributes:
+        rig, report: the result.
+        names: of the C placed cameras, the order of all below.
+        adjusted: the adjustment; `observations` are its rows.
+        covariance: (6C, 6C) of all poses together, each in its camera's own frame, rotation then translation, the world
+            being where the cameras are on average.
+        time_offset_ms, time_sigma_ms: (C,) true time = stamp + offset in the middle of the recording, median 0; and
+            standard deviations, 0 where the data want no offsets.
+        drift_ppm, drift_sigma_ppm: (C,) by which offsets grow, microseconds a second, mean 0; likewise.
+    """
+
+    rig: Rig
+    report: WandReport
+    names: list[str]
+    adjusted: Adjusted
+    observations: Observations
+    covariance: Array
+    time_offset_ms: Array
+    time_sigma_ms: Array
+    drift_ppm: Array
+    drift_sigma_ppm: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is known before the adjustment, in the order of `names`, the placed cameras: frames with the wand, frames
+    left out by reason; the reason for each camera that is not placed; and whether the scale is known."""
+
+    names: list[str]
+    frames: list[int]
+    left_out: list[Counter[str]]
+    unplaced: dict[str, str]
+    metric: bool
+
+
+def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
+    """The rig in an upright world, and the report."""
+    adjusted, count = solution.adjusted, len(told.names)
+    joint = adjusted.covariance(POSE)
+    offsets, offset_sigma = _clock(adjusted, OFFSET, 1e3)
+    drift, drift_sigma = _clock(adjusted, DRIFT, 1e6)
+    offsets, drift = offsets - np.median(offsets), drift - drift.mean()
+    covariance = joint.reshape(6 * count, 6 * count)
+    placed = _place(rig, solution, told, joint, offsets)
+    return Calibration(
+        placed,
+        _report(solution, told, joint),
+        told.names,
+        adjusted,
+        solution.observations,
+        covariance,
+        offsets,
+        offset_sigma,
+        drift,
+        drift_sigma,
+    )
+
+
+def _clock(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tuple[Array, Array]:
+    """Values and standard deviations (C,) of a clock's parameter."""
+    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
+    sigma = np.sqrt(np.einsum("cpcp->c", adjusted.covariance(part)))
+    return values * unit, sigma * unit
+
+
+def _place(rig: Rig, solution: Solution, told: Told, joint: Array, offset_ms: Array) -> Rig:
+    state, cameras = solution.adjusted.state, dict(rig.cameras)
+    for name in told.unplaced:
+        cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
+    for k, name in enumerate(told.names):
+        lens = state.lens(k, cameras[name])
+        cameras[name] = msgspec.structs.replace(
+            cameras[name],
+            fx=lens.fx,
+            fy=lens.fy,
+            cx=lens.cx,
+            cy=lens.cy,
+            distortion=lens.distortion,
+            T_world_cam=Pose.from_matrix(state.cameras[k]),
+            time_offset_ms=float(offset_ms[k]),
+            covariance=tuple(tuple(row) for row in joint[k, :, k].tolist()),
+        )
+    T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
+    return move(msgspec.structs.replace(rig, cameras=cameras), T_world)
+
+
+def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
+    adjusted, seen = solution.adjusted, solution.observations
+    lengths = measure_lengths(adjusted, seen)
+    return WandReport(
+        cameras=[_report_camera(told, k, seen, adjusted, joint[k, :, k]) for k in range(len(told.names))],
+        unplaced=told.unplaced,
+        instants=len(adjusted.problem.knot_s),
+        scale=adjusted.scale,
+        length_mean_mm=float(np.mean(lengths)) * 1e3 if len(lengths) else None,
+        length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
+        outliers=_outliers(told.names, seen, adjusted),
+        metric=told.metric,
+    )
+
+
+def _report_camera(told: Told, k: int, seen: Observations, adjusted: Adjusted, cov: Array) -> CameraReport:
+    mine = seen.camera == k
+    used = mine & adjusted.used
+    rms = float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())) if used.any() else float("nan")
+    return CameraReport(
+        name=told.names[k],
+        frames=told.frames[k],
+        frames_used=len(np.unique(seen.t_s[used])),
+        observations=int(used.sum()),
+        outliers=int((mine & ~adjusted.used).sum()),
+        residual_px=rms,
+        sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
+        left_out=dict(told.left_out[k]),
+    )
+
+
+def _outliers(names: list[str], seen: Observations, adjusted: Adjusted) -> list[Outlier]:
+    rows = np.flatnonzero(~adjusted.used)
+    far = np.linalg.norm(adjusted.residuals, axis=1)
+    return [
+        Outlier(names[seen.camera[row]], float(seen.t_s[row]), int(seen.label[row]), float(far[row]))
+        for row in rows[np.argsort(-far[rows])]
+    ]
+
+
+def measure_lengths(adjusted: Adjusted, seen: Observations) -> Array:
+    """What the cameras alone say of the wand's lengths, less what they are; metres.
+
+    Every marker of an instant moves, in one Gauss-Newton step that knows no length, to where its observations want it.
+    """
+    state, problem = adjusted.state, adjusted.problem
+    markers = np.einsum("mb,kbx->kmx", problem.wand.weights, state.motion[:, 0])
+    A, b = np.zeros((*markers.shape, 3)), np.zeros(markers.shape)
+    views = np.zeros((*markers.shape[:2], len(problem.lenses)))
+    for c, lens in enumerate(problem.lenses):
+        rows, T = np.flatnonzero((seen.camera == c) & adjusted.used), state.cameras[c]
+        k, m = seen.knot[rows], seen.label[rows]
+        local = (markers[k, m] - T[:3, 3]) @ T[:3, :3]
+        J = np.nan_to_num(state.lens(c, lens).project_with_jacobian(local)[1]) @ T[:3, :3].T
+        weight = np.linalg.inv(seen.cov[rows])
+        np.add.at(A, (k, m), np.swapaxes(J, 1, 2) @ weight @ J)
+        np.add.at(b, (k, m), np.einsum("nji,njk,nk->ni", J, weight, np.nan_to_num(adjusted.residuals[rows])))
+        views[k, m, c] = 1
+    fixed = views.sum(axis=2) >= 2
+    free = np.full(markers.shape, np.nan)
+    free[fixed] = markers[fixed] + np.linalg.solve(A[fixed], b[fixed][:, :, None])[:, :, 0]
+    ends = free[:, problem.wand.basis][:, problem.wand.pairs]
+    errors = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2) - problem.wand.lengths
+    return errors[np.isfinite(errors)]

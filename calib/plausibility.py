@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What an adjustment says against the files that it was given: lenses, names and the wand's measures."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjustment import Adjusted
+from calib.errors import CalibrationError
+from calib.linearisation import LENS, Linearisation, Observations
+from calib.sightings import ranges
+from camera_node.body import Body
+from camera_node.lens import Lens
+
+Array = NDArray[np.float64]
+
+FOCAL, CENTRE = 0.05, 0.04  # of the focal length and of the image: what no lens that was calibrated is off by
+AGREE = 0.6  # of a camera's sightings must fit the rig: gross errors are rarer
+SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
+SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
+
+
+def check_lenses(names: Sequence[str], lenses: Sequence[Lens], freed: Adjusted) -> None:
+    """Raise CalibrationError where lenses that were adjusted are other cameras', or far from those that were given."""
+    found = [freed.state.lens(k, lens) for k, lens in enumerate(lenses)]
+    cov = freed.covariance(LENS)
+    for a, b in combinations(range(len(names)), 2):
+        crossed = _apart(found[a], lenses[b], cov[a, :, a]), _apart(found[b], lenses[a], cov[b, :, b])
+        straight = _apart(found[a], lenses[a], cov[a, :, a]), _apart(found[b], lenses[b], cov[b, :, b])
+        if max(crossed) < SAME < min(straight):
+            raise CalibrationError(
+                f"cameras '{names[a]}' and '{names[b]}' seem to have each other's names: what each saw fits the "
+                "other's intrinsics; swap them in the rig file or in the recording"
+            )
+    for name, given, lens in zip(names, lenses, found, strict=True):
+        size = np.array([lens.width, lens.height])
+        shift = np.abs([lens.cx - given.cx, lens.cy - given.cy])
+        if abs(np.log(lens.fx / given.fx)) > FOCAL or (shift > CENTRE * size).any():
+            raise CalibrationError(
+                f"camera '{name}' has the wrong intrinsics: what it saw fits f = {lens.fx:.0f} px and a centre at "
+                f"({lens.cx:.0f}, {lens.cy:.0f}), its file says {given.fx:.0f} px and "
+                f"({given.cx:.0f}, {given.cy:.0f}); is its name right? "
+                f"else run python -m calib intrinsics --camera {name}"
+            )
+
+
+def _apart(found: Lens, given: Lens, cov: Array) -> float:
+    """Distance of two lenses in sigmas, root mean square of the adjusted parameters."""
+    k1 = [lens.distortion[0] if lens.distortion else 0.0 for lens in (found, given)]
+    focal = np.log(found.fx * found.fy / (given.fx * given.fy)) / 2
+    off = np.array([focal, found.cx - given.cx, found.cy - given.cy, k1[0] - k1[1]])
+    return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
+
+
+def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> None:
+    """Raise CalibrationError where much of what a camera saw fits nothing that the others saw."""
+    share = np.array([adjusted.used[seen.camera == k].mean() for k in range(len(names))])
+    if share.min() < AGREE:
+        name = names[int(share.argmin())]
+        raise CalibrationError(
+            f"only {share.min():.0%} of what camera '{name}' saw fits what the others saw: are its name and its "
+            f"intrinsics its own? else did it move? run python -m calib intrinsics --camera {name}, or leave it out"
+        )
+
+
+def check_sizes(wand: Body, adjusted: Adjusted, seen: Observations) -> None:
+    """Raise CalibrationError where the wand's lengths put roundels elsewhere than their sizes do."""
+    state, problem = adjusted.state, adjusted.problem
+    if len(problem.wand.lengths) == 0:
+        return
+    lenses = [state.lens(k, lens) for k, lens in enumerate(problem.lenses)]
+    points = Linearisation(problem, seen).positions(state)
+    far = np.linalg.norm(points - state.cameras[seen.camera, :3, 3], axis=1)
+    ratio = ranges(lenses, seen, wand.diameter_m) / far
+    known = np.isfinite(ratio) & adjusted.used
+    if not known.any() or abs(np.log(factor := float(np.median(ratio[known])))) < SIZE:
+        return
+    raise CalibrationError(
+        f"the wand's lengths and its roundels' sizes disagree by {abs(factor - 1):.0%}: by the lengths, the black disc "
+        f"is {wand.diameter_m / factor:.4f} m across, the wand file says {wand.diameter_m:.4f} m; measure both again"
+    )

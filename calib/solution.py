@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From a rough rig to the adjusted one: robustly on few moments, then exactly on more; clocks only where they tell."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjustment import Adjusted, adjust, find_robustly
+from calib.discs import centre_offsets
+from calib.errors import CalibrationError
+from calib.linearisation import DRIFT, LENS, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.plausibility import check_agreement, check_lenses, check_sizes
+from calib.trajectory import acceleration_density
+from calib.wave import Wave
+
+Array = NDArray[np.float64]
+
+FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
+NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
+# Of log f, cx, cy and k1: a recording that leaves more open fixes no lens.
+LENS_SIGMA = (0.005, 4.0, 4.0, 0.01)
+DRIFT_S = 2.0  # a recording must last to show clocks that drift
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The adjusted rig of a wave, and the observations it stands on, with discs' own centres."""
+
+    adjusted: Adjusted
+    observations: Observations
+
+
+def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution:
+    """Adjust from a rough start.
+
+    Args:
+        wave: the recording.
+        cameras: (C, 4, 4) T_world_cam; where nothing tells the scale, its two farthest cameras keep their distance.
+        offset_s: (C,) true time = stamp + offset.
+        metric: whether the start has the world's scale.
+
+    Raises:
+        CalibrationError: the wand's lengths fit nothing that was seen, or not its roundels' sizes; or a camera's lens
+            is not the one that was given.
+    """
+    if not metric:
+        cameras = cameras.copy()
+        cameras[:, :3, 3] /= _farthest(cameras)[2]
+    problem, state, observations = _around(wave, cameras, offset_s, FEW)
+    clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
+    problem = problem.freeing(POSE, *clocks)
+    state = find_robustly(problem, observations, state)
+    few = adjust(problem, _with_disc_centres(wave, problem, state, observations), state)
+    free = [part for part in clocks if _tells(few, part, wave.period_s)]
+    few = _with_lenses(few, wave, observations)
+    free += [LENS] if LENS[0] in few.problem.free else []
+    offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
+    drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
+    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
+    start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
+    density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
+    problem = replace(problem.freeing(POSE, *free), density=density)
+    observations = _with_disc_centres(wave, problem, start, observations)
+    adjusted = adjust(problem, observations, start)
+    check_agreement(wave.names, adjusted, observations)
+    if metric:
+        check_sizes(wave.wand, adjusted, observations)
+    return Solution(adjusted, observations)
+
+
+def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:
+    """The adjustment with lenses sought too, where the recording fixes every one of them well, and they are not those
+    that were given; else as it is.
+
+    Raises:
+        CalibrationError: a lens is another camera's, or far from what was given.
+    """
+    if any(lens.model != "pinhole" for lens in wave.lenses):
+        return few
+    problem = few.problem.freeing(few.problem.free, LENS)
+    freed = adjust(problem, _with_disc_centres(wave, problem, few.state, observations), few.state)
+    cov, values = freed.covariance(LENS), freed.state.lenses.ravel()
+    sigma = np.sqrt(np.einsum("cpcp->cp", cov))
+    squared = values @ np.linalg.solve(cov.reshape(len(values), -1), values)
+    if (sigma > LENS_SIGMA).any() or squared < len(values) * np.log(2 * freed.used.sum()):
+        return few
+    check_lenses(wave.names, problem.lenses, freed)
+    return freed
+
+
+def _around(wave: Wave, cameras: Array, offset_s: Array, budget: int) -> tuple[Problem, State, Observations]:
+    found = wave.pose_problem(cameras, offset_s, budget)
+    if found is None:
+        raise CalibrationError(
+            "the wand's lengths do not fit what the cameras saw: is the wand file right, "
+            "and are the intrinsics those of these cameras?"
+        )
+    problem, state, observations = found
+    if len(problem.wand.lengths) == 0:
+        problem = replace(problem, fixed_distance=_farthest(cameras))
+    return problem, state, observations
+
+
+def _farthest(cameras: Array) -> tuple[int, int, float]:
+    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
+    return int(a), int(b), float(gaps[a, b])
+
+
+def _with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observations) -> Observations:
+    points = Linearisation(problem, seen).positions(state)
+    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    return replace(
+        seen, uv=seen.uv - centre_offsets(lenses, state.cameras, seen, points, wave.wand.diameter_m / 2)
+    )
+
+
+def _tells(adjusted: Adjusted, part: tuple[int, ...], period_s: float) -> bool:
+    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, and by so
+    much that it matters."""
+    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
+    values = values - values.mean()
+    reach_s = 1.0 if part == OFFSET else np.ptp(adjusted.problem.knot_s) / 2
+    if np.abs(values).max() * reach_s < NEGLIGIBLE_S + NEGLIGIBLE * period_s:
+        return False
+    cov = adjusted.covariance(part)[:, 0, :, 0]
+    squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
+    return bool(squared > (len(values) - 1) * np.log(2 * adjusted.used.sum()))

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How well and how fast a wand places cameras: `python -m tests.benchmarks.calibration [ROW ...]`.
+
+Simulated waves (`tests.calib.wave`), and the real recordings of ../shared/data where they lie beside the checkout.
+Times are processor seconds, and in brackets as multiples of a Cholesky factorisation of 1500 x 1500 in the same run.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from calib.camera import Camera
+from calib.rig import Rig, load_rig
+from calib.wand import Calibration, calibrate
+from camera_node.body import Body
+from camera_node.messages import Detections
+from camera_node.observations import read_observations
+from tests.calib.synthetic import camera_errors, joint_error
+from tests.calib.wave import Recorded, Wave, record
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SQUARE_M = 0.054
+Row = tuple[str, str, str]
+T = TypeVar("T")
+
+
+def reference_s() -> float:
+    """Processor seconds of the unit in which times are also given."""
+    A = np.random.default_rng(0).standard_normal((1500, 1500))
+    A = A @ A.T + 1500 * np.eye(1500)
+    return min(timed(lambda: np.linalg.cholesky(A))[1] for _ in range(3))
+
+
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    """What `work` returns, and its processor seconds."""
+    start = time.process_time()
+    result = work()
+    return result, time.process_time() - start
+
+
+def simulated(wave: Wave, goal_s: float) -> tuple[list[Row], float]:
+    """Errors against the truth; offsets against their mean, as nothing observes what all clocks share."""
+    recorded = record(wave)
+    result, cost = timed(lambda: calibrate(recorded.intrinsics, wave.wand, recorded.messages))
+    placed = list(result.rig.placed())
+    shift, turn = camera_errors(result.rig, recorded.truth)
+    squared, degrees = joint_error(result, recorded.truth)
+    rows = [
+        ("cameras placed", f"{len(placed)}", f"{wave.cameras}"),
+        ("centres, mm RMS", f"{1e3 * np.sqrt((shift**2).mean()):.3f}", "<= 1"),
+        ("rotations, degrees RMS", f"{np.degrees(np.sqrt((turn**2).mean())):.4f}", "<= 0.02"),
+        ("time offsets, ms RMS", f"{offset_error(result, recorded):.3f}", "<= 0.3"),
+        ("squared Mahalanobis error", f"{squared:.0f}", f"{degrees} +- {np.sqrt(2 * degrees):.0f}"),
+        ("seconds", f"{cost:.2f}", f"<= {goal_s:g}"),
+    ]
+    return rows, cost
+
+
+def offset_error(result: Calibration, recorded: Recorded) -> float:
+    """RMS error of the time offsets, ms."""
+    cameras = result.rig.placed()
+    error = np.array(
+        [c.time_offset_ms - recorded.truth.cameras[n].time_offset_ms for n, c in cameras.items()]
+    )
+    return float(np.sqrt(((error - error.mean()) ** 2).mean()))
+
+
+def waved_led() -> tuple[list[Row], float]:
+    """A real light, one point a frame."""
+    rig, messages = recording(DATA / "waved_led" / "observations.csv")
+    result, cost = timed(lambda: calibrate(rig, Body(diameter_m=0.1), messages))
+    adjusted = result.adjusted
+    used = np.linalg.norm(adjusted.residuals[adjusted.used], axis=1)
+    rows = [
+        ("cameras placed", f"{len(result.rig.placed())}", "4"),
+        ("mean residual, px", f"{used.mean():.3f}", "<= 0.30"),
+        ("rejected", f"{(~adjusted.used).sum()} of {len(adjusted.used)}", ""),
+        ("seconds", f"{cost:.2f}", "<= 1"),
+    ]
+    return rows, cost
+
+
+def webcams_wand() -> tuple[list[Row], float]:
+    """Two corners of a real board as a wand; then all corners, triangulated, against the board."""
+    rig, messages = recording(DATA / "webcams" / "wand_observations.csv")
+    length = SQUARE_M * np.hypot(2, 3)
+    wand = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (float(length), 0.0, 0.0)))
+    result, cost = timed(lambda: calibrate(rig, wand, messages))
+    errors = corner_errors(result.rig, recording(DATA / "webcams" / "corners_observations.csv")[1])
+    rows = [
+        ("cameras placed", f"{len(result.rig.placed())}", "4"),
+        ("distances of held-out corners, mm RMS", f"{1e3 * np.sqrt((errors**2).mean()):.3f}", "<= 0.8"),
+        ("distances", f"{len(errors)}", ""),
+        ("seconds", f"{cost:.2f}", "<= 2"),
+    ]
+    return rows, cost
+
+
+def webcams_board() -> tuple[list[Row], float]:
+    """The same board, all its corners, as a wand of twelve markers."""
+    rig, messages = recording(DATA / "webcams" / "corners_observations.csv")
+    result, cost = timed(lambda: calibrate(rig, Body(diameter_m=0.05, markers=board_corners()), messages))
+    adjusted = result.adjusted
+    every, used = adjusted.residuals, adjusted.residuals[adjusted.used]
+    rows = [
+        ("cameras placed", f"{len(result.rig.placed())}", "4"),
+        ("residual, px RMS", f"{np.sqrt((used**2).sum(axis=1).mean()):.3f}", "<= 0.585"),
+        ("residual with rejected ones", f"{np.sqrt((every**2).sum(axis=1).mean()):.3f}", ""),
+        ("rejected", f"{(~adjusted.used).sum()} of {len(adjusted.used)}", ""),
+        ("seconds", f"{cost:.2f}", ""),
+    ]
+    return rows, cost
+
+
+def board_corners() -> tuple[tuple[float, float, float], ...]:
+    """The twelve inner corners, metres."""
+    return tuple(((k % 3 + 1) * SQUARE_M, (k // 3 + 1) * SQUARE_M, 0.0) for k in range(12))
+
+
+def recording(path: Path) -> tuple[Rig, list[Detections]]:
+    """Lenses and observations; `FileNotFoundError` where they are not beside the checkout."""
+    if not path.exists():
+        raise FileNotFoundError(path)
+    rig = load_rig(path.parent / "cameras.yaml")
+    return rig, read_observations(path, {n: (c.width, c.height) for n, c in rig.cameras.items()})
+
+
+def corner_errors(rig: Rig, messages: list[Detections], step_s: float = 0.17) -> NDArray[np.float64]:
+    """Distances between corners that were triangulated at the same moment, less what they are; metres.
+
+    Moments are the frames of every camera, once in `step_s`; the other cameras' corners are interpolated between two
+    frames, each at its own corrected time.
+    """
+    tracks = {name: _tracks(camera, name, messages) for name, camera in rig.placed().items()}
+    times = np.unique(np.concatenate([t for track in tracks.values() for t, _ in track.values()]))
+    moments = times[np.diff(times // step_s, prepend=-1) > 0]
+    board, errors = np.array(board_corners()), []
+    for moment in moments:
+        found = {
+            corner: point
+            for corner in range(12)
+            if (point := _triangulate(rig, tracks, corner, moment, 2 * step_s)) is not None
+        }
+        errors += [
+            np.linalg.norm(found[a] - found[b]) - np.linalg.norm(board[a] - board[b])
+            for a, b in combinations(found, 2)
+        ]
+    return np.array(errors)
+
+
+def _tracks(camera: Camera, name: str, messages: list[Detections]):
+    rows: dict[int, list[tuple[float, float, float]]] = {}
+    for message in messages:
+        if message.camera == name:
+            seen = message.unpack()
+            for corner, uv in zip(seen.id.tolist(), seen.uv, strict=True):
+                rows.setdefault(corner, []).append(
+                    (message.t_ns * 1e-9 + camera.time_offset_ms * 1e-3, *uv.tolist())
+                )
+    tables = {corner: np.array(sorted(table)) for corner, table in rows.items()}
+    return {corner: (table[:, 0], camera.normalise(table[:, 1:])) for corner, table in tables.items()}
+
+
+def _triangulate(rig: Rig, tracks, corner: int, moment: float, gap_s: float) -> NDArray[np.float64] | None:
+    centres, rays = [], []
+    for name, track in tracks.items():
+        if corner not in track:
+            continue
+        t, xy = track[corner]
+        k = int(np.searchsorted(t, moment, side="right"))
+        if not 0 < k < len(t) or t[k] - t[k - 1] > gap_s:
+            continue
+        share = (moment - t[k - 1]) / (t[k] - t[k - 1])
+        T = rig.cameras[name].matrix()
+        centres.append(T[:3, 3])
+        rays.append(T[:3, :3] @ np.append((1 - share) * xy[k - 1] + share * xy[k], 1.0))
+    return _intersect(np.array(centres), np.array(rays)) if len(rays) >= 2 else None
+
+
+def _intersect(centres: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
+
+
+ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
+    "simulated-8": lambda: simulated(Wave(cameras=8), 5),
+    "simulated-16": lambda: simulated(Wave(cameras=16), 10),
+    "simulated-numbered": lambda: simulated(Wave(cameras=8, numbered=True, sized=False, seed=1), 5),
+    "waved-led": waved_led,
+    "webcams-wand": webcams_wand,
+    "webcams-board": webcams_board,
+}
+
+
+def main(names: list[str]) -> None:
+    """Print what was measured beside its goal."""
+    console, unit = Console(), reference_s()
+    table = Table("what", "figure", "measured", "goal")
+    for name in names or ROWS:
+        try:
+            rows, cost = ROWS[name]()
+        except FileNotFoundError as missing:
+            console.print(f"{name}: {missing} is absent")
+            continue
+        for figure, measured, goal in rows:
+            told = f"{measured} ({cost / unit:.0f})" if figure == "seconds" else measured
+            table.add_row(name, figure, told, goal)
+        table.add_section()
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
