@@ -6,7 +6,7 @@ of one camera between two knots become one HessianFactor on (knot, next knot, ca
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ SPEED_SIGMA = 3.0  # metres per second: a waving hand
 STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
 # Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
+OF_KNOTS = (0, 1, 3, 4, 6)  # G11, G12, g1, G22, g2 of a factor on two knots and a camera
 FIXED = 1e-6  # to which a distance that carries the scale is kept
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
@@ -124,6 +125,7 @@ class Problem:
         middle_s: the stamp to which time offsets refer.
         free: which of a camera's 12 parameters are sought.
         fixed_distance: two cameras and their distance, where no wand length carries the scale.
+        sought: the cameras that are sought; the others stand where they stand. All, unless given.
     """
 
     lenses: list[Lens]
@@ -134,6 +136,11 @@ class Problem:
     middle_s: float
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
+    sought: tuple[int, ...] | None = None
+
+    def cameras(self) -> tuple[int, ...]:
+        """The cameras that are sought."""
+        return tuple(range(len(self.lenses))) if self.sought is None else self.sought
 
     def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
         """The same with other parameters sought."""
@@ -344,56 +351,75 @@ class Linearisation:
         """GTSAM's graph: keys are the K knots, then the cameras."""
         import gtsam
 
-        factor: Any = gtsam.JacobianFactor
+        factor, hessian = cast(Any, gtsam.JacobianFactor), cast(Any, gtsam.HessianFactor)
         half, d = 6 * len(self.problem.wand.basis), len(self.problem.free)
         count, graph = len(self.problem.knot_s), gtsam.GaussianFactorGraph()
         a, b, c = slice(0, half), slice(half, 2 * half), slice(2 * half, 2 * half + d)
         links, cameras = np.divmod(self.views, len(self.problem.lenses))
-        for k, camera, H in zip(links.tolist(), cameras.tolist(), _damped(self.blocks, damping), strict=True):
-            upper = (H[a, a], H[a, b], H[a, c], H[a, -1], H[b, b], H[b, c], H[b, -1], H[c, c], H[c, -1])
-            graph.add(gtsam.HessianFactor(k, k + 1, count + camera, *upper, 0.0))
-        for k, H in enumerate(_damped(self.chain, damping)):
-            graph.add(gtsam.HessianFactor(k, k + 1, H[a, a], H[a, b], H[a, -1], H[b, b], H[b, -1], 0.0))
+        parts = _split(_damped(self.blocks, damping), [a, b, c])
+        sought = set(self.problem.cameras())
+        for k, camera, *upper in zip(links.tolist(), cameras.tolist(), *parts, strict=True):
+            if camera in sought:
+                graph.push_back(hessian(k, k + 1, count + camera, *upper, 0.0))
+            else:
+                graph.push_back(hessian(k, k + 1, *(upper[j] for j in OF_KNOTS), 0.0))
+        for k, upper in enumerate(zip(*_split(_damped(self.chain, damping), [a, b]), strict=True)):
+            graph.push_back(hessian(k, k + 1, *upper, 0.0))
         for keys, J, error in self.rig:
+            if not sought.issuperset(keys):
+                continue
             unit = gtsam.noiseModel.Unit.Create(len(error))
             blocks: list[Any] = [
                 part for key, block in zip(keys, J, strict=True) for part in (count + key, block)
             ]
-            graph.add(factor(*blocks, error, unit))
+            graph.push_back(factor(*blocks, error, unit))
         return graph
 
-    def _ordering(self, first: int, last: int) -> Any:
+    def _ordering(self, knots: bool, cameras: bool) -> Any:
         import gtsam
 
-        ordering = gtsam.Ordering()
-        for key in range(first, last):
+        ordering, count = gtsam.Ordering(), len(self.problem.knot_s)
+        for key in range(count if knots else 0):
             ordering.push_back(key)
+        for camera in self.problem.cameras() if cameras else ():
+            ordering.push_back(count + camera)
         return ordering
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """Levenberg-Marquardt's step: (C, 12) of cameras and (K, 6 B) of the motion. The first camera and its clock
-        stay, as nothing observes the world and the time that all share.
+        """Levenberg-Marquardt's step: (C, 12) of cameras and (K, 6 B) of the motion. Where all cameras are sought, the
+        first and its clock stay, as nothing observes the world and the time that all share.
 
         Raises:
             RuntimeError: the system is too near to singular; more damping helps.
         """
         import gtsam
 
-        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
-        free = list(self.problem.free)
-        graph = self._graph(damping)
-        graph.add(gtsam.HessianFactor(count, np.diag(ANCHOR[free]), 0 * ANCHOR[free], 0.0))
-        step = graph.optimize(self._ordering(0, total))
-        by = np.zeros((total - count, PER_CAMERA))
-        by[:, free] = [step.at(key) for key in range(count, total)]
+        count, free, graph = len(self.problem.knot_s), list(self.problem.free), self._graph(damping)
+        if self.problem.sought is None:
+            graph.push_back(gtsam.HessianFactor(count, np.diag(ANCHOR[free]), 0 * ANCHOR[free], 0.0))
+        step = graph.optimize(self._ordering(True, True))
+        by = np.zeros((len(self.problem.lenses), PER_CAMERA))
+        for camera in self.problem.cameras():
+            by[camera, free] = step.at(count + camera)
         return by, np.array([step.at(key) for key in range(count)])
 
     def camera_information(self, state: State) -> Array:
-        """(C d, C d) information of the cameras' free parameters with the motion eliminated (Schur complement)."""
+        """(S d, S d) information of the S sought cameras' free parameters with the motion eliminated (Schur
+        complement)."""
         self.relinearise(state, np.ones(len(self.observations)), np.ones(len(self.smooth)))
-        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
-        rest = self._graph(0.0).eliminatePartialMultifrontal(self._ordering(0, count))[1]
-        return np.asarray(rest.hessian(self._ordering(count, total))[0])
+        rest = self._graph(0.0).eliminatePartialMultifrontal(self._ordering(True, False))[1]
+        return np.asarray(rest.hessian(self._ordering(False, True))[0])
+
+
+def _split(blocks: Array, parts: list[slice]) -> list[Array]:
+    """The upper triangle of augmented Hessians (n, m, m) as GTSAM takes it, block by block, by columns as Eigen has
+    them: G11, G12, .., g1, G22, .., g2, .."""
+    found = []
+    for k, rows in enumerate(parts):
+        for columns in parts[k:]:
+            found.append(np.swapaxes(np.ascontiguousarray(np.swapaxes(blocks[:, rows, columns], 1, 2)), 1, 2))
+        found.append(np.ascontiguousarray(blocks[:, rows, -1]))
+    return found
 
 
 def _damped(blocks: Array, damping: float) -> Array:
