@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.linearisation import Linearisation, Observations, Problem, State, unobserved
+from calib.elimination import camera_information, solve
+from calib.linearisation import Linearisation
+from calib.problem import Observations, Problem, State, unobserved
 
 Array = NDArray[np.float64]
 
@@ -99,7 +101,7 @@ def adjust(problem: Problem, observations: Observations, start: State) -> Adjust
     kept = Linearisation(problem, observations.select(used), broken)
     kept.weigh(state)
     scale = _variance_factor(kept, state)
-    information = kept.camera_information(state) / scale**2
+    information = camera_information(kept, state) / scale**2
     return Adjusted(problem, state, used, every.residuals(state), scale, information, rounds)
 
 
@@ -130,7 +132,7 @@ def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[
         linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2), 1 / (1 + (strain / slack) ** 2))
         while True:
             try:
-                trial = state.moved(*linearisation.solve(damping))
+                trial = state.moved(*solve(linearisation, damping))
                 if (after := linearisation.cost(trial, scale, slack)) <= before:
                     break
             except RuntimeError:  # GTSAM's word for a system too near to singular

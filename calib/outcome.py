@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
-from calib.linearisation import DRIFT, OFFSET, POSE, Observations
+from calib.problem import DRIFT, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
 from calib.rig import Rig
 from calib.solution import Solution

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.errors import CalibrationError
-from calib.linearisation import OFFSET, POSE, Observations
 from calib.outcome import clock_values
 from calib.pairwise import Pairs
 from calib.plausibility import check_agreement
+from calib.problem import OFFSET, POSE, Observations
 from calib.rig import Rig
 from calib.solution import with_disc_centres
 from calib.wand import check_recording, gather_wave, read

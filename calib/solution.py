@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
-from calib.linearisation import DRIFT, LENS, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.linearisation import Linearisation
 from calib.plausibility import check_agreement, check_lenses, check_sizes
+from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
