@@ -148,7 +148,7 @@ def _gather(
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            frames.append(Frame.of(message, camera.time_offset_ms))
+            frames.append(Frame.of(message, camera))
     for frame in sorted(frames, key=lambda frame: frame.t_ns):
         instants.add(frame)
         yield from instants.take(frame.t_ns)

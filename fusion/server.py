@@ -140,7 +140,7 @@ class Server:
         elif (message.width, message.height) != (camera.width, camera.height):
             self.health.count("wrong image size")
         else:
-            frame = Frame.of(message, camera.time_offset_ms, received_ns)
+            frame = Frame.of(message, camera, received_ns)
             self.health.noted(message.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:

@@ -162,7 +162,7 @@ def test_detections_without_axes_are_enough(run_arena):
     for frame in arena.frames(20):
         roundels = frame.roundels
         bare = type(roundels).from_points(roundels.uv, 0.3)
-        frames.append(Frame(frame.camera, frame.t_ns, bare))
+        frames.append(Frame.measure(frame.camera, frame.t_ns, bare, arena.cameras[frame.camera]))
     fused = fuse(arena, frames)
     tracked = [pose for instant in fused for pose in instant.poses]
     assert len(tracked) >= 17
