@@ -4,7 +4,7 @@
 1. Two rays of two frames are a candidate where they meet, before both cameras, at a range that suits both sizes.
 2. A ray's candidates lie along it: the true ones agree about the range, the false ones scatter. The densest range wins.
 3. Rays whose points are within half a disc are one marker: discs can't overlap. In every frame the nearest stays.
-4. A ray that is left joins the marker that it meets, where that has none of its frame.
+4. A ray that is left, or was too near another of its frame, joins the marker that it clearly meets.
 
 So one grouping comes out over all cameras, in which no detection is of two markers. A ray that meets two markers alike
 well joins neither. Free-running cameras see a moving marker at different places: gates widen with the time between.
@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 
 from fusion.optics import Optics
 from fusion.sightings import Sightings
+from fusion.state import skew
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -82,15 +83,14 @@ def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -
     """
     rows = rows[np.isfinite(sightings.xy[0, rows])]
     rays = _cast(optics, sightings, rows)
-    rays_met, points = _agree(rays, _meet(rays, diameters))
+    met, points = _agree(rays, _meet(rays, diameters))
     if not len(points):
         return []
-    owner = np.full(len(rows), -1)
-    owner[rays_met] = _cluster(points, np.min(diameters) / 2)
+    owner, centres = _cluster(rays, met, points, np.min(diameters) / 2)
     for _ in range(2):
-        owner, centres = _settle(rays, owner)
-        owner = _join(rays, owner, centres)
-    owner, centres = _settle(rays, owner)
+        owner, centres = _settle(rays, owner, centres)
+    owner, centres = _settle(rays, np.where(_crowded(rays), -1, owner), centres)
+    owner = _join(rays, owner, centres)
     return _markers(rays, owner, centres, rows)
 
 
@@ -111,11 +111,13 @@ def _meet(rays: _Rays, diameters: Array) -> _Meetings:
     wi, wj = np.einsum("ni,ni->n", w, rays.d[i]), np.einsum("ni,ni->n", w, rays.d[j])
     parallax = np.maximum(1 - b * b, 1e-12)
     s, t = (b * wj - wi) / parallax, (wj - b * wi) / parallax
-    miss = np.sqrt(np.maximum(np.einsum("ni,ni->n", w, w) + s * wi - t * wj, 0))
+    fits = (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
+    fits &= _fits(rays.size[i] * s, diameters) & _fits(rays.size[j] * t, diameters)
+    i, j, s, t, parallax = i[fits], j[fits], s[fits], t[fits], parallax[fits]
+    between = w[fits] + s[:, None] * rays.d[i] - t[:, None] * rays.d[j]
     reach = SIGMAS * np.hypot(rays.sigma[i] * s, rays.sigma[j] * t)
     reach += SPEED_M_S * np.abs(rays.tau[i] - rays.tau[j])
-    meets = (miss < reach) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
-    meets &= _fits(rays.size[i] * s, diameters) & _fits(rays.size[j] * t, diameters)
+    meets = np.einsum("ni,ni->n", between, between) < reach**2
     i, j, s, t = i[meets], j[meets], s[meets], t[meets]
     along = (reach / np.sqrt(parallax))[meets]
     return _Meetings(np.concatenate([i, j]), np.concatenate([s, t]), np.concatenate([along, along]))
@@ -133,24 +135,23 @@ def _pairs(rays: _Rays, diameters: Array) -> tuple[Index, Index]:
     near = [
         _near_pairs(rays, a, b, farthest)
         for a, b in combinations(parts, 2)
-        if len(a) and len(b) and rays.camera[a[0]] != rays.camera[b[0]]
+        if rays.camera[a[0]] != rays.camera[b[0]]
     ]
     i, j = (np.concatenate([np.empty(0, np.intp), *(pair[k] for pair in near)]) for k in (0, 1))
     return i, j
 
 
 def _near_pairs(rays: _Rays, a: Index, b: Index, farthest: Array) -> tuple[Index, Index]:
-    """Rays of two frames that pass each other as near as noise at their farthest range explains.
+    """Rays of two frames that pass each other as near as noise at their farthest range explains, at the least.
 
-    With w from one centre to the other the distance is |w (d_a x d_b)| / |d_a x d_b|: two matrix products.
+    With w from one centre to the other their distance is |w (d_a x d_b)| / |d_a x d_b|: a matrix product.
     """
     w = rays.o[a[0]] - rays.o[b[0]]
-    volume = np.cross(w, rays.d[a]) @ rays.d[b].T
-    cosine = rays.d[a] @ rays.d[b].T
-    reach_a, reach_b = SIGMAS * rays.sigma[a] * farthest[a], SIGMAS * rays.sigma[b] * farthest[b]
-    moved = SPEED_M_S * abs(rays.tau[a[0]] - rays.tau[b[0]])
-    reach = np.add.outer(reach_a + moved, reach_b)
-    i, j = np.nonzero(volume**2 < reach**2 * (1 - cosine**2))
+    reach = SIGMAS * rays.sigma[a] * farthest[a] + np.max(SIGMAS * rays.sigma[b] * farthest[b])
+    reach += SPEED_M_S * abs(rays.tau[a[0]] - rays.tau[b[0]])
+    d_a, d_b = rays.d[a].astype(np.float32), rays.d[b].T.astype(np.float32)
+    plane = d_a @ (skew(w).T.astype(np.float32)) / reach[:, None].astype(np.float32)
+    i, j = np.nonzero((plane @ d_b) ** 2 + (d_a @ d_b) ** 2 < 1)
     return a[i], b[j]
 
 
@@ -167,65 +168,80 @@ def _agree(rays: _Rays, met: _Meetings) -> tuple[Index, Array]:
     first, last = np.searchsorted(key, key - reach), np.searchsorted(key, key + reach)
     total = np.concatenate([[0.0], np.cumsum(range_m)])
     weight = (last - first) - reach / (1 + reach)  # among equals, what is known best
-    best = np.lexsort((-weight, ray))
-    best = best[np.concatenate([[True], np.diff(ray[best]) > 0])] if len(best) else best
+    if not len(ray):
+        return ray, np.empty((0, 3))
+    begin = np.flatnonzero(np.diff(ray, prepend=-1))
+    highest = np.maximum.reduceat(weight, begin)
+    best = np.flatnonzero(weight == np.repeat(highest, np.diff(begin, append=len(ray))))
+    best = best[np.diff(ray[best], prepend=-1) > 0]
     mean = (total[last] - total[first])[best] / (last - first)[best]
     return ray[best], rays.o[ray[best]] + mean[:, None] * rays.d[ray[best]]
 
 
-def _cluster(points: Array, radius: float) -> Index:
-    """(K,) numbers from 0: points that a chain of steps shorter than `radius` joins have the same."""
+def _cluster(rays: _Rays, met: Index, points: Array, radius: float) -> tuple[Index, Array]:
+    """Owners (N,) and their centres: points that a chain of steps shorter than `radius` joins are of one marker."""
     pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    return connected_components(graph, directed=False)[1]
+    number = connected_components(graph, directed=False)[1]
+    owner = np.full(len(rays.o), -1)
+    owner[met] = number
+    sums = np.column_stack([np.bincount(number, points[:, k]) for k in range(3)])
+    return owner, sums / np.bincount(number)[:, None]
 
 
-def _settle(rays: _Rays, owner: Index) -> tuple[Index, Array]:
-    """Owners, and the centres (K, 3) that their rays are nearest to, with rays that miss theirs set free.
+def _settle(rays: _Rays, owner: Index, centres: Array) -> tuple[Index, Array]:
+    """Owners without rays that miss their centre, or that are not the nearest of their frame; and better centres.
 
     Groups that fewer than two cameras see are dissolved; the rest are counted from 0.
     """
-    for _ in range(2):
-        owner, centres = _number(rays, owner), _triangulate(rays, _number(rays, owner))[0]
-        held = np.flatnonzero(owner >= 0)
-        miss = _miss(rays, held, centres[owner[held]])
-        order = held[np.lexsort((miss, rays.frame[held], owner[held]))]
-        again = np.zeros(len(owner), bool)
-        again[order[1:]] = (np.diff(owner[order]) == 0) & (np.diff(rays.frame[order]) == 0)
-        owner = owner.copy()
-        owner[held[~(miss < 1)]] = -1
-        owner[again] = -1
-    owner = _number(rays, owner)
-    return owner, _triangulate(rays, owner)[0]
+    held = np.flatnonzero(owner >= 0)
+    miss = _miss(rays, held, centres[owner[held]])
+    order = np.lexsort((miss, rays.frame[held], owner[held]))
+    order = order[miss[order] < 1]
+    rank = owner[held[order]] * (int(rays.frame.max()) + 1) + rays.frame[held[order]]
+    first = held[order[np.concatenate([[True], np.diff(rank) > 0])]] if len(order) else order
+    kept = np.full(len(owner), -1)
+    kept[first] = owner[first]
+    number = _number(rays, kept, len(centres))
+    kept[first] = number[kept[first]]
+    return kept, _triangulate(rays, kept, centres[number >= 0])[0]
 
 
-def _number(rays: _Rays, owner: Index) -> Index:
-    """The groups that two cameras see, counted from 0; -1 for the rest."""
+def _number(rays: _Rays, owner: Index, n: int) -> Index:
+    """(n,) numbers from 0 of the groups that two cameras see, -1 for the rest."""
     held = owner >= 0
-    n, n_cameras = int(owner.max(initial=-1)) + 1, int(rays.camera.max(initial=0)) + 1
-    seen = np.zeros((n, n_cameras), bool)
+    seen = np.zeros((n, int(rays.camera.max(initial=0)) + 1), bool)
     seen[owner[held], rays.camera[held]] = True
     kept = seen.sum(1) >= 2
-    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-    return number[owner]
+    return np.where(kept, np.cumsum(kept) - 1, -1)
 
 
-def _triangulate(rays: _Rays, owner: Index) -> tuple[Array, Array]:
-    """(K, 3) points of least squared distance to their rays, weighed by noise and motion, and covariances (K, 3, 3)."""
+def _crowded(rays: _Rays) -> NDArray[np.bool_]:
+    """(N,) rays so near another of their frame that noise may have exchanged them."""
+    reach = 2 * SIGMAS * rays.sigma
+    near = KDTree(rays.d + rays.frame[:, None] * 10.0).query_pairs(float(reach.max()), output_type="ndarray")
+    apart = np.linalg.norm(rays.d[near[:, 0]] - rays.d[near[:, 1]], axis=1)
+    crowded = np.zeros(len(rays.d), bool)
+    crowded[near[apart < reach[near[:, 0]]]] = True
+    return crowded
+
+
+def _triangulate(rays: _Rays, owner: Index, near: Array) -> tuple[Array, Array]:
+    """(K, 3) points of least squared distance to their rays, and covariances (K, 3, 3).
+
+    Rays are weighed by noise, at their ranges to `near` (K, 3), and by motion.
+    """
     held = np.flatnonzero(owner >= 0)
-    k, n = owner[held], int(owner.max(initial=-1)) + 1
-    d, o = rays.d[held], rays.o[held]
-    centres, _ = _meeting_points(o, d, np.ones(len(held)), k, n)
-    range_m = np.einsum("ni,ni->n", centres[k] - o, d)
+    k, n, o, d = owner[held], len(near), rays.o[held], rays.d[held]
+    range_m = np.einsum("ni,ni->n", near[k] - o, d)
     moved = SPEED_M_S / SIGMAS * np.abs(rays.tau[held])
-    return _meeting_points(o, d, 1 / ((rays.sigma[held] * range_m) ** 2 + moved**2), k, n)
-
-
-def _meeting_points(o: Array, d: Array, weight: Array, k: Index, n: int) -> tuple[Array, Array]:
-    """(n, 3) points of least squared distance to rays, of which each has a weight and the number k of its point."""
-    across = weight[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None])
+    weight = 1 / ((rays.sigma[held] * range_m) ** 2 + moved**2)
+    across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
     sums = np.zeros((n, 3, 4))
-    np.add.at(sums, k, np.concatenate([across, across @ o[:, :, None]], 2))
+    for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        sums[:, row, column] = sums[:, column, row] = np.bincount(k, across[row, column], n)
+    for row, side in enumerate(np.einsum("ijn,nj->in", across, o)):
+        sums[:, row, 3] = np.bincount(k, side, n)
     covariance = np.asarray(np.linalg.inv(sums[:, :, :3] + 1e-9 * np.eye(3)), float)
     return np.einsum("nij,nj->ni", covariance, sums[:, :, 3]), covariance
 
@@ -257,7 +273,7 @@ def _join(rays: _Rays, owner: Index, centres: Array) -> Index:
 
 
 def _markers(rays: _Rays, owner: Index, centres: Array, rows: Index) -> list[Marker]:
-    centres, covariance = _triangulate(rays, owner)
+    centres, covariance = _triangulate(rays, owner, centres)
     held = np.flatnonzero(owner >= 0)
     sizes = rays.size[held] * np.linalg.norm(centres[owner[held]] - rays.o[held], axis=1)
     order = np.argsort(owner[held], kind="stable")

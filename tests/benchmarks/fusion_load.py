@@ -116,6 +116,11 @@ class Paths:
     heading: np.ndarray
     height: np.ndarray
 
+    def place(self, p: np.ndarray) -> None:
+        """Stand still at p (N, 3)."""
+        self.centre[:], self.size[:], self.rate[:], self.turn[:] = p[:, :2], 0, 0, 0
+        self.height[:] = p[:, 2]
+
     def at(self, t_s: float) -> States:
         """The robots as they truly are at a time, with covariances of nothing."""
         n, angle = len(self.turn), self.rate * t_s + self.phase
