@@ -69,10 +69,12 @@ def _spread(
     C0, C1, C2 = (C.transpose(1, 2, 0)[:, :, None] for C in (C0, C1, C2))
     tau, R = sightings.exposures.tau[:, None], optics.R_cam_world[sightings.exposures.camera]
     C = C0 + tau * (C1 + C1.transpose(1, 0, 2, 3)) + tau**2 * C2
-    xy, z = views.xy.reshape(2, len(tau), -1), views.centre[2].reshape(len(tau), -1)
-    g = (R[:, :2, :, None].transpose(1, 2, 0, 3) - xy[:, None] * R[:, 2, :, None].transpose(1, 0, 2)) / z
-    S = np.einsum("aifm,bifm->abfm", np.einsum("aifm,ijfm->ajfm", g, C), g)
-    return S.reshape(2, 2, -1)
+    R = (
+        np.repeat(R[:, :2, :].transpose(1, 2, 0), len(markers), axis=2),
+        np.repeat(R[:, 2].T, len(markers), axis=1),
+    )
+    g = (R[0] - views.xy[:, None] * R[1]) / views.centre[2]
+    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C.reshape(3, 3, -1)), g)
 
 
 def _lever(R: Array, v: Array) -> Array:

@@ -175,7 +175,7 @@ class Estimator:
         displaced = np.einsum("nij,nj->ni", prior, delta[seen])
         weights = np.ones(system.shape) if weights is None else weights
         H, right = system.normal_equations(weights)
-        step = _eliminate(prior + H, right - displaced)
+        step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]  # for the weights only
         weights = _weights(system.remainder(step))
         H, right = system.normal_equations(weights)
         step = _eliminate(prior + H, right - displaced)
@@ -258,7 +258,10 @@ def shears(measured: Array, expected: Array) -> Array:
 
     The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
     """
-    whiten = np.linalg.inv(np.linalg.cholesky(expected))
-    S = whiten @ measured @ whiten.transpose(0, 2, 1)
-    size = np.trace(S, axis1=1, axis2=2) / 2
-    return np.stack([S[:, 0, 0] - S[:, 1, 1], 2 * S[:, 0, 1]]) / np.sqrt(2) / size
+    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
+    l10 = expected[:, 1, 0] / l00
+    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
+    a = measured[:, 0, 0] / l00**2
+    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
+    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
+    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))

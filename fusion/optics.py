@@ -107,15 +107,20 @@ class Optics:
 
     def pose(self, states: States, exposures: Exposures) -> Poses:
         """Bodies at each frame's own time."""
-        tau, camera = exposures.tau[:, None], exposures.camera
-        p, v, omega, R = states.p.T, states.v.T, states.omega.T, states.R.transpose(1, 2, 0)
-        R_cw = self.R_cam_world[camera]
+        tau, R_cw, B = exposures.tau[:, None], self.R_cam_world[exposures.camera], len(states)
+        R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
         turn = turns(omega[:, None] * tau)  # (3, 3, F, B)
-        R_world = np.einsum("ikfb,kjb->ijfb", turn, R)
-        R_cam = np.einsum("fik,kjfb->ijfb", R_cw, R_world)
-        to = p[:, None] + v[:, None] * tau - self.centres[camera].T[:, :, None]
-        t_cam = np.einsum("fik,kfb->ifb", R_cw, to)
-        return Poses(len(states), *(A.reshape(*A.shape[:-2], -1) for A in (R_cam, t_cam, R_world)))
+        R_world = sum(turn[:, k, None] * R[k, :, None] for k in range(3))
+        to = states.p.T[:, None] + v[:, None] * tau - self.centres[exposures.camera].T[:, :, None]
+        # The cameras' rotations by one product each: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
+        R_cam = R_cw @ R_world.transpose(2, 0, 1, 3).reshape(-1, 3, 3 * B)
+        t_cam = R_cw @ to.transpose(1, 0, 2)
+        return Poses(
+            B,
+            R_cam.reshape(-1, 3, 3, B).transpose(1, 2, 0, 3).reshape(3, 3, -1),
+            t_cam.transpose(1, 0, 2).reshape(3, -1),
+            R_world.reshape(3, 3, -1),
+        )
 
     def view(self, poses: Poses, discs: Discs) -> Views:
         """See `Views`."""
