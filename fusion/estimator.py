@@ -28,6 +28,7 @@ NOMINAL_WEIGHT = (
 ITERATIONS = 8  # at the most
 SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
 STEP = 1e-4  # rad, of the difference quotient of an outline's shape
+STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more than noise does
 
 
@@ -146,6 +147,7 @@ class Estimator:
         seen = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
         if not len(seen):
             return states, np.empty((2, 0))
+        observations = self._loosened(states, observations)
         prior, shaped = np.asarray(np.linalg.inv(states.P[seen]), float), _shaped(observations)
         solve = partial(self._solve, states, observations, shaped, seen, prior)
         solution = solve(np.zeros((n, 12)), None)
@@ -186,6 +188,25 @@ class Estimator:
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the robots."""
         return Estimator(self.optics, self.densities[rows], self.single[rows])
+
+    def _loosened(self, states: States, observations: Observations) -> Observations:
+        """Late detections, their noise grown by what the body may have done since.
+
+        Within `STEADY_S` of the instant a velocity is taken as constant; over longer times white acceleration of
+        density q moves a marker by q tau^3 / 3.
+        """
+        tau = np.abs(observations.seen.tau)
+        if not (tau > STEADY_S).any():
+            return observations
+        late = np.maximum(tau - STEADY_S, 0)
+        q_turn, q = self.densities[observations.discs.body].T
+        arm2 = np.einsum("in,in->n", observations.discs.marker, observations.discs.marker)
+        poses = self.optics.pose(states, observations.seen.exposures)
+        z = self.optics.view(poses, observations.discs).centre[2]
+        scale = observations.seen.scale
+        moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_turn * arm2) * late**3 / 3 / z**2)
+        seen = replace(observations.seen, cov=observations.seen.cov + moved)
+        return Observations.seeing(seen, observations.discs)
 
     def _linearise(self, states: States, observations: Observations, shaped: Index) -> _Rows:
         """Rows of the observations in their order, then rows of the outlines `shaped`."""

@@ -36,13 +36,21 @@ class Frame:
     scale: Array
     sent_ns: int = 0
     received_ns: int = 0
+    exposure_us: float = 0.0
+    detect_us: float = 0.0
 
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "Frame":
         """The frame that a message of a calibrated camera tells of."""
         t_ns = message.t_ns + round(camera.time_offset_ms * 1e6)
         measured = cls.measure(message.camera, t_ns, message.unpack(), camera)
-        return replace(measured, sent_ns=message.sent_ns, received_ns=received_ns)
+        return replace(
+            measured,
+            sent_ns=message.sent_ns,
+            received_ns=received_ns,
+            exposure_us=message.exposure_us,
+            detect_us=message.detect_us,
+        )
 
     @classmethod
     def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":

@@ -18,7 +18,9 @@ State = Literal["tracked", "coasting", "lost"]
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
     """Where the time went, from the newest exposure's middle to the pose's publication, milliseconds."""
 
-    camera_ms: float  # middle of the exposure until the message was sent: read-out and detection
+    exposure_ms: float = 0.0  # middle of the exposure until its end; 0 where unknown
+    detect_ms: float = 0.0  # from the frame in memory to the roundels
+    camera_ms: float  # middle of the exposure until the message was sent: both of these, and read-out
     network_ms: float  # until the server had it
     wait_ms: float  # until the instant was complete
     fuse_ms: float  # association and estimation

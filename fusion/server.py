@@ -202,6 +202,8 @@ def _latency(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
         return None
     sent_ns = newest.sent_ns or newest.received_ns
     return Latency(
+        exposure_ms=newest.exposure_us / 2e3,
+        detect_ms=newest.detect_us * 1e-3,
         camera_ms=(sent_ns - newest.t_ns) * 1e-6,
         network_ms=(newest.received_ns - sent_ns) * 1e-6,
         wait_ms=(begun_ns - newest.received_ns) * 1e-6,

@@ -28,6 +28,9 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sigma_floor_px: float = 0.08  # added to the noise that detectors claim
     lost_after_s: float = 0.3  # without an observation
     lateness_ms: float = 150.0  # how long an instant waits for a camera: USB ones may be 100 ms behind
+    tracked_sigma_m: float = (
+        0.05  # a robot whose position is known worse is `coasting`, though a camera sees it
+    )
 
 
 class Tracker:
@@ -91,14 +94,16 @@ class Tracker:
         return matches.select(~wrong[observations.discs.body])
 
     def _note(self, t_ns: int, matches: Matches) -> None:
-        """Keep the states' names: tracked with observations, coasting for a while without, then lost."""
+        """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""
         seen = np.zeros(len(self.robots), bool)
         seen[self.catalogue.robot[matches.disc]] = True
         self._seen_ns[seen] = t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
+        worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
+        vague = worst > self.limits.tracked_sigma_m**2
         for k, status in enumerate(self.status):
             if seen[k]:
-                self.status[k] = "tracked"
+                self.status[k] = "coasting" if vague[k] else "tracked"
             elif status in ("tracked", "coasting"):
                 self.status[k] = "lost" if silent[k] else "coasting"
                 if silent[k]:

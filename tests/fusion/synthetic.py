@@ -83,6 +83,11 @@ class Arena:
             for k, f in enumerate(self.frames(n))
         ]
 
+    @staticmethod
+    def seconds(t_ns: int) -> float:
+        """Since the start."""
+        return (t_ns - START_NS) * 1e-9
+
     def truth(self, robot: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """R and p."""
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
