@@ -26,6 +26,8 @@ NOMINAL_WEIGHT = (
     0.8983  # mean Cauchy weight of Gaussian noise in two dimensions: E[1 / (1 + chi2_2 / CAUCHY^2)]
 )
 ITERATIONS = 8  # at the most
+REWEIGHTINGS = 4  # by one linearisation at the most; two mostly
+SETTLED = 0.1  # change of a weight that ends them
 SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
 STEP = 1e-4  # rad, of the difference quotient of an outline's shape
 STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
@@ -176,9 +178,12 @@ class Estimator:
         system = _System(replace(rows, body=row[rows.body]), len(seen))
         displaced = np.einsum("nij,nj->ni", prior, delta[seen])
         weights = np.ones(system.shape) if weights is None else weights
-        H, right = system.normal_equations(weights)
-        step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]  # for the weights only
-        weights = _weights(system.remainder(step))
+        for _ in range(REWEIGHTINGS):
+            H, right = system.normal_equations(weights)
+            step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]
+            before, weights = weights, _weights(system.remainder(step))
+            if np.max(np.abs(weights - before), initial=0) < SETTLED:
+                break
         H, right = system.normal_equations(weights)
         step = _eliminate(prior + H, right - displaced)
         delta = delta.copy()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.messages import VERSION, MessageError
+from fusion.robots import Robot
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -116,6 +117,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     unused: int  # detections that nothing took
     late: int  # frames dropped since the start because they came too late
     calibrated: bool
+    aside: bool = False  # it was moved: its detections are set aside until it is placed anew
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -130,3 +132,29 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, State]
     faults: dict[str, int]
+
+
+def robots_key(arena: str) -> str:
+    """The queryable that takes a `RobotsRequest` and answers with `Robots`."""
+    return f"{arena}/robots"
+
+
+def undo_key(arena: str) -> str:
+    """The queryable that takes back the last pose which the server found of a moved camera."""
+    return f"{arena}/rig/undo"
+
+
+class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What to change of the robots while the server runs; all of it or, if it makes no sense, nothing."""
+
+    version: int = VERSION
+    rename: dict[str, str] = {}  # old name -> new name, done first: a renamed robot stays tracked
+    remove: tuple[str, ...] = ()
+    define: dict[str, Robot] = {}  # new ones, or new markers of old ones, which are then searched for anew
+
+
+class Robots(msgspec.Struct, frozen=True, kw_only=True):
+    """The robots that the server looks for."""
+
+    version: int = VERSION
+    robots: dict[str, Robot]

@@ -99,6 +99,14 @@ class Optics:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
         self.cameras = tuple(cameras.values())
+        self._set()
+
+    def place(self, name: str, camera: Camera) -> None:
+        """A camera stands elsewhere."""
+        self.cameras = tuple(camera if k == self.index[name] else old for k, old in enumerate(self.cameras))
+        self._set()
+
+    def _set(self) -> None:
         T = np.array([camera.matrix() for camera in self.cameras]).reshape(-1, 4, 4)
         self.R_cam_world = T[:, :3, :3].transpose(0, 2, 1)
         self._R_cw = _rotations(self.R_cam_world)
@@ -110,7 +118,11 @@ class Optics:
         tau, R_cw, B = exposures.tau[:, None], self.R_cam_world[exposures.camera], len(states)
         R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
         turn = turns(omega[:, None] * tau)  # (3, 3, F, B)
-        R_world = sum(turn[:, k, None] * R[k, :, None] for k in range(3))
+        R_world = (
+            turn[:, 0, None] * R[0, :, None]
+            + turn[:, 1, None] * R[1, :, None]
+            + turn[:, 2, None] * R[2, :, None]
+        )
         to = states.p.T[:, None] + v[:, None] * tau - self.centres[exposures.camera].T[:, :, None]
         # The cameras' rotations by one product each: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
         R_cam = R_cw @ R_world.transpose(2, 0, 1, 3).reshape(-1, 3, 3 * B)

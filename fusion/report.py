@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera import Camera
 from fusion.grouping import Marker
 from fusion.instants import Instant
 from fusion.messages import Markers, RobotPose, State
@@ -38,6 +39,14 @@ class CameraUse:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A camera was found to be moved: where it stands now, or None while its detections are set aside."""
+
+    name: str
+    camera: Camera | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Fused:
     """What an instant tells."""
 
@@ -45,6 +54,7 @@ class Fused:
     poses: tuple[RobotPose, ...]
     markers: Markers
     cameras: dict[str, CameraUse]
+    moves: tuple[Move, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

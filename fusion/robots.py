@@ -95,10 +95,36 @@ def load_robots(path: Path) -> dict[str, Robot]:
     robots = load_yaml(path, _Robots).robots
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
-    if bad := [name for name in robots if not name or set(name) & set("/*$#? ")]:
-        raise ConfigError(f"{path}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
-    require_distinct(robots, str(path))
+    require_trackable(robots, str(path))
     return robots
+
+
+def require_trackable(robots: dict[str, Robot], where: str) -> None:
+    """Raise ConfigError if a name can't be one, FusionError as `require_distinct` does."""
+    if bad := [name for name in robots if not name or set(name) & set("/*$#? ")]:
+        raise ConfigError(f"{where}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
+    require_distinct(robots, where)
+
+
+def changed(
+    robots: dict[str, Robot], rename: dict[str, str], remove: tuple[str, ...], define: dict[str, Robot]
+) -> dict[str, Robot]:
+    """The robots with some renamed, then some removed, then some defined.
+
+    Raises:
+        ConfigError: a name is none, is unknown, or is taken.
+        FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
+    """
+    if unknown := [name for name in (*rename, *remove) if name not in robots]:
+        raise ConfigError(f"there is no robot '{unknown[0]}'; there are {', '.join(robots) or 'none'}")
+    renamed = [rename.get(name, name) for name in robots]
+    if taken := [name for name in renamed if renamed.count(name) > 1]:
+        raise ConfigError(f"the name '{taken[0]}' is taken")
+    kept = {
+        new: robot for new, (old, robot) in zip(renamed, robots.items(), strict=True) if old not in remove
+    }
+    require_trackable(kept | define, "robots")
+    return kept | define
 
 
 def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:

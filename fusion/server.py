@@ -10,22 +10,26 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import yaml
 import zenoh
 
+from calib.camera import Camera
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, load_rig
+from calib.rig import Rig, dump_rig
 from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
 from camera_node.network import open_router
+from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Frame, Instant, Instants
-from fusion.messages import Latency, State
-from fusion.report import Fused
-from fusion.robots import load_robots
+from fusion.messages import Latency, Robots, State, robots_key, undo_key
+from fusion.report import Fused, Move
+from fusion.requests import parse_robots, respond, robots_reply
+from fusion.robots import changed, load_robots
 from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -47,12 +51,11 @@ class Server:
         self.keys = Keys(config.arena)
         self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
-        self._rig: Rig | None = None
+        kept = Path(config.kept_rig) if config.kept_rig else None
+        self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
         self._tracker: Tracker | None = None
-        self._apply(load_rig(Path(config.rig)) if config.rig else None)
-        self._messages: queue.Queue[tuple[Callable[[bytes, str, int], None], bytes, str, int]] = queue.Queue(
-            QUEUE
-        )
+        self._start()
+        self._messages: queue.Queue[Callable[[], None]] = queue.Queue(QUEUE)
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
@@ -79,12 +82,12 @@ class Server:
         """Serve."""
         while not self._stopped.is_set():
             with contextlib.suppress(queue.Empty):
-                take, data, key, received_ns = self._messages.get(timeout=TICK_S)
-                take(data, key, received_ns)
+                self._messages.get(timeout=TICK_S)()
             now_ns = time.time_ns()
             for instant in self._instants.take(now_ns):
                 self._fuse(instant)
-            if status := self.health.status(now_ns, self._calibrated(), self._instants.late):
+            aside = self._tracker.watch.bumped if self._tracker else set()
+            if status := self.health.status(now_ns, set(self._cameras()), self._instants.late, aside):
                 self._publish(self.keys.fusion_status, status)
 
     def _declare(self, stack: contextlib.ExitStack) -> None:
@@ -94,6 +97,9 @@ class Server:
         self._publishers: dict[str, zenoh.Publisher] = {}
         stack.callback(session.declare_queryable(keys.clock, self._answer_clock).undeclare)
         stack.callback(session.declare_queryable(keys.rig, self._answer_rig).undeclare)
+        answers = {undo_key(keys.arena): self._undo, robots_key(keys.arena): self._change_robots}
+        for key, answer in answers.items():
+            stack.callback(session.declare_queryable(key, self._later(answer)).undeclare)
         stack.callback(session.declare_subscriber(keys.detections(), detections).undeclare)
         stack.callback(session.declare_subscriber(keys.rig, rig).undeclare)
         stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
@@ -102,13 +108,19 @@ class Server:
         """A callback that only enqueues: whatever else it did would stall the link."""
 
         def callback(sample: zenoh.Sample) -> None:
-            try:
-                entry = (take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns())
-                self._messages.put_nowait(entry)
-            except queue.Full:
-                self.health.count("queue full")
+            self._put(partial(take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns()))
 
         return callback
+
+    def _later(self, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
+        """A callback that has the server's thread answer a query."""
+        return lambda query: self._put(partial(respond, query, answer))
+
+    def _put(self, task: Callable[[], None]) -> None:
+        try:
+            self._messages.put_nowait(task)
+        except queue.Full:
+            self.health.count("queue full")
 
     def _publish(self, key: str, message: msgspec.Struct) -> None:
         if key not in self._publishers:
@@ -132,9 +144,9 @@ class Server:
             self._add(message, received_ns)
 
     def _add(self, message: Detections, received_ns: int) -> None:
-        if self._tracker is None or self._rig is None:
+        if self._tracker is None:
             return
-        camera = self._rig.placed().get(message.camera)
+        camera = self._cameras().get(message.camera)
         if camera is None:
             self.health.count("unknown camera")
         elif (message.width, message.height) != (camera.width, camera.height):
@@ -145,26 +157,29 @@ class Server:
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            message = decode(data, RigMessage)
-            self._apply(msgspec.yaml.decode(message.yaml, type=Rig))
+            rig = msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
         except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
             self.health.count("rig that is no rig")
             log.warning(
                 "a published rig is refused, the old one stays: %s", " ".join(str(error).split())[:200]
             )
 
-    def _apply(self, rig: Rig | None) -> None:
-        """Put a calibration in force; robots are found anew."""
-        placed = rig.placed() if rig else {}
-        tracker = Tracker(placed, self.robots, self.config.limits) if placed else None
-        self._rig, self._tracker = rig, tracker
+            return
+        if rig != self.calibration.rig:  # else it is our own, or one that came twice
+            self.calibration.replace(rig)
+            self._start()
+
+    def _start(self) -> None:
+        """Begin with the rig in force; robots are found anew."""
+        placed = self._cameras()
+        self._tracker = Tracker(placed, self.robots, self.config.limits) if placed else None
         rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
         self._instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
         if placed:
             log.info("calibration in force: %s", ", ".join(placed))
 
-    def _calibrated(self) -> set[str]:
-        return set(self._rig.placed()) if self._rig else set()
+    def _cameras(self) -> dict[str, Camera]:
+        return self.calibration.rig.placed() if self.calibration.rig else {}
 
     # What is answered.
 
@@ -172,9 +187,40 @@ class Server:
         query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns())))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
-        rig = self._rig
-        if rig is not None:
-            query.reply(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+        if self.calibration.rig is not None:
+            query.reply(self.keys.rig, encode(self._rig_message()))
+
+    def _rig_message(self) -> RigMessage:
+        assert self.calibration.rig is not None
+        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.calibration.rig))
+
+    def _undo(self, payload: bytes) -> bytes:
+        """Take the last correction back; that camera is not doubted again until another rig comes."""
+        name, camera = self.calibration.undo()
+        log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
+        if self._tracker is not None:
+            self._tracker.place(name, camera)
+            self._tracker.watch.hold(name)
+        message = self._rig_message()
+        self._publish(self.keys.rig, message)
+        return encode(message)
+
+    def _change_robots(self, payload: bytes) -> bytes:
+        """Rename, remove and define robots, all or none; what they are then."""
+        request = parse_robots(payload)
+        robots = changed(self.robots, request.rename, request.remove, request.define)
+        if robots != self.robots:
+            for name in self.robots.keys() - robots.keys():
+                self._forget(self.keys.robot_pose(name))
+            self.robots = robots
+            log.info("robots: %s", ", ".join(robots) or "none")
+            if self._tracker is not None:
+                self._tracker = self._tracker.with_robots(robots, request.rename)
+        return robots_reply(payload, Robots(robots=self.robots))
+
+    def _forget(self, key: str) -> None:
+        if key in self._publishers:
+            self._publishers.pop(key).undeclare()
 
     # What is told.
 
@@ -188,7 +234,24 @@ class Server:
             told = msgspec.structs.replace(pose, latency=latency)
             self._publish(self.keys.robot_pose(pose.robot), told)
         self._publish(self.keys.markers, fused.markers)
+        for move in fused.moves:
+            self._tell(move)
         self._note(fused, latency)
+
+    def _tell(self, move: Move) -> None:
+        """Say that a camera was moved, or where it stands now."""
+        if move.camera is None:
+            log.warning(
+                "camera %s was moved: its detections are set aside until robots show where it is", move.name
+            )
+            return
+        self.calibration.correct(move.name, move.camera)
+        self._publish(self.keys.rig, self._rig_message())
+        log.warning(
+            "camera %s is placed anew and used again; a query on %s takes that back",
+            move.name,
+            undo_key(self.keys.arena),
+        )
 
     def _note(self, fused: Fused, latency: Latency | None) -> None:
         states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Instants in, robots and markers out: the same code live and offline, without a clock of its own."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -8,17 +10,20 @@ from numpy.typing import NDArray
 from calib.camera import Camera
 from fusion.association import match
 from fusion.estimator import Estimator, Prediction, misfit
-from fusion.instants import Instant
+from fusion.instants import Frame, Instant
 from fusion.messages import State
-from fusion.optics import Optics
-from fusion.report import Fused, report
+from fusion.optics import Exposures, Optics
+from fusion.report import Fused, Move, report
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
 from fusion.state import POSITION, States
+from fusion.watch import Expected, Watch
 
 Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
+WATCHED = 200  # markers that are compared with their images in one instant
+WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
 
 
@@ -56,19 +61,90 @@ class Tracker:
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), BIRTH)
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
         self.search = Search(self)
+        self.watch = Watch()
+        self._watched = 0
         self._seen_ns = np.zeros(n, np.int64)
         self._t_ns: int | None = None
 
     def fuse(self, instant: Instant) -> Fused:
         """Follow the robots into this instant, and look for those that are not tracked."""
         prediction = self._predict(instant.t_ns)
-        sightings = Sightings.of(instant, self.optics, self.limits.sigma_floor_px)
+        trusted = Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
+        sightings = Sightings.of(trusted, self.optics, self.limits.sigma_floor_px)
         followed = self._followed(prediction.states)
         matches = match(self.optics, prediction.states, self.catalogue, followed, sightings)
         matches = self._update(prediction, sightings, matches)
         matches, free = self.search.find(np.flatnonzero(~followed), sightings, matches)
         self._note(instant.t_ns, matches)
-        return report(self, instant, sightings, matches, free)
+        fused = report(self, trusted, sightings, matches, free)
+        return replace(fused, moves=self._watch(instant, sightings, matches))
+
+    def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
+        """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
+
+        Args:
+            robots: the new ones, by name.
+            renamed: old name -> new name.
+        """
+        other = Tracker(dict(zip(self.optics.names, self.optics.cameras, strict=True)), robots, self.limits)
+        other.watch, other._t_ns = self.watch, self._t_ns
+        old = {renamed.get(name, name): k for k, name in enumerate(self.names)}
+        for row, (name, robot) in enumerate(robots.items()):
+            k = old.get(name)
+            if k is None or self.robots[k].markers != robot.markers:
+                continue
+            other.states = other.states.with_rows(np.array([row]), self.states.select(np.array([k])))
+            other.status[row], other._seen_ns[row] = self.status[k], self._seen_ns[k]
+        return other
+
+    def place(self, name: str, camera: Camera) -> None:
+        """A camera stands elsewhere from now on; robots stay as they are."""
+        self.optics.place(name, camera)
+
+    def _watch(self, instant: Instant, sightings: Sightings, matches: Matches) -> tuple[Move, ...]:
+        """Compare frames with what robots seen by two other cameras should look like; place a moved camera anew."""
+        seen = np.zeros((len(self.robots), len(self.optics.names)), bool)
+        seen[self.catalogue.robot[matches.disc], sightings.camera[matches.sighting]] = True
+        steady = np.array([status == "tracked" for status in self.status])
+        for frame in self._turn(instant.frames):
+            camera = self.optics.index[frame.camera]
+            others = seen.sum(1) - seen[:, camera]
+            markers = np.flatnonzero((steady & (others >= 2))[self.catalogue.robot])
+            points = self._expect(frame, camera, (frame.t_ns - instant.t_ns) * 1e-9, markers)
+            if points.shape[1]:
+                self.watch.note(self.optics.cameras[camera], Expected(frame, points))
+        return self._heal()
+
+    def _turn(self, frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        """Some of the frames, others in the next instant, so that watching costs the same in a large arena."""
+        n = max(1, WATCHED // max(len(self.catalogue.robot), 1))
+        first = self._watched % max(len(frames), 1)
+        self._watched += n
+        return (frames + frames)[first : first + min(n, len(frames))]
+
+    def _expect(self, frame: Frame, camera: int, tau: float, markers: NDArray[np.intp]) -> Array:
+        """(3, N) points in the world whose projections are the outlines' centres that the frame should show."""
+        exposures = Exposures(np.array([camera]), np.array([tau]))
+        discs = self.catalogue.discs(markers, np.zeros(len(markers), np.intp))
+        views = self.optics.view(self.optics.pose(self.states, exposures), discs)
+        points = self.optics.R_cam_world[camera].T @ views.q + self.optics.centres[camera][:, None]
+        lens = self.optics.cameras[camera]
+        uv = lens.project(views.q.T)
+        inside = ((uv > WATCH_MARGIN_PX) & (uv < np.array([lens.width, lens.height]) - WATCH_MARGIN_PX)).all(
+            1
+        )
+        return points[:, inside & (views.facing > WATCH_FACING)]
+
+    def _heal(self) -> tuple[Move, ...]:
+        moves = []
+        if (name := self.watch.find_bumped()) is not None:
+            moves.append(Move(name, None))
+        for name in sorted(self.watch.bumped):
+            camera = self.watch.heal(name, self.optics.cameras[self.optics.index[name]])
+            if camera is not None:
+                self.place(name, camera)
+                moves.append(Move(name, camera))
+        return tuple(moves)
 
     def _predict(self, t_ns: int) -> Prediction:
         dt = BIRTH_S if self._t_ns is None else max((t_ns - self._t_ns) * 1e-9, BIRTH_S)
@@ -83,15 +159,38 @@ class Tracker:
 
     def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
         """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""
+        states, matches = self._fit(prediction, sightings, matches)
+        if self.watch.is_strange(matches.squared_px):
+            states, matches = self._without_a_camera(prediction, sightings, matches, states)
+        else:
+            self.watch.learn(matches.squared_px)
+        self.states = states
+        return matches
+
+    def _fit(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> tuple[States, Matches]:
         observations = Observations.of(matches, sightings, self.catalogue)
-        self.states, remainder = self.estimator.update(prediction, observations)
+        states, remainder = self.estimator.update(prediction, observations)
         matches = matches.remaining(remainder)
         wrong = misfit(observations, remainder, SLACK_PX, len(self.robots)) > MAX_CHI2
         if not wrong.any():
-            return matches
+            return states, matches
         bad = np.flatnonzero(wrong)
-        self.states = self.states.with_rows(bad, prediction.states.select(bad))
-        return matches.select(~wrong[observations.discs.body])
+        states = states.with_rows(bad, prediction.states.select(bad))
+        return states, matches.select(~wrong[observations.discs.body])
+
+    def _without_a_camera(
+        self, prediction: Prediction, sightings: Sightings, matches: Matches, states: States
+    ) -> tuple[States, Matches]:
+        """Robots by all cameras but the one that contradicts the others, if there is one."""
+        for name in self.watch.suspects(self.optics.names):
+            others = sightings.camera[matches.sighting] != self.optics.index[name]
+            if others.all():
+                continue
+            fitted, rest = self._fit(prediction, sightings, matches.select(others))
+            if self.watch.explains(name, rest.squared_px, matches.squared_px):
+                return fitted, rest
+        self.watch.learn(matches.squared_px)
+        return states, matches
 
     def _note(self, t_ns: int, matches: Matches) -> None:
         """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""

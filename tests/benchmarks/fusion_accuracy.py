@@ -48,7 +48,9 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
         variance.append(np.einsum("nii->n", told.states.P[:, 3:6, 3:6]))
         honesty.append(_mahalanobis(tracker.states.R, truth.R, error, tracker.states.P)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
-    return Accuracy(*rms, float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked)))
+    return Accuracy(
+        rms[0], rms[1], rms[2], float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked))
+    )
 
 
 def instants(load: Load, seconds: float) -> Iterator[Instant]:

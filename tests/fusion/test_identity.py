@@ -38,7 +38,7 @@ def test_identical_robots_pass_each_other_within_0_3_m(run_arena):
 
 def test_identical_robots_need_a_beginning():
     bare = Robot(diameter_m=TRIANGLE.diameter_m, markers=TRIANGLE.markers)
-    with pytest.raises(FusionError, match="identical: give both a start_m, 0.6 m or more apart"):
+    with pytest.raises(FusionError, match=r"identical: give both a start_m, 0\.6 m or more apart"):
         require_distinct({"a": bare, "b": bare})
     with pytest.raises(FusionError, match="identical"):
         require_distinct({"a": twin((0.0, 0, 0)), "b": twin((0.1, 0, 0))})
