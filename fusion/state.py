@@ -99,6 +99,14 @@ def exp_so3(vectors: Array) -> Array:
     return np.ascontiguousarray(turns(vectors.T).transpose(2, 0, 1))
 
 
+def log_so3(R: Array) -> Array:
+    """(N, 3) vectors of rotations (N, 3, 3) of less than half a turn: the quaternion's."""
+    q = wxyz_of(R)
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2 * np.arctan2(sine, q[:, 0])
+    return q[:, 1:] * (angle / np.maximum(sine, 1e-12))[:, None]
+
+
 def turns(w: Array) -> Array:
     """(3, 3, ...) rotations by vectors (3, ...).
 

@@ -63,6 +63,7 @@ class Tracker:
         self.search = Search(self)
         self.watch = Watch()
         self._watched = 0
+        self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
         self._seen_ns = np.zeros(n, np.int64)
         self._t_ns: int | None = None
 
@@ -72,6 +73,7 @@ class Tracker:
         trusted = Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
         sightings = Sightings.of(trusted, self.optics, self.limits.sigma_floor_px)
         followed = self._followed(prediction.states)
+        self.predicted = prediction, followed
         matches = match(self.optics, prediction.states, self.catalogue, followed, sightings)
         matches = self._update(prediction, sightings, matches)
         matches, free = self.search.find(np.flatnonzero(~followed), sightings, matches)
