@@ -53,8 +53,8 @@ class Publish:
     """Deliver recorded frames when they are due, or as fast as they are read."""
     stamps: Literal["recorded", "now"] = "recorded"
     """Keep recorded times as they are, or move them to now, as if the recording were a camera."""
-    detector: Literal["paper"] = "paper"
-    """Which detector: paper is that of Faigl et al., ICRA 2013."""
+    detector: Literal["chords", "paper"] = "chords"
+    """Which search; paper is that of Faigl et al., ICRA 2013, the reference."""
     inner_ratios: tuple[float, ...] = (0.6, 0.41)
     """Inner over outer diameters of the roundels in use."""
 

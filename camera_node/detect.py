@@ -31,7 +31,7 @@ class Detect:
     """Print one JSON object an image instead of a table."""
     draw: Path | None = None
     """Write the image with its roundels drawn on it to this file; takes a single image."""
-    detector: Literal["paper"] = "paper"
+    detector: Literal["chords", "paper"] = "chords"
     """Which search."""
     inner_ratio: tuple[float, ...] = (0.6, 0.41)
     """Inner over outer diameter of the prints in use."""
