@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fusion.optics import Optics, measured_outlines, outlines
 from fusion.sightings import Observations
-from fusion.state import States, forget_turn, predict
+from fusion.state import OMEGA, States, forget_turn, predict
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -219,6 +219,7 @@ class Estimator:
         poses = self.optics.pose(states, seen.exposures)
         views = self.optics.view(poses, discs)
         A = self.optics.derive(poses, seen.exposures, discs, views, observations.whiten)
+        A[:, OMEGA, self.single[discs.body]] = 0  # one marker's turning rate would but fit its noise
         b = np.einsum("abn,bn->an", observations.whiten, seen.xy - views.xy)
         unseen = ~np.isfinite(b[0])
         if unseen.any():
@@ -245,12 +246,16 @@ class Estimator:
         return _Rows(discs.body, A / sigma, at / sigma)
 
 
-def misfit(observations: Observations, remainder: Array, slack_px: float, n_bodies: int) -> Array:
-    """(B,) mean squared error of each body's observations in standard deviations, to which `slack_px` is added."""
-    cov, body = observations.seen.cov, observations.discs.body
+def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
+    """(N,) squared errors of observations in standard deviations, to which `slack_px` is added; inf if unseen."""
+    cov = observations.seen.cov
     d2 = np.sum(remainder**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + slack_px**2)
-    count = np.bincount(body, minlength=n_bodies)
-    return np.bincount(body, np.nan_to_num(d2, nan=np.inf), n_bodies) / np.maximum(count, 1)
+    return np.nan_to_num(d2, nan=np.inf)
+
+
+def mean_of_bodies(values: Array, body: Index, n_bodies: int) -> Array:
+    """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
+    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
 
 
 def _eliminate(information: Array, right: Array) -> Array:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.estimator import Estimator, misfit
+from fusion.estimator import Estimator, mean_of_bodies, misfit
 from fusion.grouping import Marker, group
 from fusion.messages import State
 from fusion.normals import find_normal, rotation_to
@@ -182,7 +182,8 @@ class Search:
         estimator = tracker.estimator.select(robots)
         prediction = estimator.predict(at, np.full(len(robots), BIRTH_S))
         found, remainder = estimator.update(prediction, observations, BIRTH_SMALL)
-        good = misfit(observations, remainder, SLACK_PX, len(robots)) < MAX_CHI2
+        d2 = misfit(observations, remainder, SLACK_PX)
+        good = mean_of_bodies(d2, observations.discs.body, len(robots)) < MAX_CHI2
         kept = good[observations.discs.body]
         tracker.adopt(robots[good], found.select(good))
         return matches.remaining(remainder).select(kept)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.camera import Camera
 from fusion.association import match
-from fusion.estimator import Estimator, Prediction, misfit
+from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.instants import Frame, Instant
 from fusion.messages import State
 from fusion.optics import Exposures, Optics
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 WATCHED = 200  # markers that are compared with their images in one instant
 WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
+CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
 
 
@@ -173,7 +174,8 @@ class Tracker:
         observations = Observations.of(matches, sightings, self.catalogue)
         states, remainder = self.estimator.update(prediction, observations)
         matches = matches.remaining(remainder)
-        wrong = misfit(observations, remainder, SLACK_PX, len(self.robots)) > MAX_CHI2
+        misses = misfit(observations, remainder, SLACK_PX) > MAX_CHI2
+        wrong = mean_of_bodies(misses, observations.discs.body, len(self.robots)) > CONTRADICTED
         if not wrong.any():
             return states, matches
         bad = np.flatnonzero(wrong)
