@@ -65,7 +65,7 @@ class Tracker:
         self.watch = Watch()
         self._watched = 0
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
-        self._seen_ns = np.zeros(n, np.int64)
+        self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
 
     def fuse(self, instant: Instant) -> Fused:
@@ -98,6 +98,7 @@ class Tracker:
                 continue
             other.states = other.states.with_rows(np.array([row]), self.states.select(np.array([k])))
             other.status[row], other._seen_ns[row] = self.status[k], self._seen_ns[k]
+            other._seen[row] = self._seen[k]
         return other
 
     def place(self, name: str, camera: Camera) -> None:
@@ -155,10 +156,13 @@ class Tracker:
         return self.estimator.predict(self.states, np.full(len(self.robots), min(dt, MAX_COAST_S)))
 
     def _followed(self, states: States) -> NDArray[np.bool_]:
-        """(N,) robots that are where they are predicted to be, near enough to name their markers by it."""
+        """(N,) robots that are where they are predicted to be, near enough to name their markers by it.
+
+        One that was seen just now is, in the camera that saw it, however badly its range is known.
+        """
         alive = np.array([status in ("tracked", "coasting") for status in self.status])
         sigma2 = np.einsum("nii->n", states.P[:, POSITION, POSITION]) / 3
-        return alive & (sigma2 < FOLLOWED_M**2)
+        return alive & ((sigma2 < FOLLOWED_M**2) | self._seen)
 
     def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
         """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""
@@ -200,7 +204,7 @@ class Tracker:
         """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""
         seen = np.zeros(len(self.robots), bool)
         seen[self.catalogue.robot[matches.disc]] = True
-        self._seen_ns[seen] = t_ns
+        self._seen, self._seen_ns[seen] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
         worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
         vague = worst > self.limits.tracked_sigma_m**2
