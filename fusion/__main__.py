@@ -33,6 +33,8 @@ class Serve:
     """robots.yaml."""
     rate_hz: float | None = None
     """Instants a second; those of the fastest camera unless given."""
+    shard: str | None = None
+    """Such as 2/3, the second of three processes that share the robots; the first is the one to listen."""
 
     def run(self) -> int:
         """Serve until Ctrl-C or SIGTERM."""

@@ -23,6 +23,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         robots: robots.yaml.
         rate_hz: instants a second; without it those of the fastest camera.
         limits: see `Limits`.
+        shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
     """
 
     arena: str = "arena"
@@ -33,6 +34,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     robots: str = "robots.yaml"
     rate_hz: float | None = None
     limits: Limits = Limits()
+    shard: str = "1/1"
 
     def __post_init__(self) -> None:
         if not self.arena or set(self.arena) & set("/*$#? "):

@@ -253,7 +253,7 @@ def misfit(observations: Observations, remainder: Array, slack_px: float) -> Arr
     return np.nan_to_num(d2, nan=np.inf)
 
 
-def mean_of_bodies(values: Array, body: Index, n_bodies: int) -> Array:
+def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
     """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
     return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
 

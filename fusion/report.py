@@ -27,6 +27,7 @@ class Told(Protocol):
     catalogue: Catalogue
     states: States
     status: list[State | None]
+    owned: NDArray[np.bool_]  # robots whose poses are told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +109,7 @@ def _poses(tracker: Told, t_ns: int, seen: _Seen) -> tuple[RobotPose, ...]:
             residual_px=residual[k] if markers[k] else None,
         )
         for k, status in enumerate(tracker.status)
-        if status is not None
+        if status is not None and tracker.owned[k]
     )
 
 
@@ -143,7 +144,7 @@ def _usage(tracker: Told, sightings: Sightings, matches: Matches, free: list[Mar
     used[np.concatenate([matches.sighting, *(m.sightings for m in free)])] = True
     taken = np.bincount(camera[used], minlength=n).tolist()
     unused = np.bincount(camera[~used], minlength=n).tolist()
-    squares = np.bincount(camera[matches.sighting], matches.squared_px, n).tolist()
+    squares = np.bincount(camera[matches.sighting], np.nan_to_num(matches.squared_px), n).tolist()
     return {name: CameraUse(taken[k], unused[k], squares[k]) for k, name in enumerate(tracker.optics.names)}
 
 

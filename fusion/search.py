@@ -44,6 +44,7 @@ class Followed(Protocol):
     estimator: Estimator
     states: States
     status: list[State | None]
+    owned: NDArray[np.bool_]
 
     def adopt(self, rows: Index, states: States) -> None: ...
 
@@ -89,6 +90,7 @@ class Search:
                 fit.robot, fit.R, fit.t, self._claim(fit.robot, fit.numbers, [markers[p] for p in fit.points])
             )
             for fit in fits
+            if tracker.owned[fit.robot]
         ]
         return self._with_singles(matches.joined(self._bear(births, sightings, BIRTH)), aside)
 
@@ -136,10 +138,11 @@ class Search:
         """Robots of one marker and theirs, where within reach there is one robot to one marker; else none."""
         within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost], bool)
         within = within.reshape(len(lost), len(markers))
+        owned = self.tracker.owned
         return [
             (k, markers[int(np.argmax(row))])
             for k, row in zip(lost, within, strict=True)
-            if row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
+            if owned[k] and row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
         ]
 
     def _reaches(self, k: int, marker: Marker) -> bool:

@@ -21,15 +21,16 @@ from calib.camera import Camera
 from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig
 from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
-from camera_node.network import open_router
+from camera_node.network import open_client, open_router
 from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Frame, Instant, Instants
-from fusion.messages import Latency, Robots, State, robots_key, undo_key
+from fusion.messages import Latency, RobotPose, Robots, State, robots_key, undo_key
 from fusion.report import Fused, Move
 from fusion.requests import parse_robots, respond, robots_reply
 from fusion.robots import changed, load_robots
+from fusion.shards import Shard
 from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -49,6 +50,7 @@ class Server:
     def __init__(self, config: ArenaConfig) -> None:
         self.config = config
         self.keys = Keys(config.arena)
+        self.shard = Shard.parse(config.shard)
         self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
         kept = Path(config.kept_rig) if config.kept_rig else None
@@ -61,12 +63,11 @@ class Server:
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
-            self.session = stack.enter_context(
-                open_router(self.config.listen, Path(self.config.zenoh) if self.config.zenoh else None)
-            )
+            self.session = stack.enter_context(self._open())
             self._declare(stack)
             self._closing = stack.pop_all()
-        log.info("arena '%s' listens on %s", self.config.arena, " ".join(self.config.listen))
+        verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
+        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
         if self._tracker is None:
             log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
         return self
@@ -88,21 +89,31 @@ class Server:
                 self._fuse(instant)
             aside = self._tracker.watch.bumped if self._tracker else set()
             if status := self.health.status(now_ns, set(self._cameras()), self._instants.late, aside):
-                self._publish(self.keys.fusion_status, status)
+                own = "" if self.shard.leads else f"/{self.shard.index}"
+                self._publish(self.keys.fusion_status + own, status)
 
     def _declare(self, stack: contextlib.ExitStack) -> None:
         keys, session = self.keys, self.session
-        detections = self._enqueue(self._take_detections)
-        rig = self._enqueue(self._take_rig)
         self._publishers: dict[str, zenoh.Publisher] = {}
-        stack.callback(session.declare_queryable(keys.clock, self._answer_clock).undeclare)
-        stack.callback(session.declare_queryable(keys.rig, self._answer_rig).undeclare)
-        answers = {undo_key(keys.arena): self._undo, robots_key(keys.arena): self._change_robots}
+        takes = {keys.detections(): self._take_detections, keys.rig: self._take_rig}
+        if self.shard.count > 1:
+            takes[keys.robot_pose()] = self._take_pose
+        answers = {robots_key(keys.arena): self._later(self._change_robots)}
+        if self.shard.leads:
+            answers |= {keys.clock: self._answer_clock, keys.rig: self._answer_rig}
+            answers[undo_key(keys.arena)] = self._later(self._undo)
+            stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
         for key, answer in answers.items():
-            stack.callback(session.declare_queryable(key, self._later(answer)).undeclare)
-        stack.callback(session.declare_subscriber(keys.detections(), detections).undeclare)
-        stack.callback(session.declare_subscriber(keys.rig, rig).undeclare)
-        stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
+            stack.callback(session.declare_queryable(key, answer).undeclare)
+        for key, take in takes.items():
+            stack.callback(session.declare_subscriber(key, self._enqueue(take)).undeclare)
+
+    def _open(self) -> zenoh.Session:
+        """The arena's router, or of another shard a connection to it."""
+        zenoh_config = Path(self.config.zenoh) if self.config.zenoh else None
+        if self.shard.leads:
+            return open_router(self.config.listen, zenoh_config)
+        return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in self.config.listen], zenoh_config)
 
     def _enqueue(self, take: Callable[[bytes, str, int], None]) -> Callable[[zenoh.Sample], None]:
         """A callback that only enqueues: whatever else it did would stall the link."""
@@ -165,14 +176,31 @@ class Server:
             )
 
             return
-        if rig != self.calibration.rig:  # else it is our own, or one that came twice
-            self.calibration.replace(rig)
+        old = self.calibration.rig
+        if rig == old:  # our own, or one that came twice
+            return
+        self.calibration.replace(rig)
+        moved = [name for name in rig.cameras if old and rig.cameras[name] != old.cameras.get(name)]
+        if old and len(moved) == 1 and rig.placed().keys() == old.placed().keys() and self._tracker:
+            self._tracker.place(moved[0], rig.cameras[moved[0]])  # robots stay as they are
+            self._tracker.watch.trust(moved[0])
+        else:
             self._start()
+
+    def _take_pose(self, data: bytes, key: str, received_ns: int) -> None:
+        """Another shard's robot."""
+        try:
+            pose = decode(data, RobotPose)
+        except MessageError:
+            self.health.count("poses that are no message")
+            return
+        if self._tracker is not None and not self.shard.owns(pose.robot):
+            self._tracker.follow(pose)
 
     def _start(self) -> None:
         """Begin with the rig in force; robots are found anew."""
         placed = self._cameras()
-        self._tracker = Tracker(placed, self.robots, self.config.limits) if placed else None
+        self._tracker = Tracker(placed, self.robots, self.config.limits, self.shard) if placed else None
         rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
         self._instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
         if placed:
@@ -233,7 +261,8 @@ class Server:
         for pose in fused.poses:
             told = msgspec.structs.replace(pose, latency=latency)
             self._publish(self.keys.robot_pose(pose.robot), told)
-        self._publish(self.keys.markers, fused.markers)
+        if self.shard.leads:
+            self._publish(self.keys.markers, fused.markers)
         for move in fused.moves:
             self._tell(move)
         self._note(fused, latency)
@@ -245,7 +274,7 @@ class Server:
                 "camera %s was moved: its detections are set aside until robots show where it is", move.name
             )
             return
-        self.calibration.correct(move.name, move.camera)
+        self.calibration.correct(move.name, move.camera)  # only the leading shard gets here
         self._publish(self.keys.rig, self._rig_message())
         log.warning(
             "camera %s is placed anew and used again; a query on %s takes that back",

@@ -8,16 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
+from camera_node.pose import rotation_from_wxyz
 from fusion.association import match
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.instants import Frame, Instant
-from fusion.messages import State
+from fusion.messages import RobotPose, State
 from fusion.optics import Exposures, Optics
 from fusion.report import Fused, Move, report
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
+from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.state import POSITION, States
+from fusion.state import POSITION, States, exp_so3
 from fusion.watch import Expected, Watch
 
 Array = NDArray[np.float64]
@@ -46,14 +48,20 @@ class Tracker:
         cameras: the placed cameras; frames of others must not come.
         robots: by name, as `load_robots` checked them.
         limits: see `Limits`.
+        shard: which of the robots are estimated here; `follow` tells of the others.
     """
 
     def __init__(
-        self, cameras: dict[str, Camera], robots: dict[str, Robot], limits: Limits | None = None
+        self,
+        cameras: dict[str, Camera],
+        robots: dict[str, Robot],
+        limits: Limits | None = None,
+        shard: Shard = Shard(),  # noqa: B008 frozen
     ) -> None:
         self.optics = Optics(cameras)
         self.names, self.robots = tuple(robots), list(robots.values())
-        self.limits = limits or Limits()
+        self.limits, self.shard = limits or Limits(), shard
+        self.owned = np.array([shard.owns(name) for name in self.names], bool)
         self.catalogue = Catalogue.of(self.robots)
         single = np.array([robot.is_single for robot in self.robots])
         densities = np.array([robot.densities for robot in self.robots])
@@ -89,7 +97,9 @@ class Tracker:
             robots: the new ones, by name.
             renamed: old name -> new name.
         """
-        other = Tracker(dict(zip(self.optics.names, self.optics.cameras, strict=True)), robots, self.limits)
+        other = Tracker(
+            dict(zip(self.optics.names, self.optics.cameras, strict=True)), robots, self.limits, self.shard
+        )
         other.watch, other._t_ns = self.watch, self._t_ns
         old = {renamed.get(name, name): k for k, name in enumerate(self.names)}
         for row, (name, robot) in enumerate(robots.items()):
@@ -143,7 +153,7 @@ class Tracker:
         moves = []
         if (name := self.watch.find_bumped()) is not None:
             moves.append(Move(name, None))
-        for name in sorted(self.watch.bumped):
+        for name in sorted(self.watch.bumped) if self.shard.leads else ():
             camera = self.watch.heal(name, self.optics.cameras[self.optics.index[name]])
             if camera is not None:
                 self.place(name, camera)
@@ -166,13 +176,15 @@ class Tracker:
 
     def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
         """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""
+        mine = self.owned[self.catalogue.robot[matches.disc]]
+        others, matches = matches.select(~mine), matches.select(mine)
         states, matches = self._fit(prediction, sightings, matches)
         if self.watch.is_strange(matches.squared_px):
             states, matches = self._without_a_camera(prediction, sightings, matches, states)
         else:
             self.watch.learn(matches.squared_px)
         self.states = states
-        return matches
+        return matches.joined(others)
 
     def _fit(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> tuple[States, Matches]:
         observations = Observations.of(matches, sightings, self.catalogue)
@@ -204,17 +216,33 @@ class Tracker:
         """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""
         seen = np.zeros(len(self.robots), bool)
         seen[self.catalogue.robot[matches.disc]] = True
-        self._seen, self._seen_ns[seen] = seen, t_ns
+        self._seen, self._seen_ns[seen & self.owned] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
         worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
         vague = worst > self.limits.tracked_sigma_m**2
         for k, status in enumerate(self.status):
-            if seen[k]:
+            if not self.owned[k]:
+                self.status[k] = "lost" if status is not None and silent[k] else status
+            elif seen[k]:
                 self.status[k] = "coasting" if vague[k] else "tracked"
             elif status in ("tracked", "coasting"):
                 self.status[k] = "lost" if silent[k] else "coasting"
                 if silent[k]:
                     self.states.v[k] = self.states.omega[k] = 0
+
+    def follow(self, pose: RobotPose) -> None:
+        """Another shard's robot is there: its detections are its own, and not for ours."""
+        if pose.robot not in self.names or self._t_ns is None:
+            return
+        k = self.names.index(pose.robot)
+        if self.owned[k] or pose.t_ns <= self._seen_ns[k]:
+            return
+        dt = (self._t_ns - pose.t_ns) * 1e-9
+        omega, v = np.array([pose.angular_velocity]), np.array([pose.velocity])
+        R = exp_so3(omega * dt) @ rotation_from_wxyz(pose.quaternion_wxyz)
+        there = States(R, pose.position + v * dt, omega, v, pose.covariance_matrix[None])
+        self.states = self.states.with_rows(np.array([k]), there)
+        self.status[k], self._seen_ns[k] = pose.state, pose.t_ns
 
     def adopt(self, rows: NDArray[np.intp], states: States) -> None:
         """Robots that were found stand there from now on."""
