@@ -88,12 +88,15 @@ def fuse_recording(
     tracker = Tracker(cameras, robots, limits)
     smoother = Smoother(tracker) if smooth else None
     instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(limits.lateness_ms * 1e6))
-    for instant in _gather(messages, cameras, instants, Counter() if faults is None else faults):
+    told = Counter() if faults is None else faults
+    for instant in _gather(messages, cameras, instants, told):
         fused = tracker.fuse(instant)
         if smoother is None:
             yield fused
         else:
             smoother.add(fused)
+        for move in tracker.inspect():
+            told[f"camera '{move.name}' was moved{', and placed anew' if move.camera else ''}"] += 1
     if smoother is not None:
         yield from smoother.smooth()
 

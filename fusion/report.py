@@ -55,7 +55,6 @@ class Fused:
     poses: tuple[RobotPose, ...]
     markers: Markers
     cameras: dict[str, CameraUse]
-    moves: tuple[Move, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

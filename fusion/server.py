@@ -5,6 +5,7 @@ Zenoh's callbacks only enqueue; one thread, that of `Server.run`, decodes, fuses
 """
 
 import contextlib
+import gc
 import logging
 import queue
 import threading
@@ -81,6 +82,7 @@ class Server:
 
     def run(self) -> None:
         """Serve."""
+        gc.freeze()  # what was imported is not looked through again and again
         while not self._stopped.is_set():
             with contextlib.suppress(queue.Empty):
                 self._messages.get(timeout=TICK_S)()
@@ -263,7 +265,7 @@ class Server:
             self._publish(self.keys.robot_pose(pose.robot), told)
         if self.shard.leads:
             self._publish(self.keys.markers, fused.markers)
-        for move in fused.moves:
+        for move in self._tracker.inspect():
             self._tell(move)
         self._note(fused, latency)
 

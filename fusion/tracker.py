@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Instants in, robots and markers out: the same code live and offline, without a clock of its own."""
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,7 @@ from fusion.watch import Expected, Watch
 
 Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
-WATCHED = 200  # markers that are compared with their images in one instant
+WATCHED = 40  # markers that are compared with their images in one instant, about
 WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
@@ -72,6 +70,7 @@ class Tracker:
         self.search = Search(self)
         self.watch = Watch()
         self._watched = 0
+        self._last: tuple[Instant, Sightings, Matches] | None = None
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
@@ -87,8 +86,8 @@ class Tracker:
         matches = self._update(prediction, sightings, matches)
         matches, free = self.search.find(np.flatnonzero(~followed), sightings, matches)
         self._note(instant.t_ns, matches)
-        fused = report(self, trusted, sightings, matches, free)
-        return replace(fused, moves=self._watch(instant, sightings, matches))
+        self._last = instant, sightings, matches
+        return report(self, trusted, sightings, matches, free)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
@@ -115,8 +114,14 @@ class Tracker:
         """A camera stands elsewhere from now on; robots stay as they are."""
         self.optics.place(name, camera)
 
-    def _watch(self, instant: Instant, sightings: Sightings, matches: Matches) -> tuple[Move, ...]:
-        """Compare frames with what robots seen by two other cameras should look like; place a moved camera anew."""
+    def inspect(self) -> tuple[Move, ...]:
+        """After an instant was told: compare frames with what robots seen by two other cameras should look like.
+
+        Places a camera anew that was moved; says which were, and where they stand.
+        """
+        if self._last is None:
+            return ()
+        instant, sightings, matches = self._last
         seen = np.zeros((len(self.robots), len(self.optics.names)), bool)
         seen[self.catalogue.robot[matches.disc], sightings.camera[matches.sighting]] = True
         steady = np.array([status == "tracked" for status in self.status])
@@ -124,6 +129,7 @@ class Tracker:
             camera = self.optics.index[frame.camera]
             others = seen.sum(1) - seen[:, camera]
             markers = np.flatnonzero((steady & (others >= 2))[self.catalogue.robot])
+            markers = np.roll(markers, -self._watched)[:WATCHED]
             points = self._expect(frame, camera, (frame.t_ns - instant.t_ns) * 1e-9, markers)
             if points.shape[1]:
                 self.watch.note(self.optics.cameras[camera], Expected(frame, points))
