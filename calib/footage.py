@@ -11,7 +11,8 @@ import zenoh
 
 from camera_node.errors import CameraError
 from camera_node.messages import Keys
-from camera_node.source import Grey, grey, read_grey
+from camera_node.pixels import Grey, grey
+from camera_node.source import read_grey
 
 IMAGES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m fusion` is the live server, `python -m fusion run` fuses a recording."""
+"""The command line: `python -m fusion` is the live server; `run`, `record` and `replay` are about recordings."""
 
 import logging
 import signal
@@ -16,7 +16,7 @@ from camera_node.errors import run
 class Serve:
     """Fuse what an arena's cameras publish into robot poses, until stopped; holds the arena's Zenoh router.
 
-    For recordings: python -m fusion run --help
+    For recordings: python -m fusion run | record | replay --help
     """
 
     config: Path | None = None
@@ -33,6 +33,8 @@ class Serve:
     """robots.yaml."""
     rate_hz: float | None = None
     """Instants a second; those of the fastest camera unless given."""
+    shard: str | None = None
+    """Such as 2/3, the second of three processes that share the robots; the first is the one to listen."""
 
     def run(self) -> int:
         """Serve until Ctrl-C or SIGTERM."""
@@ -62,10 +64,14 @@ def main() -> None:
 def _program() -> int:
     arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:
-        from fusion.offline import run as run_offline
-
-        return tyro.cli(run_offline, prog="fusion run", args=arguments[1:])
-    return tyro.cli(Serve, prog="fusion", args=arguments).run()
+        from fusion.offline import run as command
+    elif arguments[:1] == ["record"]:
+        from fusion.recording import record as command
+    elif arguments[:1] == ["replay"]:
+        from fusion.offline import replay as command
+    else:
+        return tyro.cli(Serve, prog="fusion", args=arguments).run()
+    return tyro.cli(command, prog=f"fusion {arguments[0]}", args=arguments[1:])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 """Which detection is of which marker, while robots are tracked.
 
 Each marker is predicted into each frame at the frame's own time; within a gate of its covariance and apparent size,
-detections are assigned globally, frame by frame: no detection is of two markers.
+detections are assigned globally, frame by frame: no detection is of two markers. The cost of a pair is its negative
+log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits.
 """
 
 from dataclasses import dataclass
@@ -11,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from fusion.estimator import Observations
-from fusion.instants import Instant
 from fusion.optics import Discs, Optics, Views
-from fusion.robots import Robot
-from fusion.state import States
+from fusion.sightings import Catalogue, Matches, Sightings
+from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -23,131 +22,131 @@ GATE = 13.8  # chi-square with 2 degrees: one detection in a thousand is lost to
 SLACK_PX = 0.7  # what a calibration may be off, added to the gate
 SIZE_RATIO = 1.35  # between the measured and the predicted major axis
 GRAZING = 0.1  # cosine between the line of sight and the normal under which a print is not read
-MARGIN_PX = 20.0  # how far outside an image a marker's centre is still looked for
+UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
+TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
+FRAME_STEP = 1e6  # keeps the frames' x apart on one sorted axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """All N detections of an instant: frame and camera index, tau (s), uv, cov, axes_px and angle_rad."""
+class _Pairs:
+    """Candidates: row of the prediction, row of the sighting, and what the pair costs."""
 
-    frame: Index
-    camera: Index
-    tau: Array
-    uv: Array
-    cov: Array
-    axes_px: Array
-    angle_rad: Array
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> "Sightings":
-        """The rows that a mask or an index array names."""
-        return Sightings(*(getattr(self, name)[rows] for name in self.__slots__))
-
-    @classmethod
-    def of(cls, instant: Instant, optics: Optics, floor_px: float) -> "Sightings":
-        """The detections of an instant; `floor_px` is added to what detectors say of their noise."""
-        frames = instant.frames
-        counts = [len(frame.roundels) for frame in frames]
-        row = np.repeat(np.arange(len(frames)), counts)
-        camera = np.array([optics.index[frame.camera] for frame in frames], np.intp)
-        tau = np.array([(frame.t_ns - instant.t_ns) * 1e-9 for frame in frames])
-        empty = {"uv": (0, 2), "cov": (0, 2, 2), "axes_px": (0, 2), "angle_rad": (0,)}
-        columns = {
-            name: np.concatenate([np.zeros(shape), *(getattr(f.roundels, name) for f in frames)])
-            for name, shape in empty.items()
-        }
-        columns["cov"] = columns["cov"] + floor_px**2 * np.eye(2)
-        return cls(row, camera[row], tau[row], **columns)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Catalogue:
-    """All K markers of all robots: the robot's index, the number in the robot, centre (K, 3) and radius (K,)."""
-
-    robot: Index
-    number: Index
-    marker: Array
-    radius: Array
-
-    @classmethod
-    def of(cls, robots: list[Robot]) -> "Catalogue":
-        counts = [len(robot.markers) for robot in robots]
-        return cls(
-            np.repeat(np.arange(len(robots)), counts),
-            np.concatenate([np.arange(n) for n in counts]).astype(np.intp),
-            np.concatenate([robot.points for robot in robots]),
-            np.repeat([robot.diameter_m / 2 for robot in robots], counts),
-        )
-
-    def discs(self, rows: Index, camera: Index, tau: Array) -> Discs:
-        """Markers `rows` as cameras see them `tau` seconds from the instant."""
-        return Discs(camera, self.robot[rows], self.marker[rows], self.radius[rows], tau)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Matches:
-    """Rows of the sightings, and the rows of the catalogue that they are of."""
-
+    marker: Index
     sighting: Index
-    disc: Index
-
-    def observations(self, sightings: Sightings, catalogue: Catalogue) -> Observations:
-        """The matched detections for the estimator."""
-        seen = sightings.select(self.sighting)
-        discs = catalogue.discs(self.disc, seen.camera, seen.tau)
-        return Observations(discs, seen.uv, seen.cov, seen.axes_px, seen.angle_rad)
+    cost: Array
 
 
 def match(
     optics: Optics, states: States, catalogue: Catalogue, active: NDArray[np.bool_], sightings: Sightings
 ) -> Matches:
     """Match the detections of an instant to the markers of the robots that are `active` (N,)."""
-    frames, first = np.unique(sightings.frame, return_index=True)
     markers = np.flatnonzero(active[catalogue.robot])
-    if not len(frames) or not len(markers):
-        return Matches(np.empty(0, np.intp), np.empty(0, np.intp))
-    rows = np.tile(markers, len(frames))
-    camera = np.repeat(sightings.camera[first], len(markers))
-    tau = np.repeat(sightings.tau[first], len(markers))
-    views = optics.view(states, catalogue.discs(rows, camera, tau))
-    spread = views.jacobian @ states.P[catalogue.robot[rows]] @ views.jacobian.transpose(0, 2, 1)
-    visible = _is_visible(views, camera, optics)
-    found: list[tuple[Index, Index]] = []
-    for k, frame in enumerate(frames):
-        here = np.arange(k * len(markers), (k + 1) * len(markers))
-        here = here[visible[here]]
-        seen = np.flatnonzero(sightings.frame == frame)
-        a, b = _assign(_costs(views, spread, here, sightings.select(seen)))
-        found.append((seen[b], rows[here[a]]))
-    return Matches(*(np.concatenate(column) for column in zip(*found, strict=True)))
+    n_frames = len(sightings.exposures.camera)
+    if not len(sightings) or not len(markers):
+        return Matches.none()
+    rows = np.tile(markers, n_frames)
+    discs = catalogue.discs(rows, np.repeat(np.arange(n_frames), len(markers)))
+    views = optics.view(optics.pose(states, sightings.exposures), discs)
+    spread = _spread(optics, states, catalogue, markers, sightings, views)
+    pairs = _candidates(optics, discs, views, spread, sightings)
+    chosen = _assign(pairs, discs.frame)
+    return Matches.of(pairs.sighting[chosen], rows[pairs.marker[chosen]])
 
 
-def _is_visible(views: Views, camera: Index, optics: Optics) -> NDArray[np.bool_]:
-    inside = (views.uv > -MARGIN_PX) & (views.uv < optics.sizes[camera] + MARGIN_PX)
-    return inside.all(1) & (views.facing > GRAZING)  # NaN, behind the camera, is not inside
+def _spread(
+    optics: Optics, states: States, catalogue: Catalogue, markers: Index, sightings: Sightings, views: Views
+) -> Array:
+    """(2, 2, F * M) covariance of where markers are predicted, in the undistorted plane."""
+    owner = catalogue.robot[markers]
+    arm = np.einsum("nij,jn->ni", states.R[owner], catalogue.marker[:, markers])
+    P = states.P[owner]
+    at, along = _lever(states.R[owner], catalogue.marker[:, markers].T), _lever(np.eye(3), arm)
+    place, rate = at @ P[:, THETA] + P[:, POSITION], along @ P[:, OMEGA] + P[:, VELOCITY]
+    at, along = at.transpose(0, 2, 1), along.transpose(0, 2, 1)
+    C0 = place[:, :, THETA] @ at + place[:, :, POSITION]
+    C1 = place[:, :, OMEGA] @ along + place[:, :, VELOCITY]
+    C2 = rate[:, :, OMEGA] @ along + rate[:, :, VELOCITY]
+    C0, C1, C2 = (C.transpose(1, 2, 0)[:, :, None] for C in (C0, C1, C2))
+    tau, R = sightings.exposures.tau[:, None], optics.R_cam_world[sightings.exposures.camera]
+    C = C0 + tau * (C1 + C1.transpose(1, 0, 2, 3)) + tau**2 * C2
+    R = (
+        np.repeat(R[:, :2, :].transpose(1, 2, 0), len(markers), axis=2),
+        np.repeat(R[:, 2].T, len(markers), axis=1),
+    )
+    g = (R[0] - views.xy[:, None] * R[1]) / views.centre[2]
+    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C.reshape(3, 3, -1)), g)
 
 
-def _costs(views: Views, spread: Array, here: Index, seen: Sightings) -> Array:
-    """(M, N) squared Mahalanobis distances; infinite outside the gate."""
-    error = seen.uv[None] - views.uv[here, None]
-    S = spread[here, None] + seen.cov[None] + SLACK_PX**2 * np.eye(2)
-    det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] ** 2
-    u, v = error[..., 0], error[..., 1]
-    d2 = (S[..., 1, 1] * u * u - 2 * S[..., 0, 1] * u * v + S[..., 0, 0] * v * v) / det
-    with np.errstate(invalid="ignore"):
-        size = np.abs(np.log(seen.axes_px[None, :, 0] / views.major_px[here, None]))
-        outside = (d2 > GATE) | (size > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
-    return np.where(outside, np.inf, d2)
+def _lever(R: Array, v: Array) -> Array:
+    """(N, 3, 3) -R [v]x."""
+    W = np.zeros((len(v), 3, 3))
+    W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = v[:, 2], -v[:, 1], v[:, 0]
+    return R @ (W - W.transpose(0, 2, 1))
 
 
-def _assign(costs: Array) -> tuple[Index, Index]:
-    """The rows and columns of the cheapest assignment with as many pairs as there can be."""
-    open_ = np.isfinite(costs)
-    if (open_.sum(0) <= 1).all() and (open_.sum(1) <= 1).all():
-        a, b = np.nonzero(open_)
-        return a, b
-    a, b = linear_sum_assignment(np.where(open_, costs, 1e6))
-    kept = open_[a, b]
-    return a[kept], b[kept]
+def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sightings: Sightings) -> _Pairs:
+    """Detections within the gates of visible markers, found along x and then tested."""
+    noise = noise_xy(sightings, SLACK_PX)
+    visible = np.flatnonzero((views.facing > GRAZING) & np.isfinite(views.xy[0]))
+    worst = np.array([[np.max(noise[0, 0])], [np.max(noise[1, 1])]])
+    reach = np.sqrt(GATE * (spread[[0, 1], [0, 1]][:, visible] + worst))
+    i, j = _windows(discs.frame[visible], views.xy[:, visible], reach, sightings)
+    i = visible[i]
+    S = spread[:, :, i] + noise[:, :, j]
+    u, v = sightings.xy[:, j] - views.xy[:, i]
+    det = S[0, 0] * S[1, 1] - S[0, 1] ** 2
+    d2 = (S[1, 1] * u * u - 2 * S[0, 1] * u * v + S[0, 0] * v * v) / det
+    focal = optics.focal[sightings.camera[j]]
+    major_px = 2 * focal * discs.radius[i] / views.centre[2, i]
+    size = np.abs(np.log(sightings.axes_px[0, j] / major_px))
+    fits = (d2 < GATE) & ~(size > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
+    i, j, det, focal = i[fits], j[fits], det[fits], focal[fits]
+    return _Pairs(i, j, d2[fits] + np.log(det * focal**4))
+
+
+def noise_xy(sightings: Sightings, slack_px: float) -> Array:
+    """(2, 2, N) the detections' noise in the undistorted plane; `slack_px` is added to it."""
+    (a, b), (c, d) = sightings.scale
+    inverse = np.stack([np.stack([d, -b]), np.stack([-c, a])]) / (a * d - b * c)
+    cov = sightings.cov + slack_px**2 * np.eye(2)[:, :, None]
+    return np.nan_to_num(np.einsum("ian,abn,jbn->ijn", inverse, cov, inverse))
+
+
+def _windows(frame: Index, xy: Array, reach: Array, sightings: Sightings) -> tuple[Index, Index]:
+    """Pairs (row, sighting) of one frame whose xy differ by less than `reach`; by sorting x, for all frames at once."""
+    known = np.flatnonzero(np.isfinite(sightings.xy[0]))
+    key = sightings.frame[known] * FRAME_STEP + sightings.xy[0, known]
+    order = np.argsort(key)
+    key = key[order]
+    x, reach_x = frame * FRAME_STEP + xy[0], np.minimum(reach[0], FRAME_STEP / 10)
+    first = np.searchsorted(key, x - reach_x)
+    count = np.searchsorted(key, x + reach_x) - first
+    i = np.repeat(np.arange(len(x)), count)
+    within = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count)
+    j = known[order[np.repeat(first, count) + within]]
+    near = np.abs(sightings.xy[1, j] - xy[1, i]) < reach[1, i]
+    return i[near], j[near]
+
+
+def _assign(pairs: _Pairs, frame: Index) -> Index:
+    """The rows of the cheapest pairs, as many as there can be; what has no rival needs no search."""
+    rivals = np.maximum(np.bincount(pairs.marker)[pairs.marker], np.bincount(pairs.sighting)[pairs.sighting])
+    alone, contested = np.flatnonzero(rivals == 1), np.flatnonzero(rivals > 1)
+    at = frame[pairs.marker[contested]]
+    parts = [contested] if len(contested) < TOGETHER else [contested[at == k] for k in set(at.tolist())]
+    return np.concatenate([alone, *(_assign_rivals(pairs, part) for part in parts)])
+
+
+def _assign_rivals(pairs: _Pairs, rows: Index) -> Index:
+    i, n = _renumber(pairs.marker[rows])
+    j, m = _renumber(pairs.sighting[rows])
+    costs, number = np.full((n, m), UNMATCHED), np.full((n, m), -1)
+    costs[i, j], number[i, j] = pairs.cost[rows], rows
+    chosen = number[linear_sum_assignment(costs)]
+    return chosen[chosen >= 0]
+
+
+def _renumber(rows: Index) -> tuple[Index, int]:
+    """Rows counted from 0 without gaps, and how many there are."""
+    new = np.cumsum(np.bincount(rows) > 0)
+    return new[rows] - 1, int(new[-1]) if len(new) else 0

@@ -18,18 +18,23 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         listen: Zenoh endpoints on which the server is the router.
         zenoh: a Zenoh configuration (JSON5) for TLS, access control or scouting.
         rig: rig.yaml; without one the server waits for a calibration to be published.
+        kept_rig: where a rig that was published, or corrected after a bump, is kept over a restart; the newer of this
+            file and `rig` is in force. Not kept unless given.
         robots: robots.yaml.
         rate_hz: instants a second; without it those of the fastest camera.
         limits: see `Limits`.
+        shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
     """
 
     arena: str = "arena"
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     zenoh: str | None = None
     rig: str | None = None
+    kept_rig: str | None = None
     robots: str = "robots.yaml"
     rate_hz: float | None = None
     limits: Limits = Limits()
+    shard: str = "1/1"
 
     def __post_init__(self) -> None:
         if not is_name(self.arena):
@@ -49,7 +54,7 @@ def load_arena(path: Path) -> ArenaConfig:
     config = load_yaml(path, ArenaConfig)
     found = {
         name: str(path.parent / value)
-        for name in ("rig", "robots", "zenoh")
+        for name in ("rig", "kept_rig", "robots", "zenoh")
         if (value := getattr(config, name))
     }
     return override(config, **found)

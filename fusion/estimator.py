@@ -1,53 +1,37 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The estimator: one factor graph a robot and instant, eliminated by GTSAM (a lag-1 filter).
+"""The estimator: a factor graph an instant, eliminated by GTSAM (a lag-1 filter).
 
     posterior of the last instant -- white-noise-on-acceleration motion -- observations of this instant
 
-A robot's observations, each at its own capture time, are linearised in one numpy batch and weighed one by one
-(Cauchy); GTSAM gets them as one HessianFactor.
+All robots are one graph, of which each is a part of its own. What the last posterior and the motion say together is one
+HessianFactor a robot, what its observations say another; those, each at its own capture time, are linearised in one
+numpy batch over all robots and weighed one by one (Cauchy).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Discs, Optics, measured_outlines, place
-from fusion.state import States, forget_turn, predict
+from fusion.optics import Optics, measured_outlines, outlines
+from fusion.sightings import Observations
+from fusion.state import OMEGA, States, forget_turn, predict
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 CAUCHY = 4.0  # whitened distance at which an observation's weight is halved
 NOMINAL_WEIGHT = (
     0.8983  # mean Cauchy weight of Gaussian noise in two dimensions: E[1 / (1 + chi2_2 / CAUCHY^2)]
 )
-ITERATIONS = 2
+ITERATIONS = 8  # at the most
+REWEIGHTINGS = 4  # by one linearisation at the most; two mostly
+SETTLED = 0.1  # change of a weight that ends them
+SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
 STEP = 1e-4  # rad, of the difference quotient of an outline's shape
+STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more than noise does
-BEFORE, NOW = gtsam.symbol("x", 0), gtsam.symbol("x", 1)
-ORDERING = gtsam.Ordering()
-ORDERING.push_back(BEFORE)
-ORDERING.push_back(NOW)
-UNIT = gtsam.noiseModel.Unit.Create(12)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """N detections and the discs they are of: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), angle_rad (N,)."""
-
-    discs: Discs
-    uv: Array
-    cov: Array
-    axes_px: Array
-    angle_rad: Array
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> "Observations":
-        """The rows that a mask or an index array names."""
-        columns = (self.uv, self.cov, self.axes_px, self.angle_rad)
-        return Observations(self.discs.select(rows), *(column[rows] for column in columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,15 +46,70 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """Whitened linear equations A delta = b: A (N, 2, 12), b (N, 2), and the body of each."""
+    """Whitened linear equations A delta = b, columns last: A (2, 12, N), b (2, N), and the body of each.
 
-    body: NDArray[np.intp]
+    What can't be seen has A = b = 0.
+    """
+
+    body: Index
     A: Array
     b: Array
 
-    def weights(self) -> Array:
-        """(N,) Cauchy weights, scaled so that Gaussian noise keeps its information."""
-        return 1 / (1 + np.sum(self.b**2, 1) / CAUCHY**2) / NOMINAL_WEIGHT
+    def joined(self, other: "_Rows") -> "_Rows":
+        """Both."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__slots__)
+        return _Rows(*(np.concatenate(pair, axis=-1) for pair in pairs))
+
+
+class _System:
+    """The equations of B bodies side by side (B, S, 2, 13): A and b, zeros where a body has fewer than S."""
+
+    def __init__(self, rows: _Rows, n_bodies: int) -> None:
+        count = np.bincount(rows.body, minlength=n_bodies)
+        order = np.argsort(rows.body, kind="stable")
+        place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+        size = int(count.max())
+        self._at = np.empty(len(order), np.intp)
+        self._at[order] = rows.body[order] * size + place
+        table = np.zeros((n_bodies * size, 2, 13))
+        table[self._at, :, :12] = rows.A.transpose(2, 0, 1)
+        table[self._at, :, 12] = rows.b.T
+        self._table = table.reshape(n_bodies, size, 2, 13)
+        self.shape = (n_bodies, size)
+
+    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
+        """(B, 12, 12) information and (B, 12) right sides, by weights (B, S)."""
+        B = len(weights)
+        flat = self._table.reshape(B, -1, 13)
+        product = (self._table * weights[:, :, None, None]).reshape(B, -1, 13).transpose(0, 2, 1) @ flat
+        return product[:, :12, :12], product[:, :12, 12]
+
+    def remainder(self, step: Array) -> Array:
+        """(B, S, 2) whitened: what steps (B, 12) leave of b."""
+        return -np.einsum("bsak,bk->bsa", self._table, np.column_stack([step, -np.ones(len(step))]))
+
+    def remainder_of_rows(self, step: Array) -> Array:
+        """(2, N) the same, in the order of the rows."""
+        return self.remainder(step).reshape(-1, 2)[self._at].T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """Errors `delta` (N, 12) of all bodies; of the K seen the last step (K, 12), information and weights.
+
+    `remainder` (2, N) is whitened, in the order of the rows.
+    """
+
+    delta: Array
+    step: Array
+    information: Array
+    weights: Array
+    remainder: Array
+
+
+def _weights(remainder: Array) -> Array:
+    """(B, S) Cauchy weights, scaled so that Gaussian noise keeps its information."""
+    return 1 / (1 + np.sum(remainder**2, -1) / CAUCHY**2) / NOMINAL_WEIGHT
 
 
 class Estimator:
@@ -90,108 +129,170 @@ class Estimator:
     def predict(self, states: States, dt: Array) -> Prediction:
         """All robots, `dt` (N,) seconds later."""
         moved, F, Q = predict(states, dt, self.densities, self.single)
-        moved = replace(moved, P=np.where(self.single[:, None, None], forget_turn(moved.P), moved.P))
+        moved.P[self.single] = forget_turn(moved.P[self.single])
         return Prediction(states.P, moved, F, Q)
 
     def update(
-        self, prediction: Prediction, observations: Observations, iterations: int = ITERATIONS
-    ) -> States:
-        """Fuse an instant's observations; robots without any stay as predicted."""
-        seen = np.unique(observations.discs.body)
-        states = prediction.states
-        delta = np.zeros((len(states), 12))
+        self, prediction: Prediction, observations: Observations, small: float = SMALL
+    ) -> tuple[States, Array]:
+        """Fuse an instant's observations; robots without any stay as predicted.
+
+        Args:
+            prediction: the robots before.
+            observations: of this instant.
+            small: rad and m; after a larger correction everything is linearised anew.
+
+        Returns:
+            the states, and what remains of each observation (2, N), pixels; NaN where it can't be seen.
+        """
+        states, n = prediction.states, len(prediction.states)
+        seen = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
+        if not len(seen):
+            return states, np.empty((2, 0))
+        observations = self._loosened(states, observations)
+        prior, shaped = np.asarray(np.linalg.inv(states.P[seen]), float), _shaped(observations)
+        solve = partial(self._solve, states, observations, shaped, seen, prior)
+        solution = solve(np.zeros((n, 12)), None)
+        for _ in range(ITERATIONS - 1):
+            if np.max(np.abs(solution.step[:, :6])) < small:
+                break
+            solution = solve(solution.delta, solution.weights)
         P = states.P.copy()
-        shaped = _shaped(observations)
-        whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(observations.cov)), float)
-        motions = {k: _motion(prediction, k) for k in seen}
-        for _ in range(iterations):
-            rows = self._linearise(prediction.states.moved(delta), observations, whiten, shaped)
-            weights = rows.weights()
-            for k in seen:
-                mine = rows.body == k
-                step, P[k] = _eliminate(motions[k], rows.A[mine], rows.b[mine], weights[mine], delta[k])
-                delta[k] += step
+        P[seen] = np.linalg.inv(solution.information)
         P[self.single] = forget_turn(P[self.single])
-        return replace(prediction.states.moved(delta), P=P)
+        return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)
 
-    def errors(self, states: States, observations: Observations) -> tuple[Array, Array]:
-        """Reprojection errors (N, 2) in pixels, and their squared Mahalanobis lengths (N,) by detection noise."""
-        error = observations.uv - self.optics.view(states, observations.discs).uv
-        whitened = np.linalg.solve(np.linalg.cholesky(observations.cov), error[:, :, None])[:, :, 0]
-        return error, np.sum(whitened**2, 1)
+    def _solve(
+        self,
+        states: States,
+        observations: Observations,
+        shaped: Index,
+        seen: Index,
+        prior: Array,
+        delta: Array,
+        weights: Array | None,
+    ) -> "_Solution":
+        """Linearise once about the states displaced by `delta` (N, 12), weigh and eliminate."""
+        row = np.cumsum(np.bincount(seen, minlength=len(states))) - 1
+        rows = self._linearise(states.moved(delta), observations, shaped)
+        system = _System(replace(rows, body=row[rows.body]), len(seen))
+        displaced = np.einsum("nij,nj->ni", prior, delta[seen])
+        weights = np.ones(system.shape) if weights is None else weights
+        for _ in range(REWEIGHTINGS):
+            H, right = system.normal_equations(weights)
+            step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]
+            before, weights = weights, _weights(system.remainder(step))
+            if np.max(np.abs(weights - before), initial=0) < SETTLED:
+                break
+        H, right = system.normal_equations(weights)
+        step = _eliminate(prior + H, right - displaced)
+        delta = delta.copy()
+        delta[seen] += step
+        return _Solution(delta, step, prior + H, weights, system.remainder_of_rows(step))
 
-    def _linearise(
-        self, states: States, observations: Observations, whiten: Array, shaped: NDArray[np.bool_]
-    ) -> _Rows:
-        views = self.optics.view(states, observations.discs)
-        b = (whiten @ (observations.uv - views.uv)[:, :, None])[:, :, 0]
-        known = np.isfinite(b).all(1)
-        rows = _Rows(observations.discs.body[known], (whiten @ views.jacobian)[known], b[known])
-        shaped = shaped & known
-        if not shaped.any():
-            return rows
-        shapes = self._linearise_shapes(states, observations.select(shaped))
-        return _Rows(*(np.concatenate([getattr(rows, f), getattr(shapes, f)]) for f in rows.__slots__))
+    def select(self, rows: NDArray) -> "Estimator":
+        """The estimator of some of the robots."""
+        return Estimator(self.optics, self.densities[rows], self.single[rows])
 
-    def _linearise_shapes(self, states: States, seen: Observations) -> _Rows:
-        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
-        R, _, normal, centre = place(states, seen.discs)
-        # (n, 3, 3): as it is, and turned a little about the body's x and y
-        normals = normal[:, None] + STEP * np.stack([0 * normal, -R[:, :, 1], R[:, :, 0]], 1)
-        of = np.repeat(np.arange(len(seen)), 3)
-        expected = self.optics.outlines(
-            seen.discs.camera[of], centre[of], normals.reshape(-1, 3), seen.discs.radius[of]
+    def _loosened(self, states: States, observations: Observations) -> Observations:
+        """Late detections, their noise grown by what the body may have done since.
+
+        Within `STEADY_S` of the instant a velocity is taken as constant; over longer times white acceleration of
+        density q moves a marker by q tau^3 / 3.
+        """
+        tau = np.abs(observations.seen.tau)
+        if not (tau > STEADY_S).any():
+            return observations
+        late = np.maximum(tau - STEADY_S, 0)
+        q_turn, q = self.densities[observations.discs.body].T
+        arm2 = np.einsum("in,in->n", observations.discs.marker, observations.discs.marker)
+        poses = self.optics.pose(states, observations.seen.exposures)
+        z = self.optics.view(poses, observations.discs).centre[2]
+        scale = observations.seen.scale
+        moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_turn * arm2) * late**3 / 3 / z**2)
+        seen = replace(observations.seen, cov=observations.seen.cov + moved)
+        return Observations.seeing(seen, observations.discs)
+
+    def _linearise(self, states: States, observations: Observations, shaped: Index) -> _Rows:
+        """Rows of the observations in their order, then rows of the outlines `shaped`."""
+        discs, seen = observations.discs, observations.seen
+        poses = self.optics.pose(states, seen.exposures)
+        views = self.optics.view(poses, discs)
+        A = self.optics.derive(poses, seen.exposures, discs, views, observations.whiten)
+        A[:, OMEGA, self.single[discs.body]] = 0  # one marker's turning rate would but fit its noise
+        b = np.einsum("abn,bn->an", observations.whiten, seen.xy - views.xy)
+        unseen = ~np.isfinite(b[0])
+        if unseen.any():
+            A[..., unseen] = b[:, unseen] = 0
+            shaped = shaped[~unseen[shaped]]
+        rows = _Rows(discs.body, A, b)
+        return (
+            rows.joined(self._linearise_shapes(states, observations.select(shaped))) if len(shaped) else rows
         )
-        stretch = shears(measured_outlines(seen.axes_px, seen.angle_rad)[of], expected).reshape(-1, 3, 2)
-        A = np.zeros((len(seen), 2, 12))
-        A[:, :, :2] = -(stretch[:, 1:] - stretch[:, :1]).transpose(0, 2, 1) / STEP
-        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[:, 0, 0])) / seen.axes_px[:, 1]
-        return _Rows(seen.discs.body, A / sigma[:, None, None], stretch[:, 0] / sigma[:, None])
+
+    def _linearise_shapes(self, states: States, observations: Observations) -> _Rows:
+        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
+        seen, discs = observations.seen, observations.discs
+        poses = self.optics.pose(states, seen.exposures)
+        R, views = poses.R_cam[..., poses.columns(discs)], self.optics.view(poses, discs)
+        measured = measured_outlines(seen.axes_px, seen.angle_rad)
+        turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
+        at, about_x, about_y = (
+            shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
+        )
+        A = np.zeros((2, 12, len(discs)))
+        A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
+        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+        return _Rows(discs.body, A / sigma, at / sigma)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
-    """What the last instant tells of a body at this one: its information there, and whitened F and identity."""
-
-    information: Array
-    F: Array
-    identity: Array
+def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
+    """(N,) squared errors of observations in standard deviations, to which `slack_px` is added; inf if unseen."""
+    cov = observations.seen.cov
+    d2 = np.sum(remainder**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + slack_px**2)
+    return np.nan_to_num(d2, nan=np.inf)
 
 
-def _motion(prediction: Prediction, k: int) -> _Motion:
-    whiten = np.linalg.inv(np.linalg.cholesky(prediction.Q[k]))
-    return _Motion(np.linalg.inv(prediction.before[k]), whiten @ prediction.F[k], whiten)
+def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
+    """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
+    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
 
 
-def _eliminate(motion: _Motion, A: Array, b: Array, weights: Array, delta: Array) -> tuple[Array, Array]:
-    """The correction (12,) of a robot about its prediction displaced by `delta`, and its covariance."""
-    A, b = A.reshape(-1, 12), b.reshape(-1)
-    weighted = np.repeat(weights, 2)[:, None] * A
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(gtsam.HessianFactor(BEFORE, motion.information, np.zeros(12), 0.0))
-    graph.push_back(
-        gtsam.JacobianFactor(BEFORE, -motion.F, NOW, motion.identity, -motion.identity @ delta, UNIT)
-    )
-    graph.push_back(gtsam.HessianFactor(NOW, weighted.T @ A, weighted.T @ b, 0.0))
-    now = graph.eliminateSequential(ORDERING).at(1)
-    root = np.linalg.inv(now.R())
-    return root @ now.d(), root @ root.T
+def _eliminate(information: Array, right: Array) -> Array:
+    """(K, 12) corrections of K robots, by one elimination of all."""
+    graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    for k, (H, g) in enumerate(zip(information, right, strict=True)):
+        graph.push_back(gtsam.HessianFactor(k, H, g, 0.0))
+        ordering.push_back(k)
+    return graph.eliminateSequential(ordering).optimize().vector().reshape(-1, 12)
 
 
-def _shaped(observations: Observations) -> NDArray[np.bool_]:
-    """(N,) outlines of bodies of which fewer than three markers are seen: their shapes are needed."""
+def _in_pixels(observations: Observations, whitened: Array) -> Array:
+    """(2, N) of whitened remainders of the observations, which come first (2, N...)."""
+    whitened = whitened[:, : len(observations)]
+    (a, b), (c, d) = observations.whiten
+    error = np.stack([d * whitened[0] - b * whitened[1], a * whitened[1] - c * whitened[0]]) / (a * d - b * c)
+    return np.einsum("abn,bn->an", observations.seen.scale, error)
+
+
+def _shaped(observations: Observations) -> Index:
+    """Rows of outlines of bodies of which fewer than three markers are seen: their shapes are needed."""
     discs = observations.discs
-    places = np.unique(np.column_stack([discs.body, discs.marker]), axis=0)
-    seen = np.bincount(places[:, 0].astype(np.intp), minlength=1)
-    return (seen[discs.body] < 3) & np.isfinite(observations.axes_px).all(1)
+    body = np.full(np.max(discs.row, initial=0) + 1, -1)
+    body[discs.row] = discs.body
+    kinds = np.bincount(body[body >= 0], minlength=1)
+    return np.flatnonzero((kinds[discs.body] < 3) & np.isfinite(observations.seen.axes_px[1]))
 
 
 def shears(measured: Array, expected: Array) -> Array:
-    """(N, 2) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
+    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
 
     The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
     """
-    whiten = np.linalg.inv(np.linalg.cholesky(expected))
-    S = whiten @ measured @ whiten.transpose(0, 2, 1)
-    size = np.trace(S, axis1=1, axis2=2)[:, None] / 2
-    return np.stack([S[:, 0, 0] - S[:, 1, 1], 2 * S[:, 0, 1]], -1) / np.sqrt(2) / size
+    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
+    l10 = expected[:, 1, 0] / l00
+    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
+    a = measured[:, 0, 0] / l00**2
+    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
+    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
+    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))

@@ -1,24 +1,39 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Detections that no robot claims, matched across views into markers: epipolar geometry, and range by apparent size.
 
-Free-running cameras see a moving marker at different places, so gates widen with the time between captures.
+1. Two rays of two frames are a candidate where they meet, before both cameras, at a range that suits both sizes.
+2. A ray's candidates lie along it: the true ones agree about the range, the false ones scatter. The densest range wins.
+3. Rays whose points are within half a disc are one marker: discs can't overlap. In every frame the nearest stays.
+4. A ray that is left, or was too near another of its frame, joins the marker that it clearly meets.
+
+So one grouping comes out over all cameras, in which no detection is of two markers. A ray that meets two markers alike
+well joins neither. Free-running cameras see a moving marker at different places: gates widen with the time between.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
-from fusion.association import Sightings
 from fusion.optics import Optics
+from fusion.sightings import Sightings
+from fusion.state import skew
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 SPEED_M_S = 2.0  # of the fastest marker that is looked for
-SIGMAS = 3.0
-SLACK_PX = 0.7  # what a calibration may be off, and an outline's centre from the disc's
+SIGMAS = 3.5
+SLACK_PX = 0.5  # what a calibration may be off, and an outline's centre from the disc's
 DIAMETER_TOLERANCE = 0.2  # between the size that a view implies and a robot's marker
 MIN_PARALLAX = np.sin(np.radians(3)) ** 2
+FAR_M = 50.0  # the range where no size tells one
+RAY_STEP = 1e4  # m: keeps the rays' ranges apart on one sorted axis
+FEW = 60  # rays of which all pairs are looked at
+CLEARLY = 0.5  # how much nearer a ray must be to one marker than to any other, of their distances
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +63,15 @@ class _Rays:
     camera: Index
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Meetings:
+    """E candidates seen from one ray each: the ray, the range along it, and how well that range is known."""
+
+    ray: Index
+    range_m: Array
+    reach_m: Array
+
+
 def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -> list[Marker]:
     """Markers that two or more cameras saw, as one grouping in which no detection is of two markers.
 
@@ -57,51 +81,78 @@ def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -
         rows: those of them that are free.
         diameters: sizes of marker in use; where axes are unknown, geometry alone decides.
     """
+    rows = rows[np.isfinite(sightings.xy[0, rows])]
     rays = _cast(optics, sightings, rows)
-    points = _pair(rays, diameters)
+    met, points = _agree(rays, _meet(rays, diameters))
     if not len(points):
         return []
-    near, miss = _support(rays, points)
-    found = near.any(1)
-    near, miss, points = near[found], miss[found], points[found]
-    mean_miss = np.where(near, miss, 0).sum(1) / near.sum(1)
-    markers, free = [], np.ones(len(rows), bool)
-    for k in np.lexsort((mean_miss, -near.sum(1))):
-        members = np.flatnonzero(near[k])
-        if free[members].all():
-            markers.append(_triangulate(rays, members, points[k], rows))
-            free[members] = False
-    return markers
+    owner, centres = _cluster(rays, met, points, np.min(diameters) / 2)
+    for _ in range(2):
+        owner, centres = _settle(rays, owner, centres)
+    owner, centres = _settle(rays, np.where(_crowded(rays), -1, owner), centres)
+    owner = _join(rays, owner, centres)
+    return _markers(rays, owner, centres, rows)
 
 
 def _cast(optics: Optics, sightings: Sightings, rows: Index) -> _Rays:
     seen = sightings.select(rows)
-    d = np.full((len(rows), 3), np.nan)
-    for k in np.unique(seen.camera):
-        d[seen.camera == k] = optics.rays(int(k), seen.uv[seen.camera == k])
-    noise = np.sqrt(np.trace(seen.cov, axis1=1, axis2=2) / 2 + SLACK_PX**2)
-    focal = optics.focal[seen.camera]
-    depth = np.einsum("ni,ni->n", optics.R_cam_world[seen.camera][:, 2], d)  # per metre of range
-    size = seen.axes_px[:, 0] * depth / focal
-    o = optics.centres[seen.camera]
-    return _Rays(o, d, noise / focal, size, seen.tau, seen.frame, seen.camera)
+    camera, d = seen.camera, optics.rays(seen.camera, seen.xy)
+    noise = np.sqrt((seen.cov[0, 0] + seen.cov[1, 1]) / 2 + SLACK_PX**2)
+    focal = optics.focal[camera]
+    depth = 1 / np.sqrt(1 + seen.xy[0] ** 2 + seen.xy[1] ** 2)  # per metre of range
+    size = seen.axes_px[0] * depth / focal
+    return _Rays(optics.centres[camera], d, noise * depth / focal, size, seen.tau, seen.frame, camera)
 
 
-def _pair(rays: _Rays, diameters: Array) -> Array:
-    """(H, 3) points where two rays of different cameras meet and the sizes agree."""
-    i, j = np.triu_indices(len(rays.o), 1)
-    other = (rays.camera[i] != rays.camera[j]) & np.isfinite(rays.d[i] + rays.d[j]).all(1)
-    i, j = i[other], j[other]
-    w, b = rays.o[i] - rays.o[j], np.sum(rays.d[i] * rays.d[j], 1)
-    wi, wj = np.sum(w * rays.d[i], 1), np.sum(w * rays.d[j], 1)
+def _meet(rays: _Rays, diameters: Array) -> _Meetings:
+    """Where two rays of different cameras meet and the sizes agree; told to both rays."""
+    i, j = _pairs(rays, diameters)
+    w, b = rays.o[i] - rays.o[j], np.einsum("ni,ni->n", rays.d[i], rays.d[j])
+    wi, wj = np.einsum("ni,ni->n", w, rays.d[i]), np.einsum("ni,ni->n", w, rays.d[j])
     parallax = np.maximum(1 - b * b, 1e-12)
     s, t = (b * wj - wi) / parallax, (wj - b * wi) / parallax
-    a, c = rays.o[i] + s[:, None] * rays.d[i], rays.o[j] + t[:, None] * rays.d[j]
+    fits = (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
+    fits &= _fits(rays.size[i] * s, diameters) & _fits(rays.size[j] * t, diameters)
+    i, j, s, t, parallax = i[fits], j[fits], s[fits], t[fits], parallax[fits]
+    between = w[fits] + s[:, None] * rays.d[i] - t[:, None] * rays.d[j]
     reach = SIGMAS * np.hypot(rays.sigma[i] * s, rays.sigma[j] * t)
     reach += SPEED_M_S * np.abs(rays.tau[i] - rays.tau[j])
-    meets = (np.linalg.norm(a - c, axis=1) < reach) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
-    fits = _fits(rays.size[i] * s, diameters) & _fits(rays.size[j] * t, diameters)
-    return ((a + c) / 2)[meets & fits]
+    meets = np.einsum("ni,ni->n", between, between) < reach**2
+    i, j, s, t = i[meets], j[meets], s[meets], t[meets]
+    along = (reach / np.sqrt(parallax))[meets]
+    return _Meetings(np.concatenate([i, j]), np.concatenate([s, t]), np.concatenate([along, along]))
+
+
+def _pairs(rays: _Rays, diameters: Array) -> tuple[Index, Index]:
+    """Pairs of rays of different cameras that may meet; of few rays, all pairs."""
+    if len(rays.frame) <= FEW:
+        i, j = np.triu_indices(len(rays.frame), 1)
+        other = rays.camera[i] != rays.camera[j]
+        return i[other], j[other]
+    order = np.argsort(rays.frame, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(rays.frame[order])) + 1)
+    farthest = np.where(np.isfinite(rays.size), (1 + DIAMETER_TOLERANCE) * diameters.max() / rays.size, FAR_M)
+    near = [
+        _near_pairs(rays, a, b, farthest)
+        for a, b in combinations(parts, 2)
+        if rays.camera[a[0]] != rays.camera[b[0]]
+    ]
+    i, j = (np.concatenate([np.empty(0, np.intp), *(pair[k] for pair in near)]) for k in (0, 1))
+    return i, j
+
+
+def _near_pairs(rays: _Rays, a: Index, b: Index, farthest: Array) -> tuple[Index, Index]:
+    """Rays of two frames that pass each other as near as noise at their farthest range explains, at the least.
+
+    With w from one centre to the other their distance is |w (d_a x d_b)| / |d_a x d_b|: a matrix product.
+    """
+    w = rays.o[a[0]] - rays.o[b[0]]
+    reach = SIGMAS * rays.sigma[a] * farthest[a] + np.max(SIGMAS * rays.sigma[b] * farthest[b])
+    reach += SPEED_M_S * abs(rays.tau[a[0]] - rays.tau[b[0]])
+    d_a, d_b = rays.d[a].astype(np.float32), rays.d[b].T.astype(np.float32)
+    plane = d_a @ (skew(w).T.astype(np.float32)) / reach[:, None].astype(np.float32)
+    i, j = np.nonzero((plane @ d_b) ** 2 + (d_a @ d_b) ** 2 < 1)
+    return a[i], b[j]
 
 
 def _fits(size: Array, diameters: Array) -> NDArray[np.bool_]:
@@ -109,35 +160,130 @@ def _fits(size: Array, diameters: Array) -> NDArray[np.bool_]:
     return np.isnan(size) | (np.abs(ratio - 1) < DIAMETER_TOLERANCE).any(-1)
 
 
-def _support(rays: _Rays, points: Array) -> tuple[NDArray[np.bool_], Array]:
-    """(H, N) the nearest sighting to each point in every frame, if near enough, and (H, N) how far it misses."""
-    to = points[:, None] - rays.o
-    along = np.einsum("hni,ni->hn", to, rays.d)
-    off = np.linalg.norm(to - along[..., None] * rays.d, axis=2)
-    reach = SIGMAS * rays.sigma * along + SPEED_M_S * np.abs(rays.tau - rays.tau.mean())
-    with np.errstate(invalid="ignore", divide="ignore"):
-        miss = np.where((off < reach) & (along > 0), off / reach, np.inf)
-    near = np.zeros(miss.shape, bool)
-    for frame in np.unique(rays.frame):
-        columns = np.flatnonzero(rays.frame == frame)
-        best = columns[np.argmin(miss[:, columns], 1)]
-        near[np.arange(len(points)), best] = np.isfinite(miss[np.arange(len(points)), best])
-    seen_twice = near.sum(1) >= 2
-    return near & seen_twice[:, None], miss
+def _agree(rays: _Rays, met: _Meetings) -> tuple[Index, Array]:
+    """The rays that meet any other, and the point (K, 3) of each at the range on which most meetings agree."""
+    order = np.argsort(met.ray * RAY_STEP + met.range_m)
+    ray, range_m, reach = met.ray[order], met.range_m[order], met.reach_m[order]
+    key = ray * RAY_STEP + range_m
+    first, last = np.searchsorted(key, key - reach), np.searchsorted(key, key + reach)
+    total = np.concatenate([[0.0], np.cumsum(range_m)])
+    weight = (last - first) - reach / (1 + reach)  # among equals, what is known best
+    if not len(ray):
+        return ray, np.empty((0, 3))
+    begin = np.flatnonzero(np.diff(ray, prepend=-1))
+    highest = np.maximum.reduceat(weight, begin)
+    best = np.flatnonzero(weight == np.repeat(highest, np.diff(begin, append=len(ray))))
+    best = best[np.diff(ray[best], prepend=-1) > 0]
+    mean = (total[last] - total[first])[best] / (last - first)[best]
+    return ray[best], rays.o[ray[best]] + mean[:, None] * rays.d[ray[best]]
 
 
-def _triangulate(rays: _Rays, members: Index, near: Array, rows: Index) -> Marker:
-    """The point of least squared distance to the rays, weighed by their noise and by motion between captures."""
-    d = rays.d[members]
-    range_m = np.linalg.norm(near - rays.o[members], axis=1)
-    moved = SPEED_M_S / SIGMAS * np.abs(rays.tau[members] - rays.tau[members].mean())
-    weight = 1 / ((rays.sigma[members] * range_m) ** 2 + moved**2)
-    across = weight[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None])
-    covariance = np.linalg.inv(across.sum(0) + 1e-9 * np.eye(3))
-    position = covariance @ np.einsum("nij,nj->i", across, rays.o[members])
-    sizes = rays.size[members] * range_m
-    known = sizes[np.isfinite(sizes)]
-    cameras = rays.camera[members]
-    return Marker(
-        position, covariance, rows[members], cameras, float(np.median(known)) if len(known) else np.nan
-    )
+def _cluster(rays: _Rays, met: Index, points: Array, radius: float) -> tuple[Index, Array]:
+    """Owners (N,) and their centres: points that a chain of steps shorter than `radius` joins are of one marker."""
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    number = connected_components(graph, directed=False)[1]
+    owner = np.full(len(rays.o), -1)
+    owner[met] = number
+    sums = np.column_stack([np.bincount(number, points[:, k]) for k in range(3)])
+    return owner, sums / np.bincount(number)[:, None]
+
+
+def _settle(rays: _Rays, owner: Index, centres: Array) -> tuple[Index, Array]:
+    """Owners without rays that miss their centre, or that are not the nearest of their frame; and better centres.
+
+    Groups that fewer than two cameras see are dissolved; the rest are counted from 0.
+    """
+    held = np.flatnonzero(owner >= 0)
+    miss = _miss(rays, held, centres[owner[held]])
+    order = np.lexsort((miss, rays.frame[held], owner[held]))
+    order = order[miss[order] < 1]
+    rank = owner[held[order]] * (int(rays.frame.max()) + 1) + rays.frame[held[order]]
+    first = held[order[np.concatenate([[True], np.diff(rank) > 0])]] if len(order) else order
+    kept = np.full(len(owner), -1)
+    kept[first] = owner[first]
+    number = _number(rays, kept, len(centres))
+    kept[first] = number[kept[first]]
+    return kept, _triangulate(rays, kept, centres[number >= 0])[0]
+
+
+def _number(rays: _Rays, owner: Index, n: int) -> Index:
+    """(n,) numbers from 0 of the groups that two cameras see, -1 for the rest."""
+    held = owner >= 0
+    seen = np.zeros((n, int(rays.camera.max(initial=0)) + 1), bool)
+    seen[owner[held], rays.camera[held]] = True
+    kept = seen.sum(1) >= 2
+    return np.where(kept, np.cumsum(kept) - 1, -1)
+
+
+def _crowded(rays: _Rays) -> NDArray[np.bool_]:
+    """(N,) rays so near another of their frame that noise may have exchanged them."""
+    reach = 2 * SIGMAS * rays.sigma
+    near = KDTree(rays.d + rays.frame[:, None] * 10.0).query_pairs(float(reach.max()), output_type="ndarray")
+    apart = np.linalg.norm(rays.d[near[:, 0]] - rays.d[near[:, 1]], axis=1)
+    crowded = np.zeros(len(rays.d), bool)
+    crowded[near[apart < reach[near[:, 0]]]] = True
+    return crowded
+
+
+def _triangulate(rays: _Rays, owner: Index, near: Array) -> tuple[Array, Array]:
+    """(K, 3) points of least squared distance to their rays, and covariances (K, 3, 3).
+
+    Rays are weighed by noise, at their ranges to `near` (K, 3), and by motion.
+    """
+    held = np.flatnonzero(owner >= 0)
+    k, n, o, d = owner[held], len(near), rays.o[held], rays.d[held]
+    range_m = np.einsum("ni,ni->n", near[k] - o, d)
+    moved = SPEED_M_S / SIGMAS * np.abs(rays.tau[held])
+    weight = 1 / ((rays.sigma[held] * range_m) ** 2 + moved**2)
+    across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
+    sums = np.zeros((n, 3, 4))
+    for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        sums[:, row, column] = sums[:, column, row] = np.bincount(k, across[row, column], n)
+    for row, side in enumerate(np.einsum("ijn,nj->in", across, o)):
+        sums[:, row, 3] = np.bincount(k, side, n)
+    covariance = np.asarray(np.linalg.inv(sums[:, :, :3] + 1e-9 * np.eye(3)), float)
+    return np.einsum("nij,nj->ni", covariance, sums[:, :, 3]), covariance
+
+
+def _miss(rays: _Rays, rows: Index, points: Array) -> Array:
+    """(N,) how far rays miss points (N, 3), each its own, as a share of what noise and motion explain."""
+    to = points - rays.o[rows]
+    along = np.einsum("ni,ni->n", to, rays.d[rows])
+    off = np.sqrt(np.maximum(np.einsum("ni,ni->n", to, to) - along**2, 0))
+    reach = SIGMAS * rays.sigma[rows] * along + SPEED_M_S * np.abs(rays.tau[rows])
+    return np.where(along > 0, off / np.maximum(reach, 1e-9), np.inf)
+
+
+def _join(rays: _Rays, owner: Index, centres: Array) -> Index:
+    """Owners, with free rays given to the marker that they meet, if clearly one, that has no ray of their frame."""
+    free = np.flatnonzero(owner < 0)
+    if not len(free) or not len(centres):
+        return owner
+    taken = np.zeros((len(centres), int(rays.frame.max()) + 1), bool)
+    taken[owner[owner >= 0], rays.frame[owner >= 0]] = True
+    every = np.tile(np.arange(len(centres)), len(free))
+    miss = _miss(rays, np.repeat(free, len(centres)), centres[every]).reshape(len(free), -1)
+    two = np.partition(np.column_stack([miss, np.full(len(free), np.inf)]), 1, axis=1)[:, :2]
+    best = np.argmin(miss, 1)
+    clear = (two[:, 0] < 1) & (two[:, 0] < CLEARLY * two[:, 1]) & ~taken[best, rays.frame[free]]
+    owner = owner.copy()
+    owner[free[clear]] = best[clear]
+    return owner
+
+
+def _markers(rays: _Rays, owner: Index, centres: Array, rows: Index) -> list[Marker]:
+    centres, covariance = _triangulate(rays, owner, centres)
+    held = np.flatnonzero(owner >= 0)
+    sizes = rays.size[held] * np.linalg.norm(centres[owner[held]] - rays.o[held], axis=1)
+    order = np.argsort(owner[held], kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(owner[held][order])) + 1) if len(held) else []
+    return [
+        Marker(centres[k], covariance[k], rows[held[part]], rays.camera[held[part]], _median(sizes[part]))
+        for k, part in enumerate(parts)
+    ]
+
+
+def _median(sizes: Array) -> float:
+    known = np.sort(sizes[np.isfinite(sizes)])
+    return float(known[len(known) // 2]) if len(known) else np.nan

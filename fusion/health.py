@@ -94,14 +94,16 @@ class Health:
                 camera.unused += use.unused
                 camera.squared_px += use.squared_px
 
-    def status(self, now_ns: int, calibrated: set[str], late: dict[str, int]) -> FusionStatus | None:
+    def status(
+        self, now_ns: int, calibrated: set[str], late: dict[str, int], aside: set[str]
+    ) -> FusionStatus | None:
         """The status of the last second, or None before it is over."""
         if now_ns - self._since_ns < PERIOD_NS:
             return None
         seconds = (now_ns - self._since_ns) * 1e-9 if self._since_ns else 1.0
         self._find_gone(now_ns)
         cameras = {
-            name: _told(c, seconds, late.get(name, 0), name in calibrated)
+            name: _told(c, seconds, late.get(name, 0), name in calibrated, name in aside)
             for name, c in self._cameras.items()
         }
         cpu_s = time.process_time()
@@ -136,7 +138,7 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # macOS counts bytes
 
 
-def _told(camera: _Camera, seconds: float, late: int, calibrated: bool) -> CameraHealth:
+def _told(camera: _Camera, seconds: float, late: int, calibrated: bool, aside: bool) -> CameraHealth:
     """What the last second says of a camera, which is then forgotten."""
     told = CameraHealth(
         fps=len(camera.lateness_ms) / seconds,
@@ -146,6 +148,7 @@ def _told(camera: _Camera, seconds: float, late: int, calibrated: bool) -> Camer
         unused=camera.unused,
         late=late,
         calibrated=calibrated,
+        aside=aside,
     )
     camera.lateness_ms.clear()
     camera.used = camera.unused = 0

@@ -3,12 +3,17 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calib.camera import Camera
+from camera_node.lens import Lens
 from camera_node.messages import Detections
 from camera_node.roundels import Roundels
+
+Array = NDArray[np.float64]
 
 LEARN_FRAMES = 8  # of one camera, from which its rate is learnt
 DEFAULT_NS = 33_333_333  # the period where no camera sent two frames
@@ -18,19 +23,42 @@ MAX_GAP_NS = 2_000_000_000  # a longer silence of all cameras starts a new row o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A camera's roundels at `t_ns`, its capture time with the calibrated offset; `sent_ns` and `received_ns` live."""
+    """A camera's roundels at `t_ns`, its capture time with the calibrated offset; `sent_ns` and `received_ns` live.
+
+    `xy` (2, N) are their undistorted centres, NaN where the lens has no inverse, and `scale` (2, 2, N) the derivative
+    of raw pixels by `xy`: the lens is used here, and nowhere after.
+    """
 
     camera: str
     t_ns: int
     roundels: Roundels
+    xy: Array
+    scale: Array
     sent_ns: int = 0
     received_ns: int = 0
+    exposure_us: float = 0.0
+    detect_us: float = 0.0
 
     @classmethod
-    def of(cls, message: Detections, time_offset_ms: float = 0.0, received_ns: int = 0) -> "Frame":
-        """The frame that a message tells of."""
-        t_ns = message.t_ns + round(time_offset_ms * 1e6)
-        return cls(message.camera, t_ns, message.unpack(), message.sent_ns, received_ns)
+    def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "Frame":
+        """The frame that a message of a calibrated camera tells of."""
+        t_ns = message.t_ns + round(camera.time_offset_ms * 1e6)
+        measured = cls.measure(message.camera, t_ns, message.unpack(), camera)
+        return replace(
+            measured,
+            sent_ns=message.sent_ns,
+            received_ns=received_ns,
+            exposure_us=message.exposure_us,
+            detect_us=message.detect_us,
+        )
+
+    @classmethod
+    def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":
+        """The frame of roundels that a lens saw."""
+        xy = lens.normalise(roundels.uv)
+        scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
+        columns = np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))
+        return cls(name, t_ns, roundels, *columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

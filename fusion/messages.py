@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.messages import VERSION, MessageError
+from fusion.robots import Robot
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -18,7 +19,9 @@ State = Literal["tracked", "coasting", "lost"]
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
     """Where the time went, from the newest exposure's middle to the pose's publication, milliseconds."""
 
-    camera_ms: float  # middle of the exposure until the message was sent: read-out and detection
+    exposure_ms: float = 0.0  # middle of the exposure until its end; 0 where unknown
+    detect_ms: float = 0.0  # from the frame in memory to the roundels
+    camera_ms: float  # middle of the exposure until the message was sent: both of these, and read-out
     network_ms: float  # until the server had it
     wait_ms: float  # until the instant was complete
     fuse_ms: float  # association and estimation
@@ -114,6 +117,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     unused: int  # detections that nothing took
     late: int  # frames dropped since the start because they came too late
     calibrated: bool
+    aside: bool = False  # it was moved: its detections are set aside until it is placed anew
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,3 +132,29 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, State]
     faults: dict[str, int]
+
+
+def robots_key(arena: str) -> str:
+    """The queryable that takes a `RobotsRequest` and answers with `Robots`."""
+    return f"{arena}/robots"
+
+
+def undo_key(arena: str) -> str:
+    """The queryable that takes back the last pose which the server found of a moved camera."""
+    return f"{arena}/rig/undo"
+
+
+class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What to change of the robots while the server runs; all of it or, if it makes no sense, nothing."""
+
+    version: int = VERSION
+    rename: dict[str, str] = {}  # old name -> new name, done first: a renamed robot stays tracked
+    remove: tuple[str, ...] = ()
+    define: dict[str, Robot] = {}  # new ones, or new markers of old ones, which are then searched for anew
+
+
+class Robots(msgspec.Struct, frozen=True, kw_only=True):
+    """The robots that the server looks for."""
+
+    version: int = VERSION
+    robots: dict[str, Robot]

@@ -4,10 +4,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.association import Sightings
 from fusion.estimator import AXIS_SIGMA_PX, shears
 from fusion.grouping import Marker
-from fusion.optics import Optics, measured_outlines
+from fusion.optics import Optics, measured_outlines, outlines
+from fusion.sightings import Sightings
 
 Array = NDArray[np.float64]
 DIRECTIONS = 600  # over the sphere, about 9 degrees apart: the estimator does the rest
@@ -18,22 +18,24 @@ ELSEWHERE = np.cos(np.radians(40))
 def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: float) -> Array | None:
     """The unit normal (3,) in the world, or None where the views do not settle it."""
     seen = sightings.select(marker.sightings)
-    seen = seen.select(np.flatnonzero(np.isfinite(seen.axes_px).all(1)))
+    seen = seen.select(np.flatnonzero(np.isfinite(seen.axes_px[0])))
     normals = fibonacci_sphere(DIRECTIONS)
     to = optics.centres[seen.camera] - marker.position
     normals = normals[(normals @ to.T > 0).all(1)]
     if not len(seen) or not len(normals):
         return None
     n, v = len(normals), len(seen)
-    expected = optics.outlines(
-        np.tile(seen.camera, n),
-        np.tile(marker.position, (n * v, 1)),
-        np.repeat(normals, v, 0),
+    R = optics.R_cam_world[seen.camera]
+    centre = np.einsum("vij,vj->iv", R, -to)
+    expected = outlines(
+        np.tile(centre, n),
+        np.einsum("vij,nj->inv", R, normals).reshape(3, -1),
         np.full(n * v, radius),
+        np.tile(seen.scale, n),
     )
     measured = np.tile(measured_outlines(seen.axes_px, seen.angle_rad), (n, 1, 1))
-    sigma = 2 * AXIS_SIGMA_PX / seen.axes_px[:, 1]
-    chi2 = ((shears(measured, expected).reshape(n, v, 2) / sigma[:, None]) ** 2).sum((1, 2))
+    sigma = 2 * AXIS_SIGMA_PX / seen.axes_px[1]
+    chi2 = ((shears(measured, expected).reshape(2, n, v) / sigma) ** 2).sum((0, 2))
     best = int(np.argmin(chi2))
     elsewhere = chi2[normals @ normals[best] < ELSEWHERE]
     return normals[best] if not len(elsewhere) or elsewhere.min() > chi2[best] + CLEARLY else None

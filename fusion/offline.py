@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion run`: a recording's every instant, by the code that runs live, as `poses.csv`."""
+"""`fusion run` and `fusion replay`: a recording's every instant, by the code that runs live, as `poses.csv`."""
 
 import csv
 import io
@@ -15,12 +15,14 @@ from calib.camera import Camera
 from calib.rig import load_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections
+from camera_node.messages import Detections, Keys, encode
 from camera_node.observations import detect_frames, read_observations
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose
+from fusion.recording import RecordingWriter, iterate, read_recording
 from fusion.report import Fused
 from fusion.robots import Robot, load_robots
+from fusion.smoothing import Smoother
 from fusion.tracker import Limits, Tracker
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
@@ -63,28 +65,40 @@ class Summary:
 
 
 def fuse_recording(
-    messages: Iterable[Detections],
+    messages: Iterable[tuple[int, Detections]],
     cameras: dict[str, Camera],
     robots: dict[str, Robot],
     rate_hz: float | None = None,
     limits: Limits | None = None,
     faults: Counter[str] | None = None,
+    smooth: bool = False,
 ) -> Iterator[Fused]:
-    """Fuse recorded detections, in order of time.
+    """Fuse recorded detections, in order of arrival.
 
     Args:
-        messages: detections of all cameras, in any order.
+        messages: detections of all cameras, and when each arrived (ns).
         cameras: the placed ones.
         robots: see `load_robots`.
         rate_hz: of the instants; without it that of the fastest camera.
         limits: see `Limits`.
         faults: counts what is skipped, by its reason.
+        smooth: tell of each instant by all of them, at the end.
     """
     limits = limits or Limits()
     tracker = Tracker(cameras, robots, limits)
-    period_ns = round(1e9 / rate_hz) if rate_hz else None
-    for instant in _gather(messages, cameras, Instants(period_ns, round(limits.lateness_ms * 1e6)), faults):
-        yield tracker.fuse(instant)
+    smoother = Smoother(tracker) if smooth else None
+    instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(limits.lateness_ms * 1e6))
+    told = Counter() if faults is None else faults
+    for instant in _gather(messages, cameras, instants, told):
+        fused = tracker.fuse(instant)
+        if smoother is None:
+            yield fused
+        else:
+            smoother.add(fused)
+        for move in tracker.inspect():
+            told[f"camera '{move.name}' was moved{', and placed anew' if move.camera else ''}"] += 1
+    if smoother is not None:
+        yield from smoother.smooth()
 
 
 def run(
@@ -95,6 +109,7 @@ def run(
     frames: Path | None = None,
     observations: Path | None = None,
     rate_hz: float | None = None,
+    smooth: bool = False,
 ) -> int:
     """Robot poses of every instant of a recording.
 
@@ -105,16 +120,67 @@ def run(
         frames: a folder of <camera>/<t_ns>.png or .jpg.
         observations: an observations.csv instead of frames.
         rate_hz: instants a second; without it those of the fastest camera.
+        smooth: let each pose be told by the instants after it too.
     """
     if (frames is None) == (observations is None):
         raise ConfigError("give either --frames FOLDER or --observations CSV")
-    if rate_hz is not None and not 0.1 <= rate_hz <= 1000:
-        raise ConfigError(f"--rate-hz {rate_hz} is not within 0.1 and 1000")
+    _check_rate(rate_hz)
     cameras = load_rig(rig).require_placed(rig)
     declared = load_robots(robots)
-    messages = _read(frames, observations, cameras)
+    messages = _in_order(_read(frames, observations, cameras), cameras)
     summary = Summary()
-    fused = fuse_recording(messages, cameras, declared, rate_hz, faults=summary.faults)
+    fused = fuse_recording(messages, cameras, declared, rate_hz, faults=summary.faults, smooth=smooth)
+    _tell(fused, out, summary, declared)
+    return 0
+
+
+def replay(
+    recording: Path,
+    /,
+    *,
+    out: Path,
+    rig: Path | None = None,
+    robots: Path | None = None,
+    rate_hz: float | None = None,
+    smooth: bool = False,
+) -> int:
+    """Fuse a recording (MCAP) anew, by the code that runs live, each message when it arrived.
+
+    Args:
+        recording: the MCAP file.
+        out: what to write: poses.csv, or .mcap with the same detections and the new poses and markers.
+        rig: another rig.yaml than the recorded one.
+        robots: another robots.yaml than the recorded one.
+        rate_hz: instants a second; without it those of the fastest camera.
+        smooth: let each pose be told by the instants after it too.
+    """
+    _check_rate(rate_hz)
+    recorded = read_recording(recording)
+    if rig is None and recorded.rig is None:
+        raise ConfigError(f"{recording} holds no rig; give --rig rig.yaml")
+    if robots is None and not recorded.robots:
+        raise ConfigError(f"{recording} holds no robots; give --robots robots.yaml")
+    cameras = load_rig(rig).require_placed(rig) if rig else recorded.rig.placed() if recorded.rig else {}
+    declared = load_robots(robots) if robots else recorded.robots
+    summary = Summary(faults=recorded.faults)
+    fused = fuse_recording(
+        recorded.detections, cameras, declared, rate_hz, faults=summary.faults, smooth=smooth
+    )
+    if out.suffix == ".mcap":
+        _copy(recording, out, track(fused, "fusing", transient=True), summary)
+        print("\n".join([*summary.lines(declared), f"wrote {out}"]))
+    else:
+        _tell(fused, out, summary, declared)
+    return 0
+
+
+def _check_rate(rate_hz: float | None) -> None:
+    if rate_hz is not None and not 0.1 <= rate_hz <= 1000:
+        raise ConfigError(f"--rate-hz {rate_hz} is not within 0.1 and 1000")
+
+
+def _tell(fused: Iterable[Fused], out: Path, summary: Summary, robots: Iterable[str]) -> None:
+    """Write poses.csv and say what was found."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS.split(","))
@@ -122,8 +188,21 @@ def run(
         summary.add(instant)
         writer.writerows(map(_row, instant.poses))
     write_atomically(out, text.getvalue())
-    print("\n".join([*summary.lines(declared), f"wrote {out}"]))
-    return 0
+    print("\n".join([*summary.lines(robots), f"wrote {out}"]))
+
+
+def _copy(recording: Path, out: Path, fused: Iterable[Fused], summary: Summary) -> None:
+    """A recording with the same messages but other poses and markers, which stand at their instants."""
+    entries = [e for e in iterate(recording, Counter()) if not e[0].endswith(("/pose", "/markers"))]
+    arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]
+    keys = Keys(arena)
+    for instant in fused:
+        summary.add(instant)
+        entries += [(keys.robot_pose(pose.robot), encode(pose), instant.t_ns) for pose in instant.poses]
+        entries.append((keys.markers, encode(instant.markers), instant.t_ns))
+    with RecordingWriter(out) as writer:
+        for entry in sorted(entries, key=lambda entry: entry[2]):
+            writer.put(*entry)
 
 
 def _read(frames: Path | None, observations: Path | None, cameras: dict[str, Camera]) -> list[Detections]:
@@ -133,25 +212,31 @@ def _read(frames: Path | None, observations: Path | None, cameras: dict[str, Cam
     return read_observations(observations, {name: (c.width, c.height) for name, c in cameras.items()})
 
 
+def _in_order(messages: Iterable[Detections], cameras: dict[str, Camera]) -> list[tuple[int, Detections]]:
+    """Messages as if each arrived at its true capture time."""
+    offset = {name: round(camera.time_offset_ms * 1e6) for name, camera in cameras.items()}
+    arrivals = [(message.t_ns + offset.get(message.camera, 0), message) for message in messages]
+    return sorted(arrivals, key=lambda arrival: arrival[0])
+
+
 def _gather(
-    messages: Iterable[Detections],
+    messages: Iterable[tuple[int, Detections]],
     cameras: dict[str, Camera],
     instants: Instants,
-    faults: Counter[str] | None,
+    faults: Counter[str],
 ) -> Iterator[Instant]:
-    faults = Counter() if faults is None else faults
-    frames = []
-    for message in messages:
+    for received_ns, message in messages:
         camera = cameras.get(message.camera)
         if camera is None:
             faults[f"frames of camera '{message.camera}', which the rig does not place"] += 1
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            frames.append(Frame.of(message, camera.time_offset_ms))
-    for frame in sorted(frames, key=lambda frame: frame.t_ns):
-        instants.add(frame)
-        yield from instants.take(frame.t_ns)
+            instants.add(Frame.of(message, camera))
+            yield from instants.take(received_ns)
+    for name, late in instants.late.items():
+        if late:
+            faults[f"frames of camera '{name}' that came too late"] += late
     yield from instants.finish()
 
 

@@ -7,14 +7,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose import wxyz_from_rotation
-from fusion.association import Catalogue, Matches, Sightings
-from fusion.estimator import Estimator, Observations
+from calib.camera import Camera
 from fusion.grouping import Marker
 from fusion.instants import Instant
 from fusion.messages import Markers, RobotPose, State
 from fusion.optics import Optics
-from fusion.state import States, skew
+from fusion.sightings import Catalogue, Matches, Sightings
+from fusion.state import States, skew, wxyz_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -26,9 +25,9 @@ class Told(Protocol):
     names: tuple[str, ...]
     optics: Optics
     catalogue: Catalogue
-    estimator: Estimator
     states: States
     status: list[State | None]
+    owned: NDArray[np.bool_]  # robots whose poses are told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +40,14 @@ class CameraUse:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A camera was found to be moved: where it stands now, or None while its detections are set aside."""
+
+    name: str
+    camera: Camera | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Fused:
     """What an instant tells."""
 
@@ -50,86 +57,102 @@ class Fused:
     cameras: dict[str, CameraUse]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What was used of every robot: by robot and camera (B, C), by marker of the catalogue and camera (K, C)."""
+
+    by_robot: NDArray[np.bool_]
+    by_marker: NDArray[np.bool_]
+    residual_px: Array  # (B,) RMS, NaN without observations
+
+
 def report(
     tracker: Told, instant: Instant, sightings: Sightings, matches: Matches, free: list[Marker]
 ) -> Fused:
-    observations = matches.observations(sightings, tracker.catalogue)
-    error, _ = tracker.estimator.errors(tracker.states, observations)
-    squared = np.sum(error**2, 1)
-    poses = tuple(
-        _pose(tracker, k, instant.t_ns, matches, observations, squared)
+    """What to tell of an instant after its observations."""
+    seen = _look(tracker, sightings, matches)
+    poses = _poses(tracker, instant.t_ns, seen)
+    markers = _markers(tracker, instant.t_ns, seen, free)
+    return Fused(instant.t_ns, poses, markers, _usage(tracker, sightings, matches, free))
+
+
+def _look(tracker: Told, sightings: Sightings, matches: Matches) -> _Seen:
+    robots, cameras = len(tracker.names), len(tracker.optics.names)
+    body, camera = tracker.catalogue.robot[matches.disc], sightings.camera[matches.sighting]
+    by_robot = np.zeros((robots, cameras), bool)
+    by_marker = np.zeros((len(tracker.catalogue.robot), cameras), bool)
+    by_robot[body, camera] = by_marker[matches.disc, camera] = True
+    count = np.bincount(body, minlength=robots)
+    mean = np.bincount(body, matches.squared_px, robots) / np.where(count, count, np.nan)
+    return _Seen(by_robot, by_marker, np.sqrt(mean))
+
+
+def _poses(tracker: Told, t_ns: int, seen: _Seen) -> tuple[RobotPose, ...]:
+    states, names = tracker.states, tracker.optics.names
+    p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
+    wxyz, residual = wxyz_of(states.R).tolist(), seen.residual_px.tolist()
+    P, by_robot = states.P.astype("<f4").tobytes(), seen.by_robot.tolist()
+    markers = np.add.reduceat(seen.by_marker.any(1), tracker.catalogue.first[:-1]).tolist() if p else []
+    return tuple(
+        RobotPose(
+            robot=tracker.names[k],
+            t_ns=t_ns,
+            state=status,
+            position=tuple(p[k]),
+            quaternion_wxyz=tuple(wxyz[k]),
+            velocity=tuple(v[k]),
+            angular_velocity=tuple(omega[k]),
+            covariance=P[576 * k : 576 * (k + 1)],
+            n_markers=markers[k],
+            cameras=tuple([name for name, saw in zip(names, by_robot[k], strict=True) if saw]),
+            residual_px=residual[k] if markers[k] else None,
+        )
         for k, status in enumerate(tracker.status)
-        if status is not None
-    )
-    markers = _markers(tracker, instant.t_ns, matches, observations, free)
-    return Fused(instant.t_ns, poses, markers, _usage(tracker, sightings, matches, free, squared))
-
-
-def _pose(
-    tracker: Told, k: int, t_ns: int, matches: Matches, observations: Observations, squared: Array
-) -> RobotPose:
-    mine = observations.discs.body == k
-    cameras = np.unique(observations.discs.camera[mine])
-    status = tracker.status[k]
-    assert status is not None
-    return RobotPose(
-        robot=tracker.names[k],
-        t_ns=t_ns,
-        state=status,
-        position=tuple(tracker.states.p[k].tolist()),
-        quaternion_wxyz=tuple(wxyz_from_rotation(tracker.states.R[k]).tolist()),
-        velocity=tuple(tracker.states.v[k].tolist()),
-        angular_velocity=tuple(tracker.states.omega[k].tolist()),
-        covariance=tracker.states.P[k].astype("<f4").tobytes(),
-        n_markers=len(np.unique(matches.disc[mine])),
-        cameras=tuple(tracker.optics.names[c] for c in cameras),
-        residual_px=float(np.sqrt(squared[mine].mean())) if mine.any() else None,
+        if status is not None and tracker.owned[k]
     )
 
 
-def _markers(
-    tracker: Told, t_ns: int, matches: Matches, observations: Observations, free: list[Marker]
-) -> Markers:
+def _markers(tracker: Told, t_ns: int, seen: _Seen, free: list[Marker]) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
-    discs = np.unique(matches.disc)
+    discs = np.flatnonzero(seen.by_marker.any(1))
     owner = tracker.catalogue.robot[discs]
-    R, marker = tracker.states.R[owner], tracker.catalogue.marker[discs]
-    arm = -R @ skew(marker)
-    J = np.concatenate([arm, np.tile(np.eye(3), (len(discs), 1, 1))], 2)
-    labelled = J @ tracker.states.P[owner][:, :6, :6] @ J.transpose(0, 2, 1)
-    bits = [_bits(observations.discs.camera[matches.disc == d]) for d in discs]
-    none = np.full(len(free), -1)
-    position = [*(tracker.states.p[owner] + np.einsum("nij,nj->ni", R, marker)), *(m.position for m in free)]
-    covariance = [*labelled, *(m.covariance for m in free)]
-    normal = [*R[:, :, 2], *(np.full(3, np.nan) for _ in free)]
+    R, marker = tracker.states.R[owner], tracker.catalogue.marker[:, discs].T
+    J = np.concatenate([-R @ skew(marker), np.tile(np.eye(3), (len(discs), 1, 1))], 2)
+    labelled = J @ tracker.states.P[owner, :6, :6] @ J.transpose(0, 2, 1)
+    n, none = len(free), np.full(len(free), -1)
+    position = tracker.states.p[owner] + np.einsum("nij,nj->ni", R, marker)
+    places = np.array([m.position for m in free]).reshape(n, 3)
+    covariances = np.array([m.covariance for m in free]).reshape(n, 3, 3)
+    free_bits = np.array([_bits(m.cameras) for m in free], np.uint64)
     return Markers(
         t_ns=t_ns,
         robots=tracker.names,
         camera_names=tracker.optics.names,
-        position=np.array(position).astype("<f8").tobytes(),
-        covariance=np.array(covariance).astype("<f4").tobytes(),
-        normal=np.array(normal).astype("<f4").tobytes(),
+        position=np.concatenate([position, places]).astype("<f8").tobytes(),
+        covariance=np.concatenate([labelled, covariances]).astype("<f4").tobytes(),
+        normal=np.concatenate([R[:, :, 2], np.full((n, 3), np.nan)]).astype("<f4").tobytes(),
         robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
         marker=np.concatenate([tracker.catalogue.number[discs], none]).astype("<i4").tobytes(),
-        cameras=np.array([*bits, *(_bits(m.cameras) for m in free)], "<u8").tobytes(),
+        cameras=np.concatenate([_packed(seen.by_marker[discs]), free_bits]).astype("<u8").tobytes(),
     )
 
 
-def _usage(
-    tracker: Told, sightings: Sightings, matches: Matches, free: list[Marker], squared: Array
-) -> dict[str, CameraUse]:
-    used = np.isin(
-        np.arange(len(sightings)), np.concatenate([matches.sighting, *(m.sightings for m in free)])
+def _usage(tracker: Told, sightings: Sightings, matches: Matches, free: list[Marker]) -> dict[str, CameraUse]:
+    n, camera = len(tracker.optics.names), sightings.camera
+    used = np.zeros(len(sightings), bool)
+    used[np.concatenate([matches.sighting, *(m.sightings for m in free)])] = True
+    taken = np.bincount(camera[used], minlength=n).tolist()
+    unused = np.bincount(camera[~used], minlength=n).tolist()
+    squares = np.bincount(camera[matches.sighting], np.nan_to_num(matches.squared_px), n).tolist()
+    return {name: CameraUse(taken[k], unused[k], squares[k]) for k, name in enumerate(tracker.optics.names)}
+
+
+def _packed(seen: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """(K,) the bits of (K, C)."""
+    return seen[:, :64].astype(np.uint64) @ (
+        np.uint64(1) << np.arange(min(seen.shape[1], 64), dtype=np.uint64)
     )
-    n = len(tracker.optics.names)
-    taken = np.bincount(sightings.camera[used], minlength=n)
-    unused = np.bincount(sightings.camera[~used], minlength=n)
-    squares = np.bincount(sightings.camera[matches.sighting], squared, minlength=n)
-    return {
-        name: CameraUse(int(taken[k]), int(unused[k]), float(squares[k]))
-        for k, name in enumerate(tracker.optics.names)
-    }
 
 
 def _bits(cameras: Index) -> int:
-    return sum(1 << int(c) for c in np.unique(cameras))
+    return sum(1 << int(c) for c in set(cameras.tolist()) if c < 64)

@@ -5,6 +5,7 @@ A constellation is known by the distances between its markers. A labelling that 
 harmless: it would turn the printed sides away from the cameras.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import combinations, permutations
 from pathlib import Path
@@ -22,6 +23,7 @@ from fusion.errors import FusionError
 Array = NDArray[np.float64]
 DISTINCT_M = 0.010  # two labellings must differ by this in some distance: several sigma of a triangulated one
 SIZES_DIFFER = 1.25  # diameters in this ratio are told apart by apparent size
+APART_M = 0.6  # between the starts of identical robots: several sigma of where a person puts them
 MAX_MARKERS = 7  # keeps the comparison of all labellings at load, and the search live, in milliseconds
 MANOEUVRE_S = 0.1  # how long an acceleration lasts, to turn its size into the density of white noise
 
@@ -53,7 +55,7 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
 
     Attributes:
         motion: `aerial` (also what a hand does), the calmer `ground`, or the accelerations themselves.
-        start_m: roughly where a robot of one marker stands at first; what tells such robots of one size apart.
+        start_m: roughly where a robot stands at first; what tells robots of one marker, or of the same markers, apart.
     """
 
     motion: Literal["ground", "aerial"] | Motion = "aerial"
@@ -93,10 +95,36 @@ def load_robots(path: Path) -> dict[str, Robot]:
     robots = load_yaml(path, _Robots).robots
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
-    if bad := [name for name in robots if not is_name(name)]:
-        raise ConfigError(f"{path}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
-    require_distinct(robots, str(path))
+    require_trackable(robots, str(path))
     return robots
+
+
+def require_trackable(robots: dict[str, Robot], where: str) -> None:
+    """Raise ConfigError if a name can't be one, FusionError as `require_distinct` does."""
+    if bad := [name for name in robots if not is_name(name)]:
+        raise ConfigError(f"{where}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
+    require_distinct(robots, where)
+
+
+def changed(
+    robots: dict[str, Robot], rename: dict[str, str], remove: tuple[str, ...], define: dict[str, Robot]
+) -> dict[str, Robot]:
+    """The robots with some renamed, then some removed, then some defined.
+
+    Raises:
+        ConfigError: a name is none, is unknown, or is taken.
+        FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
+    """
+    if unknown := [name for name in (*rename, *remove) if name not in robots]:
+        raise ConfigError(f"there is no robot '{unknown[0]}'; there are {', '.join(robots) or 'none'}")
+    renamed = [rename.get(name, name) for name in robots]
+    if taken := [name for name in renamed if renamed.count(name) > 1]:
+        raise ConfigError(f"the name '{taken[0]}' is taken")
+    kept = {
+        new: robot for new, (old, robot) in zip(renamed, robots.items(), strict=True) if old not in remove
+    }
+    require_trackable(kept | define, "robots")
+    return kept | define
 
 
 def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:
@@ -109,9 +137,21 @@ def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:
             continue
         if a.is_single or b.is_single:
             continue
+        if a.markers == b.markers and a.diameter_m == b.diameter_m:
+            _require_starts(name_a, a, name_b, b, where)
+            continue
         small, large = (a, b) if len(a.markers) <= len(b.markers) else (b, a)
         if fault := _likeness(small, large):
             raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are too alike: {fault}")
+
+
+def _require_starts(name_a: str, a: Robot, name_b: str, b: Robot, where: str) -> None:
+    """Robots with the same markers are told apart by history, which needs a beginning."""
+    if a.start_m is None or b.start_m is None or math.dist(a.start_m, b.start_m) < APART_M:
+        raise FusionError(
+            f"{where}: robots '{name_a}' and '{name_b}' are identical: give both a start_m, {APART_M:g} m or more "
+            f"apart, or move a marker of one by {DISTINCT_M * 1e3:.0f} mm"
+        )
 
 
 def distances(points: Array) -> Array:

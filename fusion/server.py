@@ -5,27 +5,33 @@ Zenoh's callbacks only enqueue; one thread, that of `Server.run`, decodes, fuses
 """
 
 import contextlib
+import gc
 import logging
 import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import yaml
 import zenoh
 
+from calib.camera import Camera
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, load_rig
+from calib.rig import Rig, dump_rig
 from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
-from camera_node.network import open_router
+from camera_node.network import open_client, open_router
+from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Frame, Instant, Instants
-from fusion.messages import Latency, State
-from fusion.report import Fused
-from fusion.robots import load_robots
+from fusion.messages import Latency, RobotPose, Robots, State, robots_key, undo_key
+from fusion.report import Fused, Move
+from fusion.requests import parse_robots, respond, robots_reply
+from fusion.robots import changed, load_robots
+from fusion.shards import Shard
 from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -45,25 +51,24 @@ class Server:
     def __init__(self, config: ArenaConfig) -> None:
         self.config = config
         self.keys = Keys(config.arena)
+        self.shard = Shard.parse(config.shard)
         self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
-        self._rig: Rig | None = None
+        kept = Path(config.kept_rig) if config.kept_rig else None
+        self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
         self._tracker: Tracker | None = None
-        self._apply(load_rig(Path(config.rig)) if config.rig else None)
-        self._messages: queue.Queue[tuple[Callable[[bytes, str, int], None], bytes, str, int]] = queue.Queue(
-            QUEUE
-        )
+        self._start()
+        self._messages: queue.Queue[Callable[[], None]] = queue.Queue(QUEUE)
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
-            self.session = stack.enter_context(
-                open_router(self.config.listen, Path(self.config.zenoh) if self.config.zenoh else None)
-            )
+            self.session = stack.enter_context(self._open())
             self._declare(stack)
             self._closing = stack.pop_all()
-        log.info("arena '%s' listens on %s", self.config.arena, " ".join(self.config.listen))
+        verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
+        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
         if self._tracker is None:
             log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
         return self
@@ -77,38 +82,58 @@ class Server:
 
     def run(self) -> None:
         """Serve."""
+        gc.freeze()  # what was imported is not looked through again and again
         while not self._stopped.is_set():
             with contextlib.suppress(queue.Empty):
-                take, data, key, received_ns = self._messages.get(timeout=TICK_S)
-                take(data, key, received_ns)
+                self._messages.get(timeout=TICK_S)()
             now_ns = time.time_ns()
             for instant in self._instants.take(now_ns):
                 self._fuse(instant)
-            if status := self.health.status(now_ns, self._calibrated(), self._instants.late):
-                self._publish(self.keys.fusion_status, status)
+            aside = self._tracker.watch.bumped if self._tracker else set()
+            if status := self.health.status(now_ns, set(self._cameras()), self._instants.late, aside):
+                own = "" if self.shard.leads else f"/{self.shard.index}"
+                self._publish(self.keys.fusion_status + own, status)
 
     def _declare(self, stack: contextlib.ExitStack) -> None:
         keys, session = self.keys, self.session
-        detections = self._enqueue(self._take_detections)
-        rig = self._enqueue(self._take_rig)
         self._publishers: dict[str, zenoh.Publisher] = {}
-        stack.callback(session.declare_queryable(keys.clock, self._answer_clock).undeclare)
-        stack.callback(session.declare_queryable(keys.rig, self._answer_rig).undeclare)
-        stack.callback(session.declare_subscriber(keys.detections(), detections).undeclare)
-        stack.callback(session.declare_subscriber(keys.rig, rig).undeclare)
-        stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
+        takes = {keys.detections(): self._take_detections, keys.rig: self._take_rig}
+        if self.shard.count > 1:
+            takes[keys.robot_pose()] = self._take_pose
+        answers = {robots_key(keys.arena): self._later(self._change_robots)}
+        if self.shard.leads:
+            answers |= {keys.clock: self._answer_clock, keys.rig: self._answer_rig}
+            answers[undo_key(keys.arena)] = self._later(self._undo)
+            stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
+        for key, answer in answers.items():
+            stack.callback(session.declare_queryable(key, answer).undeclare)
+        for key, take in takes.items():
+            stack.callback(session.declare_subscriber(key, self._enqueue(take)).undeclare)
+
+    def _open(self) -> zenoh.Session:
+        """The arena's router, or of another shard a connection to it."""
+        zenoh_config = Path(self.config.zenoh) if self.config.zenoh else None
+        if self.shard.leads:
+            return open_router(self.config.listen, zenoh_config)
+        return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in self.config.listen], zenoh_config)
 
     def _enqueue(self, take: Callable[[bytes, str, int], None]) -> Callable[[zenoh.Sample], None]:
         """A callback that only enqueues: whatever else it did would stall the link."""
 
         def callback(sample: zenoh.Sample) -> None:
-            try:
-                entry = (take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns())
-                self._messages.put_nowait(entry)
-            except queue.Full:
-                self.health.count("queue full")
+            self._put(partial(take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns()))
 
         return callback
+
+    def _later(self, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
+        """A callback that has the server's thread answer a query."""
+        return lambda query: self._put(partial(respond, query, answer))
+
+    def _put(self, task: Callable[[], None]) -> None:
+        try:
+            self._messages.put_nowait(task)
+        except queue.Full:
+            self.health.count("queue full")
 
     def _publish(self, key: str, message: msgspec.Struct) -> None:
         if key not in self._publishers:
@@ -132,39 +157,59 @@ class Server:
             self._add(message, received_ns)
 
     def _add(self, message: Detections, received_ns: int) -> None:
-        if self._tracker is None or self._rig is None:
+        if self._tracker is None:
             return
-        camera = self._rig.placed().get(message.camera)
+        camera = self._cameras().get(message.camera)
         if camera is None:
             self.health.count("unknown camera")
         elif (message.width, message.height) != (camera.width, camera.height):
             self.health.count("wrong image size")
         else:
-            frame = Frame.of(message, camera.time_offset_ms, received_ns)
+            frame = Frame.of(message, camera, received_ns)
             self.health.noted(message.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            message = decode(data, RigMessage)
-            self._apply(msgspec.yaml.decode(message.yaml, type=Rig))
+            rig = msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
         except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
             self.health.count("rig that is no rig")
             log.warning(
                 "a published rig is refused, the old one stays: %s", " ".join(str(error).split())[:200]
             )
 
-    def _apply(self, rig: Rig | None) -> None:
-        """Put a calibration in force; robots are found anew."""
-        placed = rig.placed() if rig else {}
-        tracker = Tracker(placed, self.robots, self.config.limits) if placed else None
-        self._rig, self._tracker = rig, tracker
+            return
+        old = self.calibration.rig
+        if rig == old:  # our own, or one that came twice
+            return
+        self.calibration.replace(rig)
+        moved = [name for name in rig.cameras if old and rig.cameras[name] != old.cameras.get(name)]
+        if old and len(moved) == 1 and rig.placed().keys() == old.placed().keys() and self._tracker:
+            self._tracker.place(moved[0], rig.cameras[moved[0]])  # robots stay as they are
+            self._tracker.watch.trust(moved[0])
+        else:
+            self._start()
+
+    def _take_pose(self, data: bytes, key: str, received_ns: int) -> None:
+        """Another shard's robot."""
+        try:
+            pose = decode(data, RobotPose)
+        except MessageError:
+            self.health.count("poses that are no message")
+            return
+        if self._tracker is not None and not self.shard.owns(pose.robot):
+            self._tracker.follow(pose)
+
+    def _start(self) -> None:
+        """Begin with the rig in force; robots are found anew."""
+        placed = self._cameras()
+        self._tracker = Tracker(placed, self.robots, self.config.limits, self.shard) if placed else None
         rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
         self._instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
         if placed:
             log.info("calibration in force: %s", ", ".join(placed))
 
-    def _calibrated(self) -> set[str]:
-        return set(self._rig.placed()) if self._rig else set()
+    def _cameras(self) -> dict[str, Camera]:
+        return self.calibration.rig.placed() if self.calibration.rig else {}
 
     # What is answered.
 
@@ -172,9 +217,40 @@ class Server:
         query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns())))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
-        rig = self._rig
-        if rig is not None:
-            query.reply(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+        if self.calibration.rig is not None:
+            query.reply(self.keys.rig, encode(self._rig_message()))
+
+    def _rig_message(self) -> RigMessage:
+        assert self.calibration.rig is not None
+        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.calibration.rig))
+
+    def _undo(self, payload: bytes) -> bytes:
+        """Take the last correction back; that camera is not doubted again until another rig comes."""
+        name, camera = self.calibration.undo()
+        log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
+        if self._tracker is not None:
+            self._tracker.place(name, camera)
+            self._tracker.watch.hold(name)
+        message = self._rig_message()
+        self._publish(self.keys.rig, message)
+        return encode(message)
+
+    def _change_robots(self, payload: bytes) -> bytes:
+        """Rename, remove and define robots, all or none; what they are then."""
+        request = parse_robots(payload)
+        robots = changed(self.robots, request.rename, request.remove, request.define)
+        if robots != self.robots:
+            for name in self.robots.keys() - robots.keys():
+                self._forget(self.keys.robot_pose(name))
+            self.robots = robots
+            log.info("robots: %s", ", ".join(robots) or "none")
+            if self._tracker is not None:
+                self._tracker = self._tracker.with_robots(robots, request.rename)
+        return robots_reply(payload, Robots(robots=self.robots))
+
+    def _forget(self, key: str) -> None:
+        if key in self._publishers:
+            self._publishers.pop(key).undeclare()
 
     # What is told.
 
@@ -187,8 +263,26 @@ class Server:
         for pose in fused.poses:
             told = msgspec.structs.replace(pose, latency=latency)
             self._publish(self.keys.robot_pose(pose.robot), told)
-        self._publish(self.keys.markers, fused.markers)
+        if self.shard.leads:
+            self._publish(self.keys.markers, fused.markers)
+        for move in self._tracker.inspect():
+            self._tell(move)
         self._note(fused, latency)
+
+    def _tell(self, move: Move) -> None:
+        """Say that a camera was moved, or where it stands now."""
+        if move.camera is None:
+            log.warning(
+                "camera %s was moved: its detections are set aside until robots show where it is", move.name
+            )
+            return
+        self.calibration.correct(move.name, move.camera)  # only the leading shard gets here
+        self._publish(self.keys.rig, self._rig_message())
+        log.warning(
+            "camera %s is placed anew and used again; a query on %s takes that back",
+            move.name,
+            undo_key(self.keys.arena),
+        )
 
     def _note(self, fused: Fused, latency: Latency | None) -> None:
         states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
@@ -202,6 +296,8 @@ def _latency(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
         return None
     sent_ns = newest.sent_ns or newest.received_ns
     return Latency(
+        exposure_ms=newest.exposure_us / 2e3,
+        detect_ms=newest.detect_us * 1e-3,
         camera_ms=(sent_ns - newest.t_ns) * 1e-6,
         network_ms=(newest.received_ns - sent_ns) * 1e-6,
         wait_ms=(begun_ns - newest.received_ns) * 1e-6,

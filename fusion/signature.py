@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand
 CLEARLY = 9.0  # by how much the runner-up's chi-square must be worse
+MAX_WAYS = 20_000  # of placing one robot's first markers: more is a scene of nothing but look-alikes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +34,10 @@ class Fit:
 
 
 def identify(
-    robots: dict[int, Robot], markers: list[Marker], faces: Callable[[Marker, Array], bool]
+    robots: dict[int, Robot],
+    markers: list[Marker],
+    faces: Callable[[Marker, Array], bool],
+    history: Callable[[int, Array], float],
 ) -> list[Fit]:
     """The constellations among `markers`, each with more markers, or fitting clearly better, than any rival.
 
@@ -41,76 +45,101 @@ def identify(
         robots: constellations to look for, by index.
         markers: what stands free.
         faces: whether a marker with this normal would show its print to the cameras that saw it.
+        history: chi-square of a robot's standing there, by where it was last.
     """
-    fits = [fit for k, robot in robots.items() for fit in _fits(k, robot, markers, faces)]
+    if len(markers) < 3:
+        return []
+    scene = _Scene.of(markers)
+    fits = [fit for k, robot in robots.items() for fit in _fits(k, robot, scene, faces, history)]
     fits.sort(key=lambda fit: (-len(fit.points), fit.chi2))
-    accepted: list[Fit] = []
+    rivals = [
+        [n for n, other in enumerate(fits) if n != k and fit.rivals(other)] for k, fit in enumerate(fits)
+    ]
+    accepted: set[int] = set()
     for k, fit in enumerate(fits):
-        if any(fit.rivals(better) for better in accepted):
+        alike = (n for n in rivals[k] if len(fits[n].points) == len(fit.points))
+        open_ = [n for n in rivals[k] if not accepted.intersection(rivals[n])]
+        if accepted.intersection(rivals[k]) or any(fits[n].chi2 < fit.chi2 + CLEARLY for n in alike):
             continue
-        rest = (
-            other for other in fits[k + 1 :] if fit.rivals(other) and len(other.points) == len(fit.points)
-        )
-        if any(other.chi2 < fit.chi2 + CLEARLY for other in rest):
-            continue
-        if any(
-            fit.rivals(other) for other in fits[:k] if other not in accepted and not _beaten(other, accepted)
-        ):
-            continue
-        accepted.append(fit)
-    return accepted
+        if all(n > k for n in open_):
+            accepted.add(k)
+    return [fits[k] for k in sorted(accepted)]
 
 
-def _beaten(fit: Fit, accepted: list[Fit]) -> bool:
-    return any(fit.rivals(better) for better in accepted)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """The markers that stand free: positions X (N, 3), their distances (N, N) and how far off those may be."""
+
+    markers: list[Marker]
+    X: Array
+    distances: Array
+    tolerance: Array
+    diameters: Array
+
+    @classmethod
+    def of(cls, markers: list[Marker]) -> "_Scene":
+        X = np.array([marker.position for marker in markers])
+        spread = _spread(X, np.array([marker.covariance for marker in markers]))
+        sizes = np.array([marker.diameter_m for marker in markers])
+        return cls(markers, X, distances(X), SLACK_M + SIGMAS * spread, sizes)
 
 
 def _fits(
-    index: int, robot: Robot, markers: list[Marker], faces: Callable[[Marker, Array], bool]
+    index: int,
+    robot: Robot,
+    scene: _Scene,
+    faces: Callable[[Marker, Array], bool],
+    history: Callable[[int, Array], float],
 ) -> Iterator[Fit]:
     """All ways to see the robot in three or more of the markers, subsets of a longer one left out."""
-    usable = [k for k, marker in enumerate(markers) if fits_size(marker, robot)]
-    if len(usable) < 3:
-        return
-    X = np.array([markers[k].position for k in usable])
-    D, E = distances(robot.points), distances(X)
-    tolerance = SLACK_M + SIGMAS * _spread(X, np.array([markers[k].covariance for k in usable]))
+    usable = np.flatnonzero(~(np.abs(scene.diameters / robot.diameter_m - 1) >= DIAMETER_TOLERANCE))
     longest: list[dict[int, int]] = []
-    for mapping in sorted(_search(D, E, tolerance), key=len, reverse=True):
+    for mapping in sorted(_search(robot, scene, usable), key=len, reverse=True):
         if any(mapping.items() <= other.items() for other in longest):
             continue
         longest.append(mapping)
-        numbers, rows = tuple(mapping), list(mapping.values())
-        chosen = [markers[usable[row]] for row in rows]
-        R, t = align(robot.points[list(numbers)], X[rows])
+        numbers, points = list(mapping), list(mapping.values())
+        chosen = [scene.markers[p] for p in points]
+        R, t = align(robot.points[numbers], scene.X[points])
         if all(faces(marker, R[:, 2]) for marker in chosen):
-            error = robot.points[list(numbers)] @ R.T + t - X[rows]
-            chi2 = sum(e @ np.linalg.solve(m.covariance, e) for e, m in zip(error, chosen, strict=True))
-            yield Fit(index, numbers, tuple(usable[row] for row in rows), R, t, float(chi2))
+            error = robot.points[numbers] @ R.T + t - scene.X[points]
+            cov = np.array([m.covariance for m in chosen]) + SLACK_M**2 * np.eye(3)
+            chi2 = float(np.einsum("ni,ni->", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0]))
+            yield Fit(index, tuple(numbers), tuple(points), R, t, chi2 + history(index, t))
 
 
-def _search(D: Array, E: Array, tolerance: Array) -> Iterator[dict[int, int]]:
-    """Mappings of three or more of the robot's markers to points, all distances within the tolerance."""
+def _search(robot: Robot, scene: _Scene, usable: NDArray[np.intp]) -> list[dict[int, int]]:
+    """Mappings of three or more of the robot's markers to points, all distances within the tolerance.
 
-    def extend(number: int, mapping: dict[int, int]) -> Iterator[dict[int, int]]:
-        if number == len(D):
-            if len(mapping) >= 3:
-                yield mapping
-            return
-        for row in set(range(len(E))) - set(mapping.values()):
-            if all(abs(D[number, n] - E[row, r]) < tolerance[row, r] for n, r in mapping.items()):
-                yield from extend(number + 1, {**mapping, number: row})
-        if len(mapping) + len(D) - number > 3:
-            yield from extend(number + 1, mapping)
-
-    return extend(0, {})
+    Breadth first: a row of `table` is one way to place the robot's first markers, -1 for one that is not seen.
+    """
+    D, n = distances(robot.points), len(robot.markers)
+    E, tolerance = (A[np.ix_(usable, usable)] for A in (scene.distances, scene.tolerance))
+    table = np.empty((1, 0), np.intp)
+    for number in range(n):
+        allowed = np.ones((len(table), len(usable)), bool)
+        for m, column in enumerate(table.T):
+            fits = np.abs(E[column] - D[number, m]) < tolerance[column]
+            fits[np.arange(len(column)), column] = False
+            allowed &= fits | (column < 0)[:, None]
+        row, point = np.nonzero(allowed)
+        skipped = table[(table >= 0).sum(1) + n - number > 3]
+        table = np.concatenate(
+            [
+                np.column_stack([table[row], point]),
+                np.column_stack([skipped, np.full(len(skipped), -1)]),
+            ]
+        )[:MAX_WAYS]
+    return [
+        {m: int(usable[p]) for m, p in enumerate(row) if p >= 0} for row in table if (row >= 0).sum() >= 3
+    ]
 
 
 def _spread(X: Array, covariance: Array) -> Array:
     """(N, N) standard deviations of the distances between points."""
     between = X[:, None] - X[None]
     unit = between / np.maximum(np.linalg.norm(between, axis=2, keepdims=True), 1e-9)
-    along = np.einsum("abi,aij,abj->ab", unit, covariance, unit)
+    along = np.einsum("abi,aij,abj->ab", unit, covariance, unit, optimize=True)
     return np.sqrt(along + along.T)
 
 

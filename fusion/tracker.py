@@ -1,36 +1,31 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Instants in, robots and markers out: the same code live and offline, without a clock of its own."""
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from fusion.association import Catalogue, Matches, Sightings, match
-from fusion.estimator import Estimator
-from fusion.grouping import Marker, group
-from fusion.instants import Instant
-from fusion.messages import State
-from fusion.normals import find_normal, rotation_to
-from fusion.optics import Optics
-from fusion.report import Fused, report
+from camera_node.pose import rotation_from_wxyz
+from fusion.association import match
+from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
+from fusion.instants import Frame, Instant
+from fusion.messages import RobotPose, State
+from fusion.optics import Exposures, Optics
+from fusion.report import Fused, Move, report
 from fusion.robots import Robot
-from fusion.signature import fits_size, identify
-from fusion.state import POSITION, States
+from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
+from fusion.shards import Shard
+from fusion.sightings import Catalogue, Matches, Observations, Sightings
+from fusion.state import POSITION, States, exp_so3
+from fusion.watch import Expected, Watch
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-BIRTH = (0.2, 0.05, 4.0, 1.5)  # sigmas of a robot just found: rad, m, rad/s, m/s
-BIRTH_SINGLE = (0.3, 0.05, 10.0, 1.5)
-BIRTH_S = 1e-3  # the motion model needs a time to act over, however short
-BIRTH_ITERATIONS = 6
-MAX_CHI2 = 8.0  # mean squared Mahalanobis error of a birth, with SLACK_PX for the calibration
-SLACK_PX = 0.7
-HINT_SIGMA_M = 0.1  # of `start_m`
-REACH = 16.3  # chi-square with 3 degrees, one in a thousand: where a lost single marker may be found again
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
+WATCHED = 40  # markers that are compared with their images in one instant, about
+WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
+CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
+FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,6 +34,9 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sigma_floor_px: float = 0.08  # added to the noise that detectors claim
     lost_after_s: float = 0.3  # without an observation
     lateness_ms: float = 150.0  # how long an instant waits for a camera: USB ones may be 100 ms behind
+    tracked_sigma_m: float = (
+        0.05  # a robot whose position is known worse is `coasting`, though a camera sees it
+    )
 
 
 class Tracker:
@@ -48,164 +46,212 @@ class Tracker:
         cameras: the placed cameras; frames of others must not come.
         robots: by name, as `load_robots` checked them.
         limits: see `Limits`.
+        shard: which of the robots are estimated here; `follow` tells of the others.
     """
 
     def __init__(
-        self, cameras: dict[str, Camera], robots: dict[str, Robot], limits: Limits | None = None
+        self,
+        cameras: dict[str, Camera],
+        robots: dict[str, Robot],
+        limits: Limits | None = None,
+        shard: Shard = Shard(),  # noqa: B008 frozen
     ) -> None:
         self.optics = Optics(cameras)
         self.names, self.robots = tuple(robots), list(robots.values())
-        self.limits = limits or Limits()
+        self.limits, self.shard = limits or Limits(), shard
+        self.owned = np.array([shard.owns(name) for name in self.names], bool)
         self.catalogue = Catalogue.of(self.robots)
-        self._single = np.array([robot.is_single for robot in self.robots])
+        single = np.array([robot.is_single for robot in self.robots])
         densities = np.array([robot.densities for robot in self.robots])
-        self.estimator = Estimator(self.optics, densities, self._single)
+        self.estimator = Estimator(self.optics, densities, single)
         n = len(self.robots)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), BIRTH)
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
-        self._seen_ns = np.zeros(n, np.int64)
+        self.search = Search(self)
+        self.watch = Watch()
+        self._watched = 0
+        self._last: tuple[Instant, Sightings, Matches] | None = None
+        self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
+        self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
 
     def fuse(self, instant: Instant) -> Fused:
         """Follow the robots into this instant, and look for those that are not tracked."""
         prediction = self._predict(instant.t_ns)
-        sightings = Sightings.of(instant, self.optics, self.limits.sigma_floor_px)
-        active = np.array([status in ("tracked", "coasting") for status in self.status])
-        matches = match(self.optics, prediction.states, self.catalogue, active, sightings)
-        observations = matches.observations(sightings, self.catalogue)
-        self.states = self.estimator.update(prediction, observations)
-        matches, free = self._find(instant.t_ns, sightings, matches)
+        trusted = Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
+        sightings = Sightings.of(trusted, self.optics, self.limits.sigma_floor_px)
+        followed = self._followed(prediction.states)
+        self.predicted = prediction, followed
+        matches = match(self.optics, prediction.states, self.catalogue, followed, sightings)
+        matches = self._update(prediction, sightings, matches)
+        matches, free = self.search.find(np.flatnonzero(~followed), sightings, matches)
         self._note(instant.t_ns, matches)
-        return report(self, instant, sightings, matches, free)
+        self._last = instant, sightings, matches
+        return report(self, trusted, sightings, matches, free)
 
-    def _predict(self, t_ns: int):
+    def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
+        """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
+
+        Args:
+            robots: the new ones, by name.
+            renamed: old name -> new name.
+        """
+        other = Tracker(
+            dict(zip(self.optics.names, self.optics.cameras, strict=True)), robots, self.limits, self.shard
+        )
+        other.watch, other._t_ns = self.watch, self._t_ns
+        old = {renamed.get(name, name): k for k, name in enumerate(self.names)}
+        for row, (name, robot) in enumerate(robots.items()):
+            k = old.get(name)
+            if k is None or self.robots[k].markers != robot.markers:
+                continue
+            other.states = other.states.with_rows(np.array([row]), self.states.select(np.array([k])))
+            other.status[row], other._seen_ns[row] = self.status[k], self._seen_ns[k]
+            other._seen[row] = self._seen[k]
+        return other
+
+    def place(self, name: str, camera: Camera) -> None:
+        """A camera stands elsewhere from now on; robots stay as they are."""
+        self.optics.place(name, camera)
+
+    def inspect(self) -> tuple[Move, ...]:
+        """After an instant was told: compare frames with what robots seen by two other cameras should look like.
+
+        Places a camera anew that was moved; says which were, and where they stand.
+        """
+        if self._last is None:
+            return ()
+        instant, sightings, matches = self._last
+        seen = np.zeros((len(self.robots), len(self.optics.names)), bool)
+        seen[self.catalogue.robot[matches.disc], sightings.camera[matches.sighting]] = True
+        steady = np.array([status == "tracked" for status in self.status])
+        for frame in self._turn(instant.frames):
+            camera = self.optics.index[frame.camera]
+            others = seen.sum(1) - seen[:, camera]
+            markers = np.flatnonzero((steady & (others >= 2))[self.catalogue.robot])
+            markers = np.roll(markers, -self._watched)[:WATCHED]
+            points = self._expect(frame, camera, (frame.t_ns - instant.t_ns) * 1e-9, markers)
+            if points.shape[1]:
+                self.watch.note(self.optics.cameras[camera], Expected(frame, points))
+        return self._heal()
+
+    def _turn(self, frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        """Some of the frames, others in the next instant, so that watching costs the same in a large arena."""
+        n = max(1, WATCHED // max(len(self.catalogue.robot), 1))
+        first = self._watched % max(len(frames), 1)
+        self._watched += n
+        return (frames + frames)[first : first + min(n, len(frames))]
+
+    def _expect(self, frame: Frame, camera: int, tau: float, markers: NDArray[np.intp]) -> Array:
+        """(3, N) points in the world whose projections are the outlines' centres that the frame should show."""
+        exposures = Exposures(np.array([camera]), np.array([tau]))
+        discs = self.catalogue.discs(markers, np.zeros(len(markers), np.intp))
+        views = self.optics.view(self.optics.pose(self.states, exposures), discs)
+        points = self.optics.R_cam_world[camera].T @ views.q + self.optics.centres[camera][:, None]
+        lens = self.optics.cameras[camera]
+        uv = lens.project(views.q.T)
+        inside = ((uv > WATCH_MARGIN_PX) & (uv < np.array([lens.width, lens.height]) - WATCH_MARGIN_PX)).all(
+            1
+        )
+        return points[:, inside & (views.facing > WATCH_FACING)]
+
+    def _heal(self) -> tuple[Move, ...]:
+        moves = []
+        if (name := self.watch.find_bumped()) is not None:
+            moves.append(Move(name, None))
+        for name in sorted(self.watch.bumped) if self.shard.leads else ():
+            camera = self.watch.heal(name, self.optics.cameras[self.optics.index[name]])
+            if camera is not None:
+                self.place(name, camera)
+                moves.append(Move(name, camera))
+        return tuple(moves)
+
+    def _predict(self, t_ns: int) -> Prediction:
         dt = BIRTH_S if self._t_ns is None else max((t_ns - self._t_ns) * 1e-9, BIRTH_S)
         self._t_ns = t_ns
         return self.estimator.predict(self.states, np.full(len(self.robots), min(dt, MAX_COAST_S)))
 
+    def _followed(self, states: States) -> NDArray[np.bool_]:
+        """(N,) robots that are where they are predicted to be, near enough to name their markers by it.
+
+        One that was seen just now is, in the camera that saw it, however badly its range is known.
+        """
+        alive = np.array([status in ("tracked", "coasting") for status in self.status])
+        sigma2 = np.einsum("nii->n", states.P[:, POSITION, POSITION]) / 3
+        return alive & ((sigma2 < FOLLOWED_M**2) | self._seen)
+
+    def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
+        """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""
+        mine = self.owned[self.catalogue.robot[matches.disc]]
+        others, matches = matches.select(~mine), matches.select(mine)
+        states, matches = self._fit(prediction, sightings, matches)
+        if self.watch.is_strange(matches.squared_px):
+            states, matches = self._without_a_camera(prediction, sightings, matches, states)
+        else:
+            self.watch.learn(matches.squared_px)
+        self.states = states
+        return matches.joined(others)
+
+    def _fit(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> tuple[States, Matches]:
+        observations = Observations.of(matches, sightings, self.catalogue)
+        states, remainder = self.estimator.update(prediction, observations)
+        matches = matches.remaining(remainder)
+        misses = misfit(observations, remainder, SLACK_PX) > MAX_CHI2
+        wrong = mean_of_bodies(misses, observations.discs.body, len(self.robots)) > CONTRADICTED
+        if not wrong.any():
+            return states, matches
+        bad = np.flatnonzero(wrong)
+        states = states.with_rows(bad, prediction.states.select(bad))
+        return states, matches.select(~wrong[observations.discs.body])
+
+    def _without_a_camera(
+        self, prediction: Prediction, sightings: Sightings, matches: Matches, states: States
+    ) -> tuple[States, Matches]:
+        """Robots by all cameras but the one that contradicts the others, if there is one."""
+        for name in self.watch.suspects(self.optics.names):
+            others = sightings.camera[matches.sighting] != self.optics.index[name]
+            if others.all():
+                continue
+            fitted, rest = self._fit(prediction, sightings, matches.select(others))
+            if self.watch.explains(name, rest.squared_px, matches.squared_px):
+                return fitted, rest
+        self.watch.learn(matches.squared_px)
+        return states, matches
+
     def _note(self, t_ns: int, matches: Matches) -> None:
-        """Keep the states' names: tracked with observations, coasting for a while without, then lost."""
+        """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""
         seen = np.zeros(len(self.robots), bool)
         seen[self.catalogue.robot[matches.disc]] = True
-        self._seen_ns[seen] = t_ns
+        self._seen, self._seen_ns[seen & self.owned] = seen, t_ns
+        silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
+        worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
+        vague = worst > self.limits.tracked_sigma_m**2
         for k, status in enumerate(self.status):
-            if seen[k]:
-                self.status[k] = "tracked"
+            if not self.owned[k]:
+                self.status[k] = "lost" if status is not None and silent[k] else status
+            elif seen[k]:
+                self.status[k] = "coasting" if vague[k] else "tracked"
             elif status in ("tracked", "coasting"):
-                silent = (t_ns - self._seen_ns[k]) * 1e-9 > self.limits.lost_after_s
-                self.status[k] = "lost" if silent else "coasting"
-                if silent:
+                self.status[k] = "lost" if silent[k] else "coasting"
+                if silent[k]:
                     self.states.v[k] = self.states.omega[k] = 0
 
-    # Robots that are not tracked.
+    def follow(self, pose: RobotPose) -> None:
+        """Another shard's robot is there: its detections are its own, and not for ours."""
+        if pose.robot not in self.names or self._t_ns is None:
+            return
+        k = self.names.index(pose.robot)
+        if self.owned[k] or pose.t_ns <= self._seen_ns[k]:
+            return
+        dt = (self._t_ns - pose.t_ns) * 1e-9
+        omega, v = np.array([pose.angular_velocity]), np.array([pose.velocity])
+        R = exp_so3(omega * dt) @ rotation_from_wxyz(pose.quaternion_wxyz)
+        there = States(R, pose.position + v * dt, omega, v, pose.covariance_matrix[None])
+        self.states = self.states.with_rows(np.array([k]), there)
+        self.status[k], self._seen_ns[k] = pose.state, pose.t_ns
 
-    def _find(self, t_ns: int, sightings: Sightings, matches: Matches) -> tuple[Matches, list[Marker]]:
-        """Look for lost robots among detections that nothing claims: constellations first, then single markers.
-
-        Returns the matches with theirs, and the markers that stay nobody's.
-        """
-        lost = [k for k, status in enumerate(self.status) if status in (None, "lost")]
-        bodies = {k: self.robots[k] for k in lost if not self._single[k]}
-        if bodies:
-            matches = self._find_bodies(bodies, sightings, matches)
-        markers = self._group(sightings, matches)
-        for robot, marker in self._pair_singles([k for k in lost if self._single[k]], markers):
-            born = _claim([marker], [np.flatnonzero(self.catalogue.robot == robot)[0]])
-            normal = find_normal(self.optics, sightings, marker, self.robots[robot].diameter_m / 2)
-            R = rotation_to(self._towards(marker) if normal is None else normal)
-            if self._bear(robot, R, marker.position, sightings, born, BIRTH_SINGLE):
-                matches = _joined(matches, born)
-                markers = [other for other in markers if other is not marker]
-        return matches, markers
-
-    def _find_bodies(self, bodies: dict[int, Robot], sightings: Sightings, matches: Matches) -> Matches:
-        """The matches with those of the constellations found, whose markers may have passed for single ones."""
-        matches, aside = self._without_singles(matches)
-        markers = self._group(sightings, matches)
-        for fit in identify(bodies, markers, self._faces):
-            discs = [np.flatnonzero(self.catalogue.robot == fit.robot)[n] for n in fit.numbers]
-            born = _claim([markers[p] for p in fit.points], discs)
-            if self._bear(fit.robot, fit.R, fit.t, sightings, born, BIRTH):
-                matches = _joined(matches, born)
-        return self._with_singles(matches, aside)
-
-    def _group(self, sightings: Sightings, matches: Matches) -> list[Marker]:
-        """Markers out of the detections that nothing claims."""
-        free = np.setdiff1d(np.arange(len(sightings)), matches.sighting)
-        return group(self.optics, sightings, free, np.unique(2 * self.catalogue.radius))
-
-    def _without_singles(self, matches: Matches) -> tuple[Matches, Matches]:
-        kept = ~self._single[self.catalogue.robot[matches.disc]]
-        aside = Matches(matches.sighting[~kept], matches.disc[~kept])
-        return Matches(matches.sighting[kept], matches.disc[kept]), aside
-
-    def _with_singles(self, matches: Matches, aside: Matches) -> Matches:
-        """Give back what robots of one marker had, except what a constellation proved to be its own."""
-        stolen = np.isin(aside.sighting, matches.sighting)
-        robbed = np.unique(aside.disc[stolen])
-        for disc in robbed:
-            self.status[self.catalogue.robot[disc]] = "lost"
-        kept = ~np.isin(aside.disc, robbed)
-        return _joined(matches, Matches(aside.sighting[kept], aside.disc[kept]))
-
-    def _pair_singles(self, lost: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
-        """Robots of one marker and theirs, where within reach there is one robot to one marker; else none."""
-        within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost], bool)
-        within = within.reshape(len(lost), len(markers))
-        return [
-            (k, markers[int(np.argmax(row))])
-            for k, row in zip(lost, within, strict=True)
-            if row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
-        ]
-
-    def _reaches(self, k: int, marker: Marker) -> bool:
-        """Whether a lost robot of one marker can be this one: by size, and by where it was or starts."""
-        if not fits_size(marker, self.robots[k]):
-            return False
-        place, covariance = self.states.p[k], self.states.P[k, POSITION, POSITION]
-        if self.status[k] is None:
-            start = self.robots[k].start_m
-            if start is None:
-                return True
-            place, covariance = np.array(start), HINT_SIGMA_M**2 * np.eye(3)
-        error = marker.position - place
-        return bool(error @ np.linalg.solve(covariance + marker.covariance, error) < REACH)
-
-    def _bear(self, k: int, R: Array, p: Array, sightings: Sightings, born: Matches, sigmas: tuple) -> bool:
-        """Start robot k at this pose, refined by its observations; False if they do not agree."""
-        at = States.at_rest(R[None], p[None], sigmas)
-        states = self.states.select(np.arange(len(self.robots)))
-        states.store(np.array([k]), at)
-        observations = born.observations(sightings, self.catalogue)
-        prediction = self.estimator.predict(states, np.full(len(self.robots), BIRTH_S))
-        found = self.estimator.update(prediction, observations, BIRTH_ITERATIONS)
-        loose = replace(observations, cov=observations.cov + SLACK_PX**2 * np.eye(2))
-        _, d2 = self.estimator.errors(found, loose)
-        if not np.mean(d2) < MAX_CHI2:
-            return False
-        row = np.array([k])
-        self.states.store(row, found.select(row))
-        self.status[k] = "tracked"
-        return True
-
-    def _faces(self, marker: Marker, normal: Array) -> bool:
-        """Whether a marker with this normal shows its print to the cameras that saw it."""
-        cameras = np.unique(marker.cameras)
-        return bool(((self.optics.centres[cameras] - marker.position) @ normal > 0).all())
-
-    def _towards(self, marker: Marker) -> Array:
-        """The mean direction of the cameras that saw a marker."""
-        to = self.optics.centres[np.unique(marker.cameras)] - marker.position
-        mean = (to / np.linalg.norm(to, axis=1, keepdims=True)).sum(0)
-        return mean / np.linalg.norm(mean)
-
-
-def _claim(markers: list[Marker], discs: list) -> Matches:
-    counts = [len(marker.sightings) for marker in markers]
-    return Matches(
-        np.concatenate([m.sightings for m in markers]), np.repeat(np.array(discs, np.intp), counts)
-    )
-
-
-def _joined(a: Matches, b: Matches) -> Matches:
-    return Matches(np.concatenate([a.sighting, b.sighting]), np.concatenate([a.disc, b.disc]))
+    def adopt(self, rows: NDArray[np.intp], states: States) -> None:
+        """Robots that were found stand there from now on."""
+        self.states = self.states.with_rows(rows, states)
+        for k in rows:
+            self.status[k] = "tracked"

@@ -10,10 +10,10 @@ from calib.camera import Camera
 from camera_node.messages import Detections
 from camera_node.pose import Pose, look_at, rotation_from_vector
 from camera_node.roundels import Roundels
-from fusion.association import Catalogue
 from fusion.instants import Frame
-from fusion.optics import Optics
+from fusion.optics import Optics, outlines
 from fusion.robots import Robot
+from fusion.sightings import Catalogue
 
 PERIOD_NS = 33_333_333
 START_NS = 1_000_000_000_000
@@ -71,7 +71,10 @@ class Arena:
             for name, phase in zip(self.cameras, self.phases, strict=False)
             for k in range(n)
         )
-        return [Frame(name, t_ns, self._detect(name, (t_ns - START_NS) * 1e-9, rng)) for t_ns, name in times]
+        return [
+            Frame.measure(name, t_ns, self._detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name])
+            for t_ns, name in times
+        ]
 
     def messages(self, n: int) -> list[Detections]:
         """The same as the cameras' messages."""
@@ -79,6 +82,11 @@ class Arena:
             Detections.pack(f.roundels, camera=f.camera, seq=k, t_ns=f.t_ns, width=800, height=600)
             for k, f in enumerate(self.frames(n))
         ]
+
+    @staticmethod
+    def seconds(t_ns: int) -> float:
+        """Since the start."""
+        return (t_ns - START_NS) * 1e-9
 
     def truth(self, robot: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """R and p."""
@@ -95,7 +103,7 @@ class Arena:
         poses = [self.motions[robot](t) for robot in self.robots]
         R = np.array([pose[0] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3)
-        centre = p + np.einsum("nij,nj->ni", R, catalogue.marker[seen])
+        centre = p + np.einsum("nij,jn->ni", R, catalogue.marker[:, seen])
         return self._roundels(optics, centre, R[:, :, 2], catalogue.radius[seen], rng)
 
     def _roundels(self, optics: Optics, centre, normal, radius, rng: np.random.Generator) -> Roundels:
@@ -108,7 +116,7 @@ class Arena:
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
         uv, centre, normal, radius = uv[inside], centre[inside], normal[inside], radius[inside]
-        shape = optics.outlines(np.zeros(len(uv), np.intp), centre, normal, radius)
+        shape = self._outlines(camera, centre, normal, radius)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
         axes = 2 * np.sqrt(values[:, ::-1])
         angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
@@ -122,6 +130,13 @@ class Arena:
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
         return Roundels(uv, cov, axes, angle, level, 200 * level, none, none).select(order)
+
+    def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
+        """(N, 2, 2) shape matrices."""
+        T = np.linalg.inv(camera.matrix())
+        c, n = T[:3, :3] @ centre.T + T[:3, 3:], T[:3, :3] @ normal.T
+        scale = camera.project_with_jacobian((c / c[2]).T)[1][:, :, :2].transpose(1, 2, 0)
+        return outlines(c, n, radius, scale)
 
 
 def outline_centre(camera: Camera, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:

@@ -20,7 +20,7 @@ Arrivals = list[tuple[int, Frame]]
 
 
 def frame(camera: str, t_ns: int) -> Frame:
-    return Frame(camera, START + t_ns, NOTHING)
+    return Frame(camera, START + t_ns, NOTHING, np.empty((2, 0)), np.empty((2, 2, 0)))
 
 
 def row(camera: str, n: int, phase: float = 0.0, delay: int = 0, period: int = PERIOD) -> Arrivals:

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cold grouping: identical points in many views, nothing known of them but that they are discs of one size."""
+
+import time
+from collections import Counter
+
+import numpy as np
+
+from fusion.grouping import group
+from fusion.instants import Instant
+from fusion.optics import Optics
+from fusion.sightings import Sightings
+from tests.benchmarks.fusion_load import DIAMETER_M, Load
+
+APART_M = 0.12  # between discs of 0.08 m with their white margins
+
+
+def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: float = 0.3, sized: bool = True):
+    """Precision and recall, as shares, of the points that two or more cameras see; and processor seconds.
+
+    A marker is right where all its detections are of one point; a point is found where one right marker has it.
+    """
+    load = Load(
+        points, 1, cameras, speed_m_s=0, missing=0, false=0, synchronised=True, sigma_px=sigma_px, seed=seed
+    )
+    load.paths.place(scattered(points, seed))
+    frames = tuple(load.frames(1 / load.hz))
+    seen = Counter(int(k) for frame in frames for k in frame.roundels.id)
+    optics = Optics(load.rig)
+    sightings = Sightings.of(Instant(frames[0].t_ns, frames), optics, 0.0)
+    if not sized:
+        sightings.axes_px[:] = np.nan
+    rows, sizes = np.arange(len(sightings)), np.array([DIAMETER_M])
+    group(optics, sightings, rows, sizes)
+    start = time.process_time()
+    markers = group(optics, sightings, rows, sizes)
+    cost_s = time.process_time() - start
+    number = np.concatenate([frame.roundels.id for frame in frames])
+    kinds = [set(number[marker.sightings].tolist()) for marker in markers]
+    right = [kind for kind in kinds if len(kind) == 1]
+    many = {k for k, count in seen.items() if count >= 2}
+    return len(right) / max(len(kinds), 1), len(set().union(*right) & many) / len(many), cost_s
+
+
+def scattered(n: int, seed: int) -> np.ndarray:
+    """(n, 3) points in the arena, none nearer to another than discs can be."""
+    rng, places = np.random.default_rng(seed), np.empty((0, 3))
+    while len(places) < n:
+        p = rng.uniform([-2.3, -1.4, 0.05], [2.3, 1.4, 0.8])
+        if not len(places) or np.linalg.norm(places - p, axis=1).min() > APART_M:
+            places = np.vstack([places, p])
+    return places

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A load on fusion: what free-running cameras would detect of many robots, as their messages and as the truth."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calib.camera import Camera
+from camera_node.messages import Detections
+from camera_node.pose import Pose, look_at
+from camera_node.roundels import Roundels
+from fusion.errors import FusionError
+from fusion.instants import Frame
+from fusion.optics import Exposures, Optics, outlines
+from fusion.robots import Robot, require_distinct
+from fusion.sightings import Catalogue
+from fusion.state import States, exp_so3
+
+START_NS = 1_000_000_000_000
+LENS = {"width": 1280, "height": 800, "fx": 840.0, "fy": 841.0, "cx": 642.0, "cy": 397.0}
+DISTORTION = (-0.09, 0.02, 0.0003, -0.0002, 0.0)
+DIAMETER_M = 0.08
+HALF = np.array([2.6, 1.6])  # of the floor that robots drive on
+FACING = 0.2  # cosine under which a print is not detected
+
+
+@dataclass(frozen=True)
+class Load:
+    """Robots on Lissajous figures through each other, at heights of their own, with false and missing detections."""
+
+    robots: int = 50
+    markers: int = 4
+    cameras: int = 8
+    hz: float = 60.0
+    speed_m_s: float = 1.0
+    missing: float = 0.1
+    false: float = 1.0  # detections a frame
+    clutter: int = 0  # roundels on the walls that are nobody's
+    synchronised: bool = False
+    sigma_px: float = 0.1
+    crossing: bool = False  # through the whole arena, rather than each about a place of its own
+    seed: int = 1
+
+    @cached_property
+    def rig(self) -> dict[str, Camera]:
+        """Cameras around the arena, looking at its middle."""
+        a = 0.3 + 2 * np.pi * np.arange(self.cameras) / self.cameras
+        at = np.column_stack([4.0 * np.cos(a), 3.0 * np.sin(a), 3.0 + 0.3 * np.cos(3 * a)])
+        poses = [look_at(p, [0.0, 0.0, 0.2]) for p in at]
+        return {
+            f"cam{k}": Camera(**LENS, distortion=DISTORTION, T_world_cam=Pose.from_matrix(T))
+            for k, T in enumerate(poses)
+        }
+
+    @cached_property
+    def bodies(self) -> dict[str, Robot]:
+        """Robots that nothing but their distances tells apart."""
+        rng = np.random.default_rng(self.seed)
+        bodies: dict[str, Robot] = {}
+        while len(bodies) < self.robots:
+            robot = _robot(rng, self.markers)
+            if all(_differ(robot, other) for other in bodies.values()):
+                bodies[f"r{len(bodies)}"] = robot
+        return bodies
+
+    @cached_property
+    def paths(self) -> "Paths":
+        rng = np.random.default_rng(self.seed + 1)
+        n = self.robots
+        columns = int(np.ceil(np.sqrt(1.6 * n)))
+        cell = np.column_stack([np.arange(n) % columns, np.arange(n) // columns])
+        rows = int(np.ceil(n / columns))
+        centre = (cell + 0.5) / [columns, rows] * 2 * HALF - HALF
+        size = np.tile(HALF * 0.9, (n, 1)) if self.crossing else np.full((n, 2), 0.25)
+        centre = 0 * centre if self.crossing else centre
+        rate = rng.uniform(0.7, 1.3, (n, 2)) * self.speed_m_s / size
+        turn = rng.uniform(-1.5, 1.5, n) * min(self.speed_m_s, 1.0)
+        height = rng.uniform(0.05, 0.8, n)
+        return Paths(centre, size, rate, rng.uniform(0, 6.28, (n, 2)), turn, rng.uniform(0, 6.28, n), height)
+
+    def phases(self) -> np.ndarray:
+        """Of the cameras, as shares of a period."""
+        n = self.cameras
+        return (
+            np.zeros(n)
+            if self.synchronised
+            else np.linspace(-0.45, 0.45, n)[np.argsort(np.sin(7.0 * np.arange(n)))]
+        )
+
+    def messages(self, seconds: float) -> Iterator[Detections]:
+        """All cameras' detections in order of time; `id` is the row of the catalogue, -1 for a false one."""
+        rng = np.random.default_rng(self.seed + 2)
+        scene = _Scene(self)
+        stamps = (np.arange(round(seconds * self.hz))[:, None] + self.phases()) / self.hz
+        for k in np.argsort(stamps, axis=None, kind="stable"):
+            seq, camera = divmod(int(k), self.cameras)
+            t_s = float(stamps[seq, camera])
+            yield scene.detect(camera, seq, t_s, rng)
+
+    def frames(self, seconds: float) -> Iterator[Frame]:
+        """The same, received."""
+        return (Frame.of(message, self.rig[message.camera]) for message in self.messages(seconds))
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Where robots are, and how they move."""
+
+    centre: np.ndarray
+    size: np.ndarray
+    rate: np.ndarray
+    phase: np.ndarray
+    turn: np.ndarray
+    heading: np.ndarray
+    height: np.ndarray
+
+    def place(self, p: np.ndarray) -> None:
+        """Stand still at p (N, 3)."""
+        self.centre[:], self.size[:], self.rate[:], self.turn[:] = p[:, :2], 0, 0, 0
+        self.height[:] = p[:, 2]
+
+    def at(self, t_s: float) -> States:
+        """The robots as they truly are at a time, with covariances of nothing."""
+        n, angle = len(self.turn), self.rate * t_s + self.phase
+        p = np.column_stack([self.centre + self.size * np.sin(angle), self.height])
+        v = np.column_stack([self.size * self.rate * np.cos(angle), np.zeros(n)])
+        up = np.column_stack([np.zeros((n, 2)), np.ones(n)])
+        R = exp_so3(up * (self.heading + self.turn * t_s)[:, None])
+        return States(R, p, up * self.turn[:, None], v, np.zeros((n, 12, 12)))
+
+
+class _Scene:
+    """Renders detections of a load."""
+
+    def __init__(self, load: Load) -> None:
+        self.load, self.optics = load, Optics(load.rig)
+        self.catalogue = Catalogue.of(list(load.bodies.values()))
+        rng = np.random.default_rng(load.seed + 3)
+        self.clutter = np.column_stack(
+            [
+                rng.uniform(-3, 3, load.clutter),
+                rng.uniform(-2, 2, load.clutter),
+                rng.uniform(1.2, 1.6, load.clutter),
+            ]
+        )
+
+    def detect(self, camera: int, seq: int, t_s: float, rng: np.random.Generator) -> Detections:
+        """One frame's message."""
+        name, t_ns = self.optics.names[camera], START_NS + round(t_s * 1e9)
+        states = self.load.paths.at((t_ns - START_NS) * 1e-9)
+        poses = self.optics.pose(states, Exposures(np.array([camera]), np.zeros(1)))
+        n = len(self.catalogue.robot)
+        views = self.optics.view(poses, self.catalogue.discs(np.arange(n), np.zeros(n, np.intp)))
+        R, at = self.optics.R_cam_world[camera], self.optics.centres[camera]
+        c = np.column_stack([views.centre, R @ (self.clutter - at).T])
+        normal = np.column_stack([views.normal, np.tile(R[:, 2:], len(self.clutter))])
+        q = np.column_stack([views.q, c[:, n:]])
+        row = np.concatenate([np.arange(n), np.full(len(self.clutter), -1)])
+        kept = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (q[2] > 0.1)
+        kept &= rng.random(len(kept)) >= self.load.missing
+        return self._message(name, seq, t_ns, c[:, kept], normal[:, kept], q[:, kept], row[kept], rng)
+
+    def _message(self, name, seq, t_ns, c, normal, q, row, rng: np.random.Generator) -> Detections:
+        lens, sigma = self.load.rig[name], self.load.sigma_px
+        uv, J = lens.project_with_jacobian(q.T)
+        inside = ((uv > 10) & (uv < [lens.width - 10, lens.height - 10])).all(1)
+        scale = (J[:, :, :2] * q[2, :, None, None]).transpose(1, 2, 0)
+        values, vectors = np.linalg.eigh(
+            outlines(c, normal, np.full(len(row), DIAMETER_M / 2), scale)[inside]
+        )
+        axes, angle = 2 * np.sqrt(values[:, ::-1]), np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+        extra = rng.poisson(self.load.false)
+        uv = np.concatenate([uv[inside], rng.uniform([10, 10], [lens.width, lens.height], (extra, 2))])
+        axes = np.concatenate([axes, np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])
+        uv, axes = uv + sigma * rng.normal(size=uv.shape), axes + sigma * rng.normal(size=axes.shape)
+        n = len(uv)
+        angle = np.concatenate([angle, rng.uniform(-1.5, 1.5, extra)])
+        number = np.concatenate([row[inside], np.full(extra, -1)]).astype(np.int32)
+        cov, level = np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.6)
+        roundels = Roundels(uv, cov, axes, angle, level, 200 * level, number, number)
+        mixed = roundels.select(rng.permutation(n))
+        return Detections.pack(
+            mixed, camera=name, seq=seq, t_ns=t_ns, sent_ns=t_ns, width=lens.width, height=lens.height
+        )
+
+
+def _robot(rng: np.random.Generator, markers: int) -> Robot:
+    if markers == 1:
+        return Robot(diameter_m=DIAMETER_M)
+    while True:
+        corners = np.column_stack([rng.uniform(-0.17, 0.17, (markers, 2)), np.zeros(markers)])
+        apart = np.linalg.norm(corners[:, None] - corners[None], axis=2) + np.eye(markers)
+        if apart.min() > 1.3 * DIAMETER_M:
+            try:
+                return Robot(diameter_m=DIAMETER_M, markers=tuple(map(tuple, corners.tolist())))
+            except ValueError:  # on one line
+                continue
+
+
+def _differ(a: Robot, b: Robot) -> bool:
+    try:
+        require_distinct({"a": a, "b": b})
+    except FusionError:
+        return False
+    return True

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What may be asked of a running server: other robots, a correction taken back; and what it keeps over a restart."""
+
+import json
+import os
+
+import msgspec
+
+from calib.messages import RigMessage
+from calib.rig import Rig, dump_rig
+from camera_node.messages import decode, encode
+from camera_node.pose import Pose
+from fusion.calibration import Calibration
+from fusion.messages import Robots, RobotsRequest, robots_key, undo_key
+from tests.fusion.synthetic import WIDE
+from tests.fusion.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
+
+
+def ask(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:
+    """The reply, or the error's line."""
+    for reply in client._session.get(key, payload=payload, timeout=DEADLINE_S):
+        if reply.ok is not None:
+            return reply.ok.payload.to_bytes(), ""
+        return None, reply.err.payload.to_string()
+    raise AssertionError("no reply")
+
+
+def robots_of(data: bytes | None) -> Robots:
+    assert data is not None
+    return decode(data, Robots)
+
+
+def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
+    with serving(config(tmp_path)) as (server, client):
+        key = robots_key("test")
+        send(server, live(ARENA.messages(30)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        assert set(robots_of(ask(client, key)[0]).robots) == {"a"}
+        request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
+        assert list(robots_of(ask(client, key, encode(request))[0]).robots) == ["rover", "wide"]
+        assert server._tracker is not None
+        assert server._tracker.status == ["tracked", None]
+        reply, _ = ask(client, key, json.dumps({"remove": ["wide"]}).encode())
+        assert reply is not None
+        assert list(json.loads(reply)["robots"]) == ["rover"]
+
+
+def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
+    twin = msgspec.structs.replace(ARENA.robots["a"], start_m=None)
+    faults = {
+        b"\x00\xff": "no request for robots",
+        b'{"colour": 1}': "colour",
+        encode(RobotsRequest(remove=("b",))): "there is no robot 'b'",
+        encode(RobotsRequest(define={"b/c": WIDE})): "can't name a robot",
+        encode(RobotsRequest(define={"b": twin})): "identical",
+    }
+    with serving(config(tmp_path)) as (server, client):
+        for payload, said in faults.items():
+            reply, error = ask(client, robots_key("test"), payload)
+            assert reply is None
+            assert said in error
+        assert list(server.robots) == ["a"]
+
+
+def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
+    settings = config(tmp_path)
+    with serving(settings) as (server, client):
+        assert "nothing to undo" in ask(client, undo_key("test"))[1]
+        moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
+        server._messages.put(lambda: server.calibration.correct("cam1", moved))
+        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
+        reply, _ = ask(client, undo_key("test"))
+        assert reply is not None
+        assert msgspec.yaml.decode(decode(reply, RigMessage).yaml, type=Rig).cameras == ARENA.cameras
+        assert server._tracker is not None
+        assert server._tracker.watch.held == {"cam1"}
+
+
+def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
+    kept = tmp_path / "rig.kept.yaml"
+    settings = msgspec.structs.replace(config(tmp_path, with_rig=False), kept_rig=str(kept))
+    with serving(settings) as (server, client):
+        server.session.put(KEYS.rig, encode(RigMessage(t_ns=0, yaml=dump_rig(Rig(cameras=ARENA.cameras)))))
+        until(lambda: client.rig(DEADLINE_S))
+    with serving(settings) as (_, client):
+        rig = client.rig(DEADLINE_S)
+        assert rig is not None
+        assert rig.cameras == ARENA.cameras
+
+
+def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
+    given, kept = tmp_path / "rig.yaml", tmp_path / "rig.kept.yaml"
+    config(tmp_path)  # writes rig.yaml
+    fewer = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
+    kept.write_text(dump_rig(fewer))
+    for age_ns, expected in ((-1, fewer), (1, Rig(cameras=ARENA.cameras))):
+        at = kept.stat().st_mtime_ns + age_ns * 10**9
+        os.utime(given, ns=(at, at))
+        assert Calibration(given, kept).rig == expected
+    kept.write_text("cameras: {")
+    os.utime(given, (0, 0))
+    assert Calibration(given, kept).rig == Rig(cameras=ARENA.cameras)
