@@ -12,9 +12,10 @@ namespace roundel {
 
 namespace {
 
-constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
-constexpr double kNoise = 3;           // grey levels that a picture may differ by from the model
-constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
+constexpr size_t kMaxRoundels = 4096;    // as many as a message may hold
+constexpr double kNoise = 3;             // grey levels that a picture may differ by from the model
+constexpr double kRaggedSupport = 0.85;  // ragged edges differ from the model alike all around
+constexpr int kOverlap = 64;             // pixels that a searched band reaches into the one before
 
 /// The gates that end false positives: contrast, ratio, size, and grey levels as the model says but for
 /// `noise`.
@@ -36,6 +37,7 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     });
     const auto fit = refine(image, start);
     if (fit && is_roundel(*fit, settings, kNoise)) return fit;
+    if (!fit || fit->support < kRaggedSupport) return std::nullopt;
     const auto soft = refine_softened(image, start);
     return soft && is_roundel(*soft, settings, kNoise * 6 / 16) ? soft : std::nullopt;
 }
