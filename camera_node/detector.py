@@ -38,7 +38,7 @@ class Detector:
         *,
         detector: Literal["chords", "paper"] = "chords",
         inner_ratios: tuple[float, ...] = (0.6, 0.41),
-        ratio_tolerance: float = 0.1,
+        ratio_tolerance: float = 0.08,
         min_diameter_px: float = 8.0,
         max_diameter_px: float = 400.0,
         min_contrast: float = 25.0,

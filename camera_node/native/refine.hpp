@@ -26,11 +26,12 @@ struct Fit {
     double offset_x, offset_y;    // from the ellipse's centre to where the disc's own centre projects, pixels
     Symmetric offset_covariance;  // square pixels
     PoseCovariance pose_covariance;
-    double ratio;         // inner over outer diameter
-    double card;          // the white card's over the outer diameter, where the card's edge is near
-    double dark, bright;  // grey levels
-    double blur;          // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double residual;      // RMS over all pixels used that are on the card, grey levels
+    double ratio;          // inner over outer diameter
+    double card;           // the white card's over the outer diameter, where the card's edge is near
+    double dark, bright;   // grey levels
+    double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
+    double residual;       // RMS over all pixels used that are on the card, grey levels
+    double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double agreeing_residual;  // over those that agree
     double support;            // share of the ring's edges that is in the image and agrees
 };
