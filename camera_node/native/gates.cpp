@@ -14,6 +14,7 @@ namespace {
 constexpr double kBeyond = 30;           // grey levels by which a blurred ring's may seem beyond the scale
 constexpr double kMisfit = 0.05;         // of the contrast, RMS on the ring's edges
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
+constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones are alike all around
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged or covered may be letters
 constexpr double kMostCovered = 0.35;    // share of the inside
 constexpr double kLeastSupport = 0.55;   // of the edges' pixels that must agree where others are covered
@@ -55,15 +56,18 @@ bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings
     return surface.off <= kMostCovered * surface.seen;
 }
 
+double nearest(const std::vector<double>& ratios, double to) {
+    return *std::min_element(ratios.begin(), ratios.end(),
+                             [&](double a, double b) { return std::abs(a - to) < std::abs(b - to); });
+}
+
 }  // namespace
 
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise) {
-    const auto& ratios = settings.inner_ratios;
-    start.print = *std::min_element(ratios.begin(), ratios.end(), [&](double a, double b) {
-        return std::abs(a - start.ratio) < std::abs(b - start.ratio);
-    });
+    start.print = nearest(settings.inner_ratios, start.ratio);
     const auto fit = refine(image, start);
     if (fit && is_roundel(image, *fit, settings, noise)) return fit;
+    if (!fit || fit->support < kRaggedSupport) return std::nullopt;
     const auto soft = refine_softened(image, start);
     const double ragged = start.outer.major < kTellable ? kMisfit : kRaggedMisfit;
     const bool found = soft && has_limits(*soft, settings) && is_as_modelled(*soft, noise * 6 / 16, ragged);

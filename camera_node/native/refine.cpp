@@ -166,6 +166,7 @@ class Fitter {
         is_noise_known_ = left < sums_.mwrr / 4;
         const double mrr = std::max(sums_.mrr / 4, sums_.mrr - left);
         const double mwrr = std::max(sums_.mwrr / 4, sums_.mwrr - left);
+        edge_residual_ = std::sqrt(std::max(sums_.ring_rr / 4, sums_.ring_rr - left) / sums_.ring);
         scale_ = std::max(kNoiseFloor, kScale * std::sqrt(mrr / (sums_.m * freedom)));
         noise_ = std::max(kNoiseFloor, std::sqrt(mwrr / (sums_.m * freedom)) / slope);
         agreeing_ = std::sqrt(std::max(0.0, sums_.wrr - all) / std::max(1.0, sums_.w));
@@ -189,7 +190,7 @@ class Fitter {
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
     int step_ = 1;
     bool is_noise_known_ = false;
-    double scale_ = 255, noise_ = 0, agreeing_ = 0;
+    double scale_ = 255, noise_ = 0, agreeing_ = 0, edge_residual_ = 0;
 };
 
 /// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
@@ -246,7 +247,7 @@ Fit Fitter::fit() const {
             .bright = p[kBright],
             .blur = p[kBlur],
             .residual = std::sqrt(sums_.rr / std::max(1.0, sums_.n)),
-            .edge_residual = std::sqrt(sums_.ring_rr / sums_.ring),
+            .edge_residual = edge_residual_,
             .agreeing_residual = agreeing_,
             .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};
 }

@@ -12,8 +12,10 @@ from tests.camera_node.rendering import Disc, expose, outer_conic, render
 PRINCIPAL = np.array([79.5, 59.5])
 
 
-def frames(disc: Disc, count: int, noise: float, **look: float) -> Iterator[np.ndarray]:
-    rng, clean = np.random.default_rng(7), render([disc], **look)
+def frames(
+    disc: Disc, count: int, noise: float, *, blur: float = 0.7, ground: float = 90
+) -> Iterator[np.ndarray]:
+    rng, clean = np.random.default_rng(7), render([disc], blur=blur, ground=ground)
     return (expose(clean, noise, rng) for _ in range(count))
 
 
