@@ -47,7 +47,11 @@ ROUNDEL_INLINE void multiply_all(const Columns& columns, int count, Sums& sums) 
 ROUNDEL_INLINE void weigh(const Gradient& model, const Lanes& level, float per_cut, int k, Columns& columns,
                           Sums& sums) {
     const Lanes r = level - model.level[k], t = r * per_cut, left = 1.0f - t * t;
-    const Lanes root = (left > 0.0f) & (level >= 0.0f) ? left : all(0), w = root * root;
+    // What is clipped tells no more than that the level is beyond the scale.
+    const Bits clipped = ((level > 254.5f) & (model.level[k] > 255.0f)) |
+                         ((level < 0.5f) & (level >= 0.0f) & (model.level[k] < 0.0f));
+    const Bits counts = (left > 0.0f) & (level >= 0.0f) & ~clipped;
+    const Lanes root = counts ? left : all(0), w = root * root;
     const Lanes& bx = model.by[kX][k];
     const Lanes& by = model.by[kY][k];
     const Lanes ring = level >= 0.0f ? model.ring[k] * model.ring[k] : all(0), m = w * (bx * bx + by * by);

@@ -211,7 +211,8 @@ void Fitter::learn_print(double ratio) {
     const Parameters with = factor_->solve(unit);  // covariance of all with the ratio
     const double off = ratio - p[kRatio], variance = with[kRatio] + square(kPrint);
     if (square(off) > square(kOtherPrint) * variance) return;
-    for (int i = 0; i < kCount; ++i) p[i] += with[i] * off / variance;
+    for (int i = 0; i < kCount; ++i)
+        if (i != kRatio) p[i] += with[i] * off / variance;  // what was measured stays to be judged
     for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
 }
 

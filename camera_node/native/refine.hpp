@@ -26,7 +26,7 @@ struct Fit {
     double offset_x, offset_y;    // from the ellipse's centre to where the disc's own centre projects, pixels
     Symmetric offset_covariance;  // square pixels
     PoseCovariance pose_covariance;
-    double ratio;          // inner over outer diameter
+    double ratio;          // inner over outer diameter, as measured without the print
     double card;           // the white card's over the outer diameter, where the card's edge is near
     double dark, bright;   // grey levels
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
