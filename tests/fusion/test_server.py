@@ -74,9 +74,9 @@ def until(met):
     raise AssertionError("the deadline passed")
 
 
-def live(messages: list[Detections]) -> list[Detections]:
-    """The messages as if their first frame was taken a second ago."""
-    shift = time.time_ns() - 10**9 - messages[0].t_ns
+def live(messages: list[Detections], ago_ns: int = 10**9) -> list[Detections]:
+    """The messages as if their first frame was taken `ago_ns` ago."""
+    shift = time.time_ns() - ago_ns - messages[0].t_ns
     return [msgspec.structs.replace(m, t_ns=m.t_ns + shift, sent_ns=m.t_ns + shift) for m in messages]
 
 
