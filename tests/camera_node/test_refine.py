@@ -2,6 +2,7 @@
 """The photometric fit, seen through the detector: unbiased, as sure as it says, and not moved by what covers it."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tests.camera_node.rendering import Disc, expose, outer_conic, render
 PRINCIPAL = np.array([79.5, 59.5])
 
 
-def frames(disc: Disc, count: int, noise: float, **look: float) -> Iterator[np.ndarray]:
+def frames(disc: Disc, count: int, noise: float, **look: Any) -> Iterator[np.ndarray]:
     rng, clean = np.random.default_rng(7), render([disc], **look)
     return (expose(clean, noise, rng) for _ in range(count))
 
