@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A flat board of known size, as `charuco:5x4:0.054` names it on the command line."""
+"""A flat board of known size, as `charuco:5x4:0.054` or `chessboard:9x6:0.025` names it on the command line."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -9,8 +10,32 @@ from numpy.typing import NDArray
 
 from camera_node.errors import ConfigError
 
-Array = NDArray[np.float64]
-FORM = "charuco:COLSxROWS:SQUARE_M[:MARKER_RATIO[:DICTIONARY]], such as charuco:5x4:0.054:0.75:DICT_4X4_50"
+Found = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+MIN_CORNERS = 6  # of a board that may be seen in part
+FORM = (
+    "charuco:COLSxROWS:SQUARE_M[:MARKER_RATIO[:DICTIONARY]] in squares, such as charuco:5x4:0.054:0.75:DICT_4X4_50, "
+    "or chessboard:COLSxROWS:SQUARE_M in inner corners, such as chessboard:9x6:0.025"
+)
+
+
+class Finder(Protocol):
+    """Finds the corners of one board in images."""
+
+    def find(self, image: NDArray[np.uint8]) -> Found | None:
+        """Pixels (n, 2) and board points (n, 3), metres, in a grey image (h, w); None where there are too few."""
+        ...
+
+
+def make_finder(text: str) -> Finder:
+    """A finder of the board that `text` names.
+
+    Raises:
+        ConfigError: the text has another form, an unknown dictionary or impossible sizes.
+    """
+    if text.split(":")[0] == "chessboard":
+        return ChessboardFinder(*_parse(text, text.split(":")[1:], at_least=3, parts=2))
+    return BoardFinder(make_board(text))
 
 
 def make_board(text: str) -> Any:
@@ -20,16 +45,15 @@ def make_board(text: str) -> Any:
         ConfigError: the text has another form, an unknown dictionary or impossible sizes.
     """
     kind, *parts = text.split(":")
+    if kind != "charuco":
+        raise ConfigError(f"--board {text} is no board; write {FORM}")
+    columns, rows, square = _parse(text, parts, at_least=3, parts=4)
     try:
-        if kind != "charuco" or not 2 <= len(parts) <= 4:
-            raise ValueError
-        columns, rows = (int(n) for n in parts[0].lower().split("x"))
-        square = float(parts[1])
         ratio = float(parts[2]) if len(parts) > 2 and parts[2] else 0.75
-        if not (columns >= 3 and rows >= 3 and 0.001 < square < 10 and 0.1 < ratio < 1):
-            raise ValueError
     except ValueError:
-        raise ConfigError(f"--board {text} is no board; write {FORM}") from None
+        ratio = 0.0
+    if not 0.1 < ratio < 1:
+        raise ConfigError(f"--board {text} is no board; write {FORM}")
     name = parts[3] if len(parts) > 3 else "DICT_4X4_1000"
     if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
         raise ConfigError(f"--board {text}: OpenCV has no dictionary {name}; write {FORM}")
@@ -37,8 +61,22 @@ def make_board(text: str) -> Any:
     return cv2.aruco.CharucoBoard((columns, rows), square, ratio * square, dictionary)
 
 
+def _parse(text: str, given: list[str], at_least: int, parts: int) -> tuple[int, int, float]:
+    """Columns, rows and the square's side, metres, which two kinds of board have in common."""
+    try:
+        if not 2 <= len(given) <= parts:
+            raise ValueError
+        columns, rows = (int(n) for n in given[0].lower().split("x"))
+        square = float(given[1])
+        if not (at_least <= columns <= 100 and at_least <= rows <= 100 and 0.001 < square < 10):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"--board {text} is no board; write {FORM}") from None
+    return columns, rows, square
+
+
 class BoardFinder:
-    """Finds a board's inner corners in grey images, printed normally or inverted."""
+    """Finds a ChArUco board's inner corners in grey images, printed normally or inverted."""
 
     def __init__(self, board: Any) -> None:
         self.corners = np.asarray(board.getChessboardCorners(), np.float32)
@@ -46,12 +84,33 @@ class BoardFinder:
         parameters.detectInvertedMarker = True
         self._detector = cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    def find(self, image: NDArray[np.uint8]) -> Found | None:
         """Pixels (n, 2) and board points (n, 3), metres, of six or more corners; None where fewer are in sight."""
         for picture in (image, cv2.bitwise_not(image)):
             pixels, numbers = self._detector.detectBoard(picture)[:2]
-            if numbers is not None and len(numbers) >= 6:
+            if numbers is not None and len(numbers) >= MIN_CORNERS:
                 return np.asarray(pixels, np.float32).reshape(-1, 2), self.corners[
                     np.ravel(numbers).astype(np.intp)
                 ]
         return None
+
+
+@dataclass(frozen=True)
+class ChessboardFinder:
+    """Finds a plain chessboard, all of whose `columns` x `rows` inner corners must be in sight."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+    @property
+    def corners(self) -> NDArray[np.float32]:
+        """(columns * rows, 3) inner corners, metres, row by row."""
+        y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float32) * self.square_m
+        return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float32)
+
+    def find(self, image: NDArray[np.uint8]) -> Found | None:
+        """Pixels (n, 2) and board points (n, 3), metres, of all corners; None where they are not all in sight."""
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        found, pixels = cv2.findChessboardCornersSB(image, (self.columns, self.rows), flags=flags)
+        return (np.asarray(pixels, np.float32).reshape(-1, 2), self.corners) if found else None

@@ -20,10 +20,17 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     T_world_cam: Pose | None = None
     time_offset_ms: float = 0.0
     covariance: tuple[tuple[float, ...], ...] | None = None
+    lens_sigma: tuple[float, ...] | None = None
 
     def project_world(self, p_world: ArrayLike) -> Array:
         """Raw pixels (N, 2) of points (N, 3) in the world; NaN for those not before the camera."""
         return self.project(transform(invert(self.matrix()), p_world))
+
+    def sees(self, uv: ArrayLike) -> NDArray[np.bool_]:
+        """Which of the pixels (N, 2) lie in the image; NaN does not."""
+        uv = np.asarray(uv, float).reshape(-1, 2)
+        inside = (uv >= -0.5) & (uv < [self.width - 0.5, self.height - 0.5])
+        return inside[:, 0] & inside[:, 1]
 
     def matrix(self) -> Array:
         """T_world_cam as a (4, 4) matrix.

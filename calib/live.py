@@ -17,7 +17,9 @@ from camera_node.messages import Detections, Keys, MessageError, decode, encode
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
 
 
-def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[Detections], int]:
+def collect(
+    session: zenoh.Session, arena: str, seconds: float, doing: str = "wave the wand"
+) -> tuple[list[Detections], int]:
     """Detections of all cameras of an arena for a while, with a line of progress; and the number of bad messages.
 
     Raises:
@@ -29,7 +31,7 @@ def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[De
     )
     messages, bad = [], 0
     seen: Counter[str] = Counter()
-    columns = (TextColumn("wave the wand"), BarColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(doing), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, transient=True) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
         end = time.monotonic() + seconds
@@ -46,11 +48,16 @@ def collect(session: zenoh.Session, arena: str, seconds: float) -> tuple[list[De
             progress.update(task, completed=seconds - left, description=told or "waiting for cameras")
     subscriber.undeclare()
     if not messages:
-        raise CalibrationError(
-            f"no detections on {Keys(arena).detections()} in {seconds:g} s ({bad} bad messages); "
-            "are the server and the cameras running, and --connect and --arena right?"
-        )
+        raise CalibrationError(nothing_came(Keys(arena).detections(), seconds, bad))
     return messages, bad
+
+
+def nothing_came(key: str, seconds: float, bad: int) -> str:
+    """What to say where cameras are silent."""
+    return (
+        f"no detections on {key} in {seconds:g} s ({bad} bad messages); are the server and the cameras running, and "
+        "--connect and --arena right?"
+    )
 
 
 def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:

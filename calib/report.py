@@ -3,11 +3,16 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from calib.outcome import Calibration
+    from calib.trust import Trust
+    from calib.waving import Progress
 
 WORST = 5  # outliers that are listed one by one
 
@@ -65,11 +70,9 @@ class WandReport:
         """Frames of placed cameras that were not used, by reason."""
         return sum((Counter(row.left_out) for row in self.cameras), Counter())
 
-    def as_dict(self, command: str) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """For the `calibration` map of `rig.yaml`."""
         return {
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "command": command,
             "metric": self.metric,
             "instants": self.instants,
             "residual_px": round(self.residual_px, 4),
@@ -93,18 +96,62 @@ def _figures(mean: float | None, std: float | None) -> dict[str, float] | None:
     return None if mean is None or std is None else {"mean": round(mean, 3), "std": round(std, 3)}
 
 
-def print_report(report: WandReport, console: Console) -> None:
-    """A table of the cameras, then what else a person has to know."""
-    unit = "mm" if report.metric else "mm at this scale"
-    table = Table("camera", "frames used", "markers", "rejected", "residual px", f"expected error {unit}")
-    for row in report.cameras:
-        figures = (f"{row.residual_px:.3f}", f"{row.sigma_mm:.2f}")
-        table.add_row(
-            row.name, f"{row.frames_used} of {row.frames}", str(row.observations), str(row.outliers), *figures
-        )
+def print_report(result: "Calibration", trust: "Trust", console: Console) -> None:
+    """A table of the cameras, then what else a person has to know; the grade comes last."""
+    report, clocks = result.report, bool((result.time_sigma_ms > 0).any())
+    error = "error mm" if report.metric else "error %"
+    heads = ["camera", "grade", "frames", "outliers", "residual px", error, "waved"]
+    table = Table(*heads, *["clock ms"] * clocks)
+    judged = {camera.name: camera for camera in trust.cameras}
+    for k, row in enumerate(report.cameras):
+        camera = judged[row.name]
+        counts = (f"{row.frames_used}/{row.frames}", str(row.outliers))
+        error_mm = row.sigma_mm if report.metric else row.sigma_mm / 10
+        figures = (f"{row.residual_px:.3f}", f"{error_mm:.2f}", f"{1 - camera.figures['unused']:.0%}")
+        clock = f"{result.time_offset_ms[k]:+.2f} ± {result.time_sigma_ms[k]:.2f}"
+        table.add_row(row.name, camera.grade, *counts, *figures, *[clock] * clocks)
     console.print(table)
-    for line in _remarks(report):
+    foretold = trust.expected.lines() if trust.expected else []
+    wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
+    for line in [*_remarks(report), *_drifts(result), *foretold, *wave, trust.sentence()]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _drifts(result: "Calibration") -> list[str]:
+    if not (result.drift_sigma_ppm > 0).any():
+        return []
+    rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
+    return ["clocks drift apart, in ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]
+
+
+def clocks_as_dict(result: "Calibration") -> dict[str, Any]:
+    """Time offsets and drifts for the `calibration` map of `rig.yaml`; empty where the data want none."""
+    columns = {
+        "time_offset_ms": (result.time_offset_ms, result.time_sigma_ms),
+        "drift_ppm": (result.drift_ppm, result.drift_sigma_ppm),
+    }
+    return {
+        what: {
+            name: {"value": round(float(value), 4), "sigma": round(float(sigma), 4)}
+            for name, value, sigma in zip(result.names, values, sigmas, strict=True)
+        }
+        for what, (values, sigmas) in columns.items()
+        if (sigmas > 0).any()
+    }
+
+
+def show_progress(told: "Progress") -> Group:
+    """A wave as it goes: what each camera has seen, what it would give now, and what to do next."""
+    table = Table("camera", "frames", "image", "shared part", "place over noise")
+    trial = told.trial
+    for name, frames in told.frames.items():
+        used = f"{trial.used[name]:.0%}" if trial and name in trial.used else ""
+        strain = f"{trial.strain[name]:.2f}" if trial and name in trial.strain else ""
+        table.add_row(name, str(frames), f"{told.covered.get(name, 0):.0%}", used, strain)
+    now = f"{told.seconds:.0f} s"
+    if trial and trial.expected_mm is not None:
+        now += f", grade {trial.grade}, expected error {trial.expected_mm:.2f} mm"
+    return Group(Text(now, "bold"), table, Text(told.advice, "green" if told.enough else "yellow"))
 
 
 def _remarks(report: WandReport) -> list[str]:

@@ -10,6 +10,7 @@ import yaml
 
 from calib.camera import Camera
 from calib.errors import CalibrationError
+from calib.history import keep
 from camera_node.config import load_yaml, write_atomically
 from camera_node.errors import ConfigError
 
@@ -60,13 +61,23 @@ def load_rig(path: Path) -> Rig:
     return rig
 
 
-def save_rig(rig: Rig, path: Path) -> None:
+def save_rig(rig: Rig, path: Path) -> Path | None:
     """Write a rig atomically; fields at their defaults are left out.
+
+    Returns:
+        the name under which the file that was there before is kept (`calib undo` brings it back), if one was.
 
     Raises:
         ConfigError: the folder can't be written to.
     """
-    write_atomically(path, dump_rig(rig))
+    kept = keep(path)
+    try:
+        write_atomically(path, dump_rig(rig))
+    except BaseException:
+        if kept:
+            kept.unlink()
+        raise
+    return kept
 
 
 def dump_rig(rig: Rig) -> str:

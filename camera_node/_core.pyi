@@ -11,12 +11,14 @@ class Detector:
         min_diameter: float,
         max_diameter: float,
         min_contrast: float,
+        search_share: float,
+        by_paper: bool,
     ) -> None: ...
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One row of 16 a roundel.
+        """One row of 17 a roundel.
 
         u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast, residual; then the disc's own centre:
-        offset_u, offset_v from the ellipse's, and their covariance uu, uv, vv.
+        offset_u, offset_v from the ellipse's, and their covariance uu, uv, vv; and the track's number.
         """
 
     @property

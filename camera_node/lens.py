@@ -2,17 +2,20 @@
 """The lens: the only code that knows distortion. Pixel (0, 0) is the centre of the top-left pixel."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import cv2
 import msgspec
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 
 Array = NDArray[np.float64]
+
+MAX_FISHEYE_DEG = 89.0  # from the axis: beyond, x/z and y/z run away
 
 
 class Lens(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,6 +53,23 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
+    def parameters(self) -> Array:
+        """(4 + D,) fx, fy, cx, cy and the D distortion numbers."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    def with_parameters(self, parameters: ArrayLike) -> Self:
+        """The same lens with other fx, fy, cx, cy and distortion numbers (4 + D,).
+
+        Raises:
+            ValueError: they are not finite, or a focal length is not above 0.
+        """
+        fx, fy, cx, cy, *distortion = np.asarray(parameters, float).tolist()
+        changes = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": tuple(distortion)}
+        lens = msgspec.structs.replace(self, **changes)
+        lens.__post_init__()  # replace() does not call it
+        return lens
+
+    @property
     def _coefficients(self) -> Array:
         return np.array(self.distortion or (0.0,) * 4)
 
@@ -67,41 +87,64 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
 
         Points not before the camera have NaN in both.
         """
+        return self.project_with_jacobians(points)[:2]
+
+    def project_with_jacobians(self, points: ArrayLike) -> tuple[Array, Array, Array]:
+        """As `project_with_jacobian`, and the derivative (N, 2, 4 + D) by the lens's own `parameters`."""
         points = np.asarray(points, float).reshape(-1, 3)
         before = points[:, 2] > 1e-9
-        uv, J = np.full((len(points), 2), np.nan), np.full((len(points), 2, 3), np.nan)
+        shapes = ((2,), (2, 3), (2, 4 + len(self.distortion)))
+        uv, J_point, J_lens = (np.full((len(points), *shape), np.nan) for shape in shapes)
         if before.any():
-            uv[before], J[before] = self._project(points[before])
-        return uv, J
+            uv[before], J_point[before], J_lens[before] = self._project(points[before])
+        return uv, J_point, J_lens
 
-    def _project(self, points: Array) -> tuple[Array, Array]:
-        zero = np.zeros(3)
+    def _project(self, points: Array) -> tuple[Array, Array, Array]:
+        zero, free = np.zeros(3), 4 + len(self.distortion)
         if self.model == "fisheye":
             uv, jacobian = cv2.fisheye.projectPoints(points[None], zero, zero, self.K, self._coefficients)
-            translation = slice(11, 14)
+            translation, lens = slice(11, 14), slice(0, free)
         else:
             uv, jacobian = cv2.projectPoints(points, zero, zero, self.K, self._coefficients)[:2]
-            translation = slice(3, 6)
+            translation, lens = slice(3, 6), slice(6, 6 + free)
+        jacobian = np.asarray(jacobian, float).reshape(len(points), 2, -1)
         # At zero rotation, moving the frame and moving the point are the same.
-        return uv.reshape(-1, 2).astype(float), jacobian[:, translation].reshape(-1, 2, 3).astype(float)
+        return uv.reshape(-1, 2).astype(float), jacobian[:, :, translation], jacobian[:, :, lens]
 
     def normalise(self, uv: ArrayLike) -> Array:
         """Undistorted image plane coordinates x/z, y/z (N, 2) of raw pixels (N, 2).
 
-        NaN where the distortion has no inverse (far outside the image).
+        NaN where the distortion has no inverse (far outside the image), or the ray is not before the camera.
         """
-        uv = np.asarray(uv, float).reshape(-1, 1, 2)
+        uv = np.asarray(uv, float).reshape(-1, 2)
         if len(uv) == 0:
             return np.empty((0, 2))
         if self.model == "fisheye":
-            xy = cv2.fisheye.undistortPoints(uv, self.K, self._coefficients).reshape(-1, 2)
+            xy = self._normalise_fisheye(uv)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-12)
-            xy = cv2.undistortPoints(uv, self.K, self._coefficients, criteria=criteria).reshape(-1, 2)
-        xy = xy.astype(float)
+            xy = cv2.undistortPoints(uv[:, None], self.K, self._coefficients, criteria=criteria)
+            xy = xy.reshape(-1, 2).astype(float)
         back = self.project(np.column_stack([xy, np.ones(len(xy))]))
-        xy[~(np.linalg.norm(back - uv[:, 0], axis=1) < 1e-3)] = np.nan
+        xy[~(np.linalg.norm(back - uv, axis=1) < 1e-3)] = np.nan
         return xy
+
+    def _normalise_fisheye(self, uv: Array) -> Array:
+        """Newton's method on theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8) (Kannala and Brandt 2006).
+
+        `cv2.fisheye.undistortPoints` gives up where theta_d is above 90 degrees, though theta is not.
+        """
+        distorted = (uv - [self.cx, self.cy]) / [self.fx, self.fy]
+        theta_d = np.linalg.norm(distorted, axis=1)
+        odd = Polynomial(np.kron([1.0, *self._coefficients], [0.0, 1.0]))
+        derivative = odd.deriv()
+        theta = np.minimum(theta_d, np.pi / 2)
+        for _ in range(20):
+            step = (odd(theta) - theta_d) / np.maximum(derivative(theta), 0.1)
+            theta = np.clip(theta - step, 0.0, np.pi / 2)
+        stretch = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
+        stretch[theta > np.radians(MAX_FISHEYE_DEG)] = np.nan
+        return stretch[:, None] * distorted
 
     def rays(self, uv: ArrayLike) -> Array:
         """Unit viewing rays (N, 3), camera frame, of raw pixels (N, 2)."""

@@ -17,18 +17,18 @@ static roundel::ImageView view(const Grey& image) {
 }
 
 /// One row a roundel, in the order that `_core.pyi` states.
-static Table table(const std::vector<roundel::Fit>& fits) {
-    constexpr size_t kColumns = 16;
-    auto* rows = new double[fits.size() * kColumns + 1];
+static Table table(const std::vector<roundel::Roundel>& roundels) {
+    constexpr size_t kColumns = 17;
+    auto* rows = new double[roundels.size() * kColumns + 1];
     const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
     double* to = rows;
-    for (const auto& f : fits)
+    for (const auto& [f, track] : roundels)
         for (const double value :
              {f.outer.x, f.outer.y, f.covariance.xx, f.covariance.xy, f.covariance.yy, f.outer.major,
               f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.residual, f.offset_x, f.offset_y,
-              f.offset_covariance.xx, f.offset_covariance.xy, f.offset_covariance.yy})
+              f.offset_covariance.xx, f.offset_covariance.xy, f.offset_covariance.yy, double(track)})
             *to++ = value;
-    return Table(rows, {fits.size(), kColumns}, owner);
+    return Table(rows, {roundels.size(), kColumns}, owner);
 }
 
 NB_MODULE(_core, m) {
@@ -38,22 +38,22 @@ NB_MODULE(_core, m) {
         .def(
             "__init__",
             [](roundel::Detector* self, std::vector<double> ratios, double tolerance, double min_diameter,
-               double max_diameter, double min_contrast) {
-                new (self) roundel::Detector(
-                    {std::move(ratios), tolerance, min_diameter, max_diameter, min_contrast});
+               double max_diameter, double min_contrast, double share, bool by_paper) {
+                new (self) roundel::Detector({std::move(ratios), tolerance, min_diameter, max_diameter,
+                                              min_contrast, share, by_paper});
             },
             nb::arg("inner_ratios"), nb::arg("ratio_tolerance"), nb::arg("min_diameter"),
-            nb::arg("max_diameter"), nb::arg("min_contrast"))
+            nb::arg("max_diameter"), nb::arg("min_contrast"), nb::arg("search_share"), nb::arg("by_paper"))
         .def(
             "detect",
             [](roundel::Detector& self, const Grey& image) {
                 const auto pixels = view(image);
-                std::vector<roundel::Fit> fits;
+                std::vector<roundel::Roundel> roundels;
                 {
                     nb::gil_scoped_release release;
-                    fits = self.detect(pixels);
+                    roundels = self.detect(pixels);
                 }
-                return table(fits);
+                return table(roundels);
             },
             nb::arg("image").noconvert())
         .def_prop_ro("saturated", &roundel::Detector::saturated)

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cmath>
 
@@ -19,9 +20,10 @@ class Cholesky {
             positive_ = positive_ && L_[j][j] > 1e-12 * A[j][j];
             if (!positive_) return;
             L_[j][j] = std::sqrt(L_[j][j]);
+            per_diagonal_[j] = 1 / L_[j][j];
             for (int i = j + 1; i < N; ++i) {
                 for (int k = 0; k < j; ++k) L_[i][j] -= L_[i][k] * L_[j][k];
-                L_[i][j] /= L_[j][j];
+                L_[i][j] *= per_diagonal_[j];
             }
         }
     }
@@ -30,17 +32,35 @@ class Cholesky {
     Vector<N> solve(Vector<N> b) const {
         for (int i = 0; i < N; ++i) {
             for (int k = 0; k < i; ++k) b[i] -= L_[i][k] * b[k];
-            b[i] /= L_[i][i];
+            b[i] *= per_diagonal_[i];
         }
         for (int i = N - 1; i >= 0; --i) {
             for (int k = i + 1; k < N; ++k) b[i] -= L_[k][i] * b[k];
-            b[i] /= L_[i][i];
+            b[i] *= per_diagonal_[i];
         }
         return b;
+    }
+    /// The last M rows and columns of the inverse of A: those of L alone, (L_22 L_22^T)^-1.
+    template <int M>
+    std::array<Vector<M>, M> inverse_tail() const {
+        constexpr int first = N - M;
+        std::array<Vector<M>, M> K{}, inverse{};  // K = L_22^-1
+        for (int j = 0; j < M; ++j) {
+            K[j][j] = per_diagonal_[first + j];
+            for (int i = j + 1; i < M; ++i) {
+                for (int k = j; k < i; ++k) K[i][j] -= L_[first + i][first + k] * K[k][j];
+                K[i][j] *= per_diagonal_[first + i];
+            }
+        }
+        for (int i = 0; i < M; ++i)
+            for (int j = 0; j < M; ++j)
+                for (int k = std::max(i, j); k < M; ++k) inverse[i][j] += K[k][i] * K[k][j];
+        return inverse;
     }
 
   private:
     std::array<Vector<N>, N> L_;
+    Vector<N> per_diagonal_{};
     bool positive_ = true;
 };
 

@@ -3,30 +3,44 @@
 #include <mutex>
 #include <vector>
 
+#include "chords.hpp"
+#include "claims.hpp"
 #include "image.hpp"
 #include "paper.hpp"
-#include "refine.hpp"
 #include "threshold.hpp"
+#include "tracks.hpp"
 
 namespace roundel {
 
-/// Roundels of grey images, frame after frame: the paper's segments under a local threshold, then each one
-/// fitted to its grey levels. Calls from several threads wait for each other.
+/// Roundels of grey images, frame after frame: those of the last frame where they are expected, then the
+/// rest of the frame under a local threshold, each one fitted to its grey levels. Calls from several threads
+/// wait for each other.
 class Detector {
   public:
-    explicit Detector(Settings settings) : settings_(std::move(settings)) {}
-    std::vector<Fit> detect(const ImageView& image);
+    explicit Detector(Settings settings) : settings_(std::move(settings)), chords_(settings_) {}
+    std::vector<Roundel> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
     /// Share of the last frame's pixels at the upper end of the scale.
     double saturated() const { return saturated_; }
 
   private:
-    void update_theta(const std::vector<Fit>& found);
+    void follow(const ImageView& image);
+    void search(const ImageView& image);
+    void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
+    void accept(const ImageView& image, const std::optional<Start>& start, int track);
+    ImageView next_band(const ImageView& image, int& top);
+    void update_theta();
 
     Settings settings_;
+    ChordSearch chords_;
     Theta theta_;
+    Tracks tracks_;
+    Claims claims_{0, 0};
+    std::vector<Roundel> found_;
     double saturated_ = 0;
+    double noise_ = 0;        // grey levels
+    double searched_to_ = 0;  // share of the height
     std::mutex mutex_;
 };
 

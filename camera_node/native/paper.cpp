@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <optional>
 #include <stdexcept>
 
 namespace roundel {
@@ -77,6 +78,43 @@ std::vector<Pair> find_pairs(const Segments& segments, int width, int height, co
         if (has_area_ratio(disc, inner.moments, settings)) pairs.push_back({k, centre, disc});
     }
     return pairs;
+}
+
+namespace {
+
+/// A pair under its own threshold theta = (m_d + m_b) / 2, grown anew in the window around it.
+std::optional<Start> rethreshold(const ImageView& image, const Segment& outer, double theta,
+                                 const Settings& settings) {
+    const int margin = 2 + std::max(outer.width(), outer.height()) / 8;
+    const int left = std::max(0, outer.left - margin), top = std::max(0, outer.top - margin);
+    const int width = std::min(image.width, outer.right + 1 + margin) - left;
+    const int height = std::min(image.height, outer.bottom + 1 + margin) - top;
+    const ImageView window = image.window(left, top, width, height);
+    const Segments segments = grow_segments(window, constant_threshold(uint8_t(std::lround(theta))));
+    for (const Pair& pair : find_pairs(segments, width, height, settings)) {
+        Ellipse e = covariance_ellipse(pair.disc);
+        e.x += left, e.y += top;
+        if (e.x < outer.left || e.x > outer.right || e.y < outer.top || e.y > outer.bottom) continue;
+        const double ratio = std::sqrt(segments.list[size_t(pair.bright)].moments.n / pair.disc.n);
+        return Start{e, ratio, mean_level(window, segments, pair.dark),
+                     mean_level(window, segments, pair.bright)};
+    }
+    return std::nullopt;
+}
+
+}  // namespace
+
+std::vector<Start> find_by_segments(const ImageView& image, const ThresholdMap& threshold,
+                                    const Settings& settings) {
+    std::vector<Start> starts;
+    const Segments segments = grow_segments(image, threshold);
+    for (const Pair& pair : find_pairs(segments, image.width, image.height, settings)) {
+        const double m_d = mean_level(image, segments, pair.dark);
+        const double m_b = mean_level(image, segments, pair.bright);
+        const Segment& outer = segments.list[size_t(pair.dark)];
+        if (const auto start = rethreshold(image, outer, (m_d + m_b) / 2, settings)) starts.push_back(*start);
+    }
+    return starts;
 }
 
 }  // namespace roundel

@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "ellipse.hpp"
+#include "refine.hpp"
 #include "segments.hpp"
 
 namespace roundel {
@@ -10,18 +11,17 @@ namespace roundel {
 /// What counts as a roundel.
 struct Settings {
     std::vector<double> inner_ratios{0.6, 0.41};  // inner over outer diameter of the prints in use
-    double ratio_tolerance = 0.1;
+    double ratio_tolerance = 0.08;
     double min_diameter = 8, max_diameter = 400;  // of the outer ellipse's major axis, pixels
     double min_contrast = 25;                     // bright less dark, grey levels
+    double search_share = 1;                      // of a frame's rows that are searched for new roundels
+    bool by_paper = false;                        // search by the paper's segments instead of chords
 };
 
 /// A dark segment with a bright one in it: what Section III-B of the paper accepts.
 struct Pair {
-    int dark, bright;         // numbers of segments
-    Moments disc;             // both together: the outer disc
-    double dark_level = 0;    // m_d
-    double bright_level = 0;  // m_b
-    double theta() const { return (dark_level + bright_level) / 2; }
+    int dark, bright;  // numbers of segments
+    Moments disc;      // both together: the outer disc
 };
 
 // Faigl, Krajnik, Chudoba, Saska: Low-cost embedded system for relative localization in robotic swarms, ICRA
@@ -50,5 +50,10 @@ double distance_by_principal_axis(double diameter, double major);
 
 /// All pairs of segments that pass Section III-B. What touches the image's border is left out.
 std::vector<Pair> find_pairs(const Segments& segments, int width, int height, const Settings& settings);
+
+/// The paper's search, made local and for any number of roundels: segments under a threshold map, their
+/// pairs, and each pair anew under its own threshold theta = (m_d + m_b) / 2 in the window around it.
+std::vector<Start> find_by_segments(const ImageView& image, const ThresholdMap& threshold,
+                                    const Settings& settings);
 
 }  // namespace roundel

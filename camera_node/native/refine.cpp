@@ -3,294 +3,261 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
-#include <vector>
 
 #include "cholesky.hpp"
+#include "edge_pixels.hpp"
+#include "normal_equations.hpp"
 
 namespace roundel {
 
 namespace {
 
-enum Parameter {
-    kX,
-    kY,
-    kAxx,
-    kAxy,
-    kAyy,
-    kRatio,
-    kOffsetX,
-    kOffsetY,
-    kBright,
-    kDark,
-    kGround,
-    kBlur,
-    kCard,
-    kCount
-};
-using Parameters = Vector<kCount>;
-using Matrix = std::array<Parameters, kCount>;
-
-constexpr double kBand = 2;       // pixels on either side of an edge that are used
-constexpr int kMaxPixels = 1200;  // larger roundels are sampled on a coarser grid
-constexpr int kMaxIterations = 12;
-constexpr double kStep = 4e-3;     // pixels: a step below it is the last, and leaves an error of far less
+constexpr double kBand = 2.5;       // pixels on either side of an edge that are used, at the least
+constexpr double kBandBlurs = 2.5;  // blurs, likewise
+constexpr int kCoarsePixels = 200;
+constexpr int kMaxSteps = 12;
+constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
+constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
 constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
-constexpr double kTukey = 6;       // standard deviations from which on a pixel does not count
+constexpr double kStartBlur = 0.8;
 constexpr double kCardRatio = 9.0 / 7;
-
-struct Pixel {
-    double x, y, level;
-};
-
-/// Signed distance of a point to the ellipse centre + r A u, |u| = 1, to first order (positive outside), and
-/// its derivatives by the centre, by A = [[xx, xy], [xy, yy]] and by r.
-struct Edge {
-    double distance, by_x, by_y, by_axx, by_axy, by_ayy, by_r, curvature;
-};
-
-double square(double x) { return x * x; }
-double cube(double x) { return x * x * x; }
-
-Edge edge(const Symmetric& inverse, double r, double dx, double dy) {
-    const double qx = inverse.xx * dx + inverse.xy * dy, qy = inverse.xy * dx + inverse.yy * dy;
-    const double wx = inverse.xx * qx + inverse.xy * qy, wy = inverse.xy * qx + inverse.yy * qy;
-    const double f = std::sqrt(qx * qx + qy * qy) + 1e-9, per_f = 1 / f;
-    const double per_w = 1 / (std::sqrt(wx * wx + wy * wy) + 1e-9), stretch = f * per_w;
-    const double nx = wx * per_w, ny = wy * per_w, ux = r * qx * per_f, uy = r * qy * per_f;
-    return {(f - r) * stretch,    -nx,      -ny,      -nx * ux,
-            -(nx * uy + ny * ux), -ny * uy, -stretch, cube(stretch) * square(inverse.det()) / r};
-}
-
-/// The share of the inside that a pixel sees near a blurred edge, and its derivatives by distance and by
-/// blur.
-struct Step {
-    double inside, slope, by_blur;
-};
-
-/// Blur moves the half level of a curved edge towards its centre of curvature by curvature blur^2 / 2.
-Step step(const Edge& edge, double blur) {
-    const double shift = edge.curvature * blur * blur / 2, t = (edge.distance + shift) / blur;
-    if (std::abs(t) > 5) return {t < 0 ? 1.0 : 0.0, 0, 0};
-    const double slope = -std::exp(-t * t / 2) / (blur * std::sqrt(2 * std::numbers::pi));
-    return {std::erfc(t / std::numbers::sqrt2) / 2, slope, slope * (shift - edge.distance) / blur};
-}
-
-Symmetric invert(const Parameters& p) {
-    const Symmetric A{p[kAxx], p[kAxy], p[kAyy]};
-    return {A.yy / A.det(), -A.xy / A.det(), A.xx / A.det()};
-}
-
-/// The model's grey level of a pixel, and its gradient.
-class Model {
-  public:
-    explicit Model(const Parameters& p) : p_(p), inverse_(invert(p)) {
-        // The centres of concentric circles' images stand on a line, as far from each other as their radii
-        // squared.
-        card_shift_ = (p[kCard] * p[kCard] - 1) / (p[kRatio] * p[kRatio] - 1);
-    }
-
-    double operator()(double x, double y, Parameters& J) const {
-        const double dx = x - p_[kX], dy = y - p_[kY];
-        const Edge outer = edge(inverse_, 1, dx, dy);
-        const Edge inner = edge(inverse_, p_[kRatio], dx - p_[kOffsetX], dy - p_[kOffsetY]);
-        const Edge card =
-            edge(inverse_, p_[kCard], dx - card_shift_ * p_[kOffsetX], dy - card_shift_ * p_[kOffsetY]);
-        const Step o = step(outer, p_[kBlur]), i = step(inner, p_[kBlur]), c = step(card, p_[kBlur]);
-        const double fall = p_[kDark] - p_[kBright], drop = p_[kGround] - p_[kBright];
-        const double by_o = fall * o.slope, by_i = -fall * i.slope, by_c = -drop * c.slope;
-        J[kX] = by_o * outer.by_x + by_i * inner.by_x + by_c * card.by_x;
-        J[kY] = by_o * outer.by_y + by_i * inner.by_y + by_c * card.by_y;
-        J[kAxx] = by_o * outer.by_axx + by_i * inner.by_axx + by_c * card.by_axx;
-        J[kAxy] = by_o * outer.by_axy + by_i * inner.by_axy + by_c * card.by_axy;
-        J[kAyy] = by_o * outer.by_ayy + by_i * inner.by_ayy + by_c * card.by_ayy;
-        J[kRatio] = by_i * inner.by_r;
-        J[kOffsetX] = by_i * inner.by_x + card_shift_ * by_c * card.by_x;
-        J[kOffsetY] = by_i * inner.by_y + card_shift_ * by_c * card.by_y;
-        J[kBright] = c.inside - o.inside + i.inside;
-        J[kDark] = o.inside - i.inside;
-        J[kGround] = 1 - c.inside;
-        J[kBlur] = fall * (o.by_blur - i.by_blur) - drop * c.by_blur;
-        J[kCard] = by_c * card.by_r;
-        return p_[kBright] + fall * J[kDark] + drop * J[kGround];
-    }
-
-  private:
-    const Parameters& p_;
-    Symmetric inverse_;
-    double card_shift_;
-};
+constexpr double kBeyond = 64;     // grey levels off the scale that a small or clipped roundel may need
+constexpr double kPrint = 0.002;   // standard deviation of ratios among prints of one kind
+constexpr double kOtherPrint = 3;  // standard deviations
+constexpr double kStrict = 0.5;    // of it at first, when the model still bends to what it disagrees with
+constexpr double kSlack = 1.3;     // of a median of few, over the deviation it stands for
+constexpr double kShortestFocal = 400;  // pixels: no lens shows more perspective
 
 /// Starting values: A is the symmetric square root that maps the unit circle to the ellipse.
-Parameters begin(const Start& s) {
+Parameters begin(const Start& s, const EdgePixels& frame) {
     const double c = std::cos(s.outer.angle), n = std::sin(s.outer.angle);
     const double a = s.outer.major / 2, b = s.outer.minor / 2;
     Parameters p{};
-    p[kX] = s.outer.x, p[kY] = s.outer.y;
+    p[kX] = s.outer.x - frame.origin_x, p[kY] = s.outer.y - frame.origin_y;
     p[kAxx] = a * c * c + b * n * n, p[kAxy] = (a - b) * c * n, p[kAyy] = a * n * n + b * c * c;
-    p[kRatio] = s.ratio, p[kCard] = kCardRatio, p[kBlur] = 0.8;
+    p[kRatio] = s.ratio, p[kCard] = kCardRatio, p[kBlur] = kStartBlur;
     p[kDark] = s.dark, p[kBright] = p[kGround] = s.bright;
     return p;
 }
 
+double square(double x) { return x * x; }
+
 /// What is known before a pixel is seen, as information (1 / variance): wide, only to hold what the pixels
 /// don't tell.
-Parameters prior_information() {
+Parameters prior_information(double major) {
     Parameters w{};
-    w[kRatio] = 1 / (0.3 * 0.3), w[kOffsetX] = w[kOffsetY] = 1.0;
-    w[kGround] = 1 / (100.0 * 100), w[kBlur] = 1 / (1.0 * 1.0), w[kCard] = 1 / (0.05 * 0.05);
+    w[kRatio] = 1 / square(0.3), w[kCard] = 1 / square(0.05);
+    w[kGround] = 1 / square(100), w[kBlur] = 1 / square(1);
+    w[kGx] = w[kGy] = square(kShortestFocal / (major / 2));  // g = r / f sin(tilt)
     return w;
 }
 
-std::vector<Pixel> select_pixels(const ImageView& image, const Parameters& p, const Ellipse& e) {
-    const Symmetric inverse = invert(p);
-    const double edges = std::numbers::pi * (e.major + e.minor) / 2 * (1 + p[kRatio]);
-    const int grid = std::max(1, int(std::ceil(std::sqrt(edges * 2 * kBand / kMaxPixels))));
-    const double half_width = std::hypot(p[kAxx], p[kAxy]) + kBand,
-                 half_height = std::hypot(p[kAxy], p[kAyy]) + kBand;
-    const int left = std::max(0, int(std::ceil(e.x - half_width))),
-              top = std::max(0, int(std::ceil(e.y - half_height)));
-    const int right = std::min(image.width - 1, int(e.x + half_width));
-    const int bottom = std::min(image.height - 1, int(e.y + half_height));
-    std::vector<Pixel> pixels;
-    for (int y = top; y <= bottom; y += grid)
-        for (int x = left; x <= right; x += grid) {
-            const double dx = x - p[kX], dy = y - p[kY];
-            if (edge(inverse, kCardRatio, dx, dy).distance > 0) continue;
-            if (std::abs(edge(inverse, 1, dx, dy).distance) < kBand ||
-                std::abs(edge(inverse, p[kRatio], dx, dy).distance) < kBand)
-                pixels.push_back({double(x), double(y), double(image.row(y)[x])});
-        }
-    return pixels;
-}
-
-double tukey(double residual, double scale) {
-    const double t = residual / (kTukey * scale);
-    return std::abs(t) < 1 ? (1 - t * t) * (1 - t * t) : 0;
-}
-
-/// Gauss-Newton on one set of pixels.
-class Solver {
+/// Gauss-Newton on the pixels near one roundel's edges.
+class Fitter {
   public:
-    Solver(const std::vector<Pixel>& pixels, const Parameters& start)
-        : p(start), pixels_(pixels), start_(start), residuals_(pixels.size()) {}
+    Fitter(const ImageView& image, const Start& start) : image_(image) {
+        pixels_.origin_x = int(std::lround(start.outer.x));
+        pixels_.origin_y = int(std::lround(start.outer.y));
+        p = start_ = begin(start, pixels_);
+        prior_ = prior_information(start.outer.major);
+    }
 
-    /// Iterates until the step is small; false where the equations are singular or the fit goes astray.
     bool solve() {
-        scale_ = (start_[kBright] - start_[kDark]) / 4;
-        for (int k = 0; k < kMaxIterations; ++k) {
-            accumulate();
-            const Cholesky<kCount> factor(H_);
-            if (!factor.positive()) return false;
-            const Parameters delta = factor.solve(g_);
-            double moved = 0;
-            for (int i = 0; i < kCount; ++i) p[i] += delta[i];
-            for (int i = 0; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
-            p[kBlur] = std::max(p[kBlur], kMinBlur);
-            if (!is_sane()) return false;
-            if (moved < kStep) break;
-        }
-        accumulate();
-        return true;
+        // Perspective moves the inner edge and the card's from where the start has them.
+        const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
+        if (!select(kBand + unknown, kCoarsePixels)) return false;
+        p[kGround] = start_[kGround] = level_beyond_card();
+        if (!iterate(2)) return false;
+        const double band = std::max(kBand, kBandBlurs * p[kBlur]);
+        if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
+        return iterate(1);
     }
 
-    /// Covariance of two neighbouring parameters at the solution; nothing where the equations are singular.
-    std::optional<Symmetric> covariance(Parameter first, Parameter second) const {
-        const Cholesky<kCount> factor(H_);
-        if (!factor.positive()) return std::nullopt;
-        Parameters ex{}, ey{};
-        ex[first] = ey[second] = noise_ * noise_;
-        const Parameters x = factor.solve(ex), y = factor.solve(ey);
-        return Symmetric{x[first], x[second], y[second]};
-    }
-
-    double residual() const { return rms_; }
-
+    void learn_print(double ratio);
+    Fit fit() const;
     Parameters p;
 
   private:
-    /// Normal equations H delta = g of the weighted residuals and the prior.
-    void accumulate() {
-        const Model model(p);
-        H_ = {}, g_ = {};
-        double weights = 0, weighted = 0, squares = 0;
-        for (size_t k = 0; k < pixels_.size(); ++k) {
-            Parameters J;
-            const double r = pixels_[k].level - model(pixels_[k].x, pixels_[k].y, J);
-            const double w = tukey(r, scale_);
-            residuals_[k] = std::abs(r);
-            squares += r * r, weights += w, weighted += w * r * r;
-            for (int i = 0; i < kCount; ++i) {
-                const double wj = w * J[i];
-                g_[i] += wj * r;
-                for (int j = 0; j <= i; ++j) H_[i][j] += wj * J[j];
-            }
+    PoseCovariance covariance() const;
+
+    bool select(double band, int limit) {
+        step_ = select_pixels(image_, p, band, limit, pixels_);
+        return pixels_.used >= 2 * kCount;
+    }
+
+    /// The mean level of what lies beyond the card's edge; the bright one where nothing does.
+    double level_beyond_card() const {
+        const double det = p[kAxx] * p[kAyy] - square(p[kAxy]);
+        const float xx = float(p[kAyy] / det), xy = float(-p[kAxy] / det), yy = float(p[kAxx] / det);
+        const float x0 = float(p[kX]), y0 = float(p[kY]), edge = float(square(p[kCard]));
+        float sum = 0, n = 0;
+        for (int k = 0; k < pixels_.used; ++k) {
+            const float dx = pixels_.x[k] - x0, dy = pixels_.y[k] - y0;
+            const float qx = xx * dx + xy * dy, qy = xy * dx + yy * dy;
+            if (qx * qx + qy * qy > edge) sum += pixels_.level[k], n += 1;
         }
-        rms_ = std::sqrt(squares / double(pixels_.size()));
-        noise_ = std::max(kNoiseFloor, std::sqrt(weighted / std::max(1.0, weights - double(kCount))));
-        add_prior();
-        update_scale();
+        return n > 0 ? double(sum / n) : p[kBright];
+    }
+
+    /// The median of the residuals of a sample of the ring's edges (1.48 of it is a standard deviation).
+    double edge_scale() const {
+        float residuals[kSample + kLanes];
+        const int n = sample_residuals(pixels_, p, residuals);
+        if (n < kLanes) return (p[kBright] - p[kDark]) / 4;
+        std::nth_element(residuals, residuals + n / 2, residuals + n);
+        return std::max(kNoiseFloor, 1.48 * residuals[n / 2]);
+    }
+
+    /// Steps until what is left, of the order of one's square over the blur, will be small against the
+    /// standard deviation `ahead` steps later.
+    bool iterate(int ahead) {
+        for (int k = 0; k < kMaxSteps; ++k) {
+            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * edge_scale());
+            sums_ = accumulate(pixels_, p, used);
+            add_prior();
+            factor_.emplace(sums_.H);
+            if (!factor_->positive()) return false;
+            const double moved = advance();
+            if (!is_sane()) return false;
+            const double deviation = noise_ / std::sqrt(sums_.H[kX][kX] + sums_.H[kY][kY]);
+            double left = moved;
+            for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
+            if (left < 0.2 * deviation && (ahead > 1 || (is_noise_known_ && scale_ > 0.7 * used)))
+                return true;
+        }
+        return true;
     }
 
     void add_prior() {
-        static const Parameters information = prior_information();
+        const double noise = std::max(kNoiseFloor, std::sqrt(sums_.mrr / sums_.m));
         for (int i = 0; i < kCount; ++i) {
-            H_[i][i] += noise_ * noise_ * information[i];
-            const double mean = i == kOffsetX || i == kOffsetY ? 0 : start_[i];
-            g_[i] += noise_ * noise_ * information[i] * (mean - p[i]);
+            const double information = noise * noise * prior_[i];
+            sums_.H[i][i] += information;
+            sums_.g[i] += information * (start_[i] - p[i]);
         }
     }
 
-    /// Tukey's scale for the next step: the median of the residuals (1.48 of it is a standard deviation).
-    void update_scale() {
-        const auto middle = residuals_.begin() + ptrdiff_t(residuals_.size() / 2);
-        std::nth_element(residuals_.begin(), middle, residuals_.end());
-        scale_ = std::max(kNoiseFloor, 1.48 * *middle);
+    /// Takes a step, foretells the residuals after it, and gives its greatest move in pixels.
+    double advance() {
+        const Parameters delta = factor_->solve(sums_.g);
+        for (int i = 0; i < kCount; ++i) p[i] += delta[i];
+        p[kBlur] = std::max(p[kBlur], kMinBlur);
+        update_noise(delta);
+        double moved = std::abs(delta[kBlur]);
+        for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
+        return moved;
+    }
+
+    /// What residuals on the edges are left after a step. It takes delta^T H delta off the sum of squares;
+    /// what belongs to the levels and to the blur is elsewhere. `freedom` is the share that the unknowns do
+    /// not follow.
+    void update_noise(const Parameters& delta) {
+        double all = 0, edges = 0;
+        for (int i = 0; i < kCount; ++i)
+            for (int j = 0; j < kCount; ++j) {
+                const double part = delta[i] * sums_.H[std::max(i, j)][std::min(i, j)] * delta[j];
+                all += part, edges += i > kBlur && j > kBlur ? part : 0;
+            }
+        const double left = sums_.mm / sums_.m * edges;
+        const double freedom = std::max(0.1, 1 - kEdgeUnknowns * sums_.mm / square(sums_.m));
+        const double slope = std::max(0.5, sums_.mpsi / sums_.m);
+        // After a long step what is left is too small a difference to be trusted.
+        is_noise_known_ = left < sums_.mwrr / 4;
+        const double mrr = std::max(sums_.mrr / 4, sums_.mrr - left);
+        const double mwrr = std::max(sums_.mwrr / 4, sums_.mwrr - left);
+        scale_ = std::max(kNoiseFloor, kScale * std::sqrt(mrr / (sums_.m * freedom)));
+        noise_ = std::max(kNoiseFloor, std::sqrt(mwrr / (sums_.m * freedom)) / slope);
+        agreeing_ = std::sqrt(std::max(0.0, sums_.wrr - all) / std::max(1.0, sums_.w));
     }
 
     bool is_sane() const {
-        const double size = std::sqrt(start_[kAxx] * start_[kAyy] - start_[kAxy] * start_[kAxy]);
-        const double area = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
-        return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * size && p[kAxx] > 0 &&
-               std::sqrt(std::max(area, 0.0)) > 0.7 * size && std::sqrt(std::max(area, 0.0)) < 1.4 * size &&
-               p[kRatio] > 0.1 && p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * size && p[kCard] > 1;
+        const double size = start_[kAxx] * start_[kAyy] - square(start_[kAxy]);
+        const double area = (p[kAxx] * p[kAyy] - square(p[kAxy])) / size;
+        return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * std::sqrt(size) &&
+               p[kAxx] > 0 && area > square(0.7) && area < square(1.4) && p[kRatio] > 0.1 &&
+               p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * std::sqrt(size) && p[kCard] > 1 &&
+               p[kDark] > -kBeyond && p[kBright] < 255 + kBeyond &&
+               square(p[kGx]) + square(p[kGy]) < square(0.5 / p[kCard]);
     }
 
-    const std::vector<Pixel>& pixels_;
-    Parameters start_;
-    std::vector<double> residuals_;
-    Matrix H_{};
-    Parameters g_{};
-    double scale_ = 0, rms_ = 0, noise_ = 0;
+    const ImageView& image_;
+    EdgePixels pixels_;
+    Parameters start_, prior_;
+    NormalEquations sums_;
+    std::optional<Cholesky<kCount>> factor_;
+    Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
+    int step_ = 1;
+    bool is_noise_known_ = false;
+    double scale_ = 255, noise_ = 0, agreeing_ = 0;
 };
+
+/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
+/// first order in g.
+std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
+    const double gx = p[kGx], gy = p[kGy];
+    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
+    std::array<Vector<kPoseCount>, kPoseCount> T{};
+    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
+    for (int k = 0; k < 5; ++k) T[k][k] += 1;
+    return T;
+}
+
+/// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
+void Fitter::learn_print(double ratio) {
+    Parameters unit{};
+    unit[kRatio] = square(noise_);
+    const Parameters with = factor_->solve(unit);  // covariance of all with the ratio
+    const double off = ratio - p[kRatio], variance = with[kRatio] + square(kPrint);
+    if (square(off) > square(kOtherPrint) * variance) return;
+    for (int i = 0; i < kCount; ++i) p[i] += with[i] * off / variance;
+    for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
+}
+
+PoseCovariance Fitter::covariance() const {
+    auto inverse = factor_->inverse_tail<kPoseCount>();
+    for (int i = 0; i < kPoseCount; ++i)
+        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
+    const auto T = outputs_by_pose(p);
+    PoseCovariance half{}, whole{};
+    for (int a = 0; a < kPoseCount; ++a)
+        for (int i = 0; i < kPoseCount; ++i)
+            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
+    for (int a = 0; a < kPoseCount; ++a)
+        for (int b = 0; b < kPoseCount; ++b)
+            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
+    return whole;
+}
+
+Fit Fitter::fit() const {
+    const CircleImage outer = circle_image(p, 1);
+    const Eigen axes = eigen(outer.shape);
+    const PoseCovariance C = covariance();
+    return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
+                      2 * std::sqrt(axes.second), axes.angle},
+            .covariance = {C[0][0], C[0][1], C[1][1]},
+            .offset_x = p[kX] - outer.x,
+            .offset_y = p[kY] - outer.y,
+            .offset_covariance = {C[5][5], C[5][6], C[6][6]},
+            .pose_covariance = C,
+            .ratio = p[kRatio],
+            .card = p[kCard],
+            .dark = p[kDark],
+            .bright = p[kBright],
+            .blur = p[kBlur],
+            .residual = std::sqrt(sums_.rr / std::max(1.0, sums_.n)),
+            .edge_residual = std::sqrt(sums_.ring_rr / sums_.ring),
+            .agreeing_residual = agreeing_,
+            .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};
+}
 
 }  // namespace
 
 std::optional<Fit> refine(const ImageView& image, const Start& start) {
-    const Parameters first = begin(start);
-    const std::vector<Pixel> pixels = select_pixels(image, first, start.outer);
-    if (pixels.size() < 2 * kCount) return std::nullopt;
-    Solver solver(pixels, first);
-    if (!solver.solve()) return std::nullopt;
-    const auto centre = solver.covariance(kX, kY), offset = solver.covariance(kOffsetX, kOffsetY);
-    if (!centre || !offset) return std::nullopt;
-    const Parameters& p = solver.p;
-    const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
-    // Perspective moves a circle's centre by its radius squared: the inner circle's image tells that of
-    // radius nought.
-    const double to_disc = 1 / (1 - p[kRatio] * p[kRatio]);
-    return Fit{.outer = {p[kX], p[kY], 2 * axes.first, 2 * axes.second, axes.angle},
-               .covariance = *centre,
-               .offset_x = to_disc * p[kOffsetX],
-               .offset_y = to_disc * p[kOffsetY],
-               .offset_covariance = offset->scaled(to_disc * to_disc),
-               .ratio = p[kRatio],
-               .card = p[kCard],
-               .dark = p[kDark],
-               .bright = p[kBright],
-               .blur = p[kBlur],
-               .residual = solver.residual()};
+    Fitter fitter(image, start);
+    if (!fitter.solve()) return std::nullopt;
+    if (start.print > 0) fitter.learn_print(start.print);
+    return fitter.fit();
 }
 
 }  // namespace roundel

@@ -96,10 +96,10 @@ int Segments::at(int x, int y) const {
 
 Segments grow_segments(const ImageView& image, const ThresholdMap& threshold) {
     Segments segments;
-    std::vector<uint8_t> theta(static_cast<size_t>(image.width)), mask(theta.size());
+    std::vector<uint8_t> theta(static_cast<size_t>(image.width) + 8), mask(theta.size());
     segments.row_begin.push_back(0);
     for (int y = 0; y < image.height; ++y) {
-        if (y % threshold.tile == 0) threshold.expand(y, image.width, theta.data());
+        if (threshold.changes(y)) threshold.expand(y, image.width, theta.data());
         const uint8_t* row = image.row(y);
         for (int x = 0; x < image.width; ++x) mask[size_t(x)] = row[x] < theta[size_t(x)];
         append_runs(mask.data(), image.width, segments.runs);

@@ -4,17 +4,35 @@
 #include <algorithm>
 #include <cstring>
 
+#include "simd.hpp"
+
 namespace roundel {
 
 double saturated_share(const ImageView& image) {
     size_t count = 0;
-    for (int y = 0; y < image.height; ++y) {
+    for (int y = 0; y < image.height; y += 8) {
         const uint8_t* row = image.row(y);
-        unsigned in_row = 0;
-        for (int x = 0; x < image.width; ++x) in_row += row[x] >= 250;
-        count += in_row;
+        count += size_t(std::count_if(row, row + image.width, [](uint8_t level) { return level >= 250; }));
     }
-    return double(count) / (double(image.width) * image.height);
+    return double(count) / (double(image.width) * ((image.height + 7) / 8));
+}
+
+double noise_level(const ImageView& image) {
+    constexpr int kPatches = 16;                       // each way, of 8 x 4 pixels
+    constexpr double kFlat = 0.05, kDeviations = 2.9;  // the flattest twentieth of noise spans so many
+    std::vector<int> spans;
+    for (int k = 0; k < kPatches * kPatches; ++k) {
+        const int x = (image.width - 8) * (k % kPatches) / kPatches;
+        const int y = (image.height - 4) * (k / kPatches) / kPatches;
+        uint8_t low = 255, high = 0;
+        for (int v = std::max(y, 0); v < std::min(y + 4, image.height); ++v)
+            for (int u = std::max(x, 0); u < std::min(x + 8, image.width); ++u)
+                low = std::min(low, image.row(v)[u]), high = std::max(high, image.row(v)[u]);
+        spans.push_back(high - low);
+    }
+    const auto flat = spans.begin() + ptrdiff_t(kFlat * double(spans.size()));
+    std::nth_element(spans.begin(), flat, spans.end());
+    return std::clamp(*flat / kDeviations, 1.0, 8.0);
 }
 
 void Theta::settle(double dark, double bright) {
@@ -30,74 +48,130 @@ void Theta::step() {
 }
 
 void ThresholdMap::expand(int y, int width, uint8_t* out) const {
-    const uint8_t* row = theta.data() + size_t(y / tile) * size_t(columns);
-    for (int x = 0; x < width; x += tile)
-        std::memset(out + x, row[x / tile], size_t(std::min(tile, width - x)));
+    const uint8_t* row = theta.data() + size_t(y >> shift) * size_t(columns);
+    for (int x = 0; x < width; x += 8) {
+        const uint64_t eight = row[x >> shift] * 0x0101010101010101u;
+        std::memcpy(out + x, &eight, sizeof eight);
+    }
 }
 
-ThresholdMap constant_threshold(int width, int height, uint8_t theta) {
-    return {std::max({1, width, height}), 1, {theta}};
-}
+ThresholdMap constant_threshold(uint8_t theta) { return {30, 1, {theta}}; }
 
 namespace {
 
-/// The darkest and the brightest pixel of each tile.
+constexpr int kShift = 3, kTile = 1 << kShift;
+constexpr int kLevels = 5;
+
+/// The darkest and the brightest pixel of each tile, row by row.
 struct Range {
     int columns, rows;
     std::vector<uint8_t> low, high;
     Range(int c, int r) : columns(c), rows(r), low(size_t(c) * size_t(r), 255), high(low.size(), 0) {}
-    void include(size_t tile, uint8_t l, uint8_t h) {
-        low[tile] = std::min(low[tile], l);
-        high[tile] = std::max(high[tile], h);
-    }
+    size_t at(int x, int y) const { return size_t(y) * size_t(columns) + size_t(x); }
 };
 
-constexpr int kTile = 8;
-constexpr int kLevels = 5;
+inline uint8_t least(uint8_t a, uint8_t b) { return a < b ? a : b; }
+inline uint8_t greatest(uint8_t a, uint8_t b) { return a > b ? a : b; }
+
+/// Joins the ranges of n columns into others.
+inline void widen(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
+    for (int x = 0; x < n; ++x) {
+        to_low[x] = least(to_low[x], low[x]);
+        to_high[x] = greatest(to_high[x], high[x]);
+    }
+}
+
+/// The range of every 8 columns of the `rows` given ones; the buffers have room for whole tiles and 8 more.
+ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int columns, uint8_t* low, uint8_t* high,
+                                   uint8_t* to_low, uint8_t* to_high) {
+    const int n = columns * kTile;
+    std::memset(low, 255, size_t(n) + kTile);
+    std::memset(high, 0, size_t(n) + kTile);
+    for (int y = 0; y < rows.height; y += 2) widen(rows.row(y), rows.row(y), rows.width, low, high);
+    for (int step = kTile / 2; step; step /= 2) widen(low + step, high + step, n, low, high);
+    for (int k = 0; k < columns; ++k) to_low[k] = low[k * kTile], to_high[k] = high[k * kTile];
+}
 
 Range tile_range(const ImageView& image) {
     Range range((image.width + kTile - 1) / kTile, (image.height + kTile - 1) / kTile);
-    std::vector<uint8_t> low(size_t(image.width)), high(size_t(image.width));
-    for (int y0 = 0; y0 < image.height; y0 += kTile) {
-        std::fill(low.begin(), low.end(), 255);
-        std::fill(high.begin(), high.end(), 0);
-        for (int y = y0; y < std::min(y0 + kTile, image.height); ++y) {
-            const uint8_t* row = image.row(y);
-            for (int x = 0; x < image.width; ++x) {
-                low[x] = std::min(low[x], row[x]);
-                high[x] = std::max(high[x], row[x]);
-            }
-        }
-        const size_t first = size_t(y0 / kTile) * size_t(range.columns);
-        for (int x = 0; x < image.width; ++x) range.include(first + size_t(x / kTile), low[x], high[x]);
+    std::vector<uint8_t> low(size_t(range.columns + 1) * kTile), high(low.size());
+    for (int y = 0; y < image.height; y += kTile) {
+        const size_t first = range.at(0, y / kTile);
+        range_of_tiles(image.window(0, y, image.width, std::min(kTile, image.height - y)), range.columns,
+                       low.data(), high.data(), &range.low[first], &range.high[first]);
     }
     return range;
 }
 
+/// The least and the greatest of three neighbours along a row; `padded` rows have one more tile at each end.
+inline void join_three(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
+    for (int x = 0; x < n; ++x) {
+        to_low[x] = least(least(low[x], low[x + 1]), low[x + 2]);
+        to_high[x] = greatest(greatest(high[x], high[x + 1]), high[x + 2]);
+    }
+}
+
 /// Each tile's range joined with those of its eight neighbours.
-Range dilate(const Range& range) {
-    Range wide(range.columns, range.rows);
-    for (int y = 0; y < range.rows; ++y)
-        for (int x = 0; x < range.columns; ++x)
-            for (int v = std::max(0, y - 1); v <= std::min(y + 1, range.rows - 1); ++v)
-                for (int u = std::max(0, x - 1); u <= std::min(x + 1, range.columns - 1); ++u) {
-                    const size_t from = size_t(v) * size_t(range.columns) + size_t(u);
-                    wide.include(size_t(y) * size_t(range.columns) + size_t(x), range.low[from],
-                                 range.high[from]);
-                }
+ROUNDEL_CLONES Range dilate(const Range& range) {
+    const int n = range.columns;
+    Range wide(n, range.rows);
+    std::vector<uint8_t> low(size_t(n) + 2, 255), high(size_t(n) + 2, 0);
+    for (int y = 0; y < range.rows; ++y) {
+        std::fill(low.begin(), low.end(), 255);
+        std::fill(high.begin(), high.end(), 0);
+        for (int v = std::max(y - 1, 0); v <= std::min(y + 1, range.rows - 1); ++v)
+            widen(&range.low[range.at(0, v)], &range.high[range.at(0, v)], n, &low[1], &high[1]);
+        join_three(low.data(), high.data(), n, &wide.low[wide.at(0, y)], &wide.high[wide.at(0, y)]);
+    }
     return wide;
 }
 
+/// Joins neighbours two by two; `n` is even.
+inline void join_pairs(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
+    for (int x = 0; x < n / 2; ++x) {
+        to_low[x] = least(to_low[x], least(low[2 * x], low[2 * x + 1]));
+        to_high[x] = greatest(to_high[x], greatest(high[2 * x], high[2 * x + 1]));
+    }
+}
+
 /// Tiles of twice the side.
-Range halve(const Range& range) {
-    Range coarse((range.columns + 1) / 2, (range.rows + 1) / 2);
-    for (int y = 0; y < range.rows; ++y)
-        for (int x = 0; x < range.columns; ++x) {
-            const size_t from = size_t(y) * size_t(range.columns) + size_t(x);
-            coarse.include(size_t(y / 2) * size_t(coarse.columns) + size_t(x / 2), range.low[from],
-                           range.high[from]);
-        }
+ROUNDEL_CLONES Range halve(const Range& range) {
+    const int n = range.columns;
+    Range coarse((n + 1) / 2, (range.rows + 1) / 2);
+    for (int y = 0; y < range.rows; ++y) {
+        const uint8_t *low = &range.low[range.at(0, y)], *high = &range.high[range.at(0, y)];
+        uint8_t *to_low = &coarse.low[coarse.at(0, y / 2)], *to_high = &coarse.high[coarse.at(0, y / 2)];
+        join_pairs(low, high, n & ~1, to_low, to_high);
+        if (n % 2) widen(low + n - 1, high + n - 1, 1, to_low + n / 2, to_high + n / 2);
+    }
     return coarse;
+}
+
+/// The mid-range where there is contrast, else what stands there (the coarser level's word).
+ROUNDEL_CLONES void settle_row(const uint8_t* low, const uint8_t* high, int n, uint8_t min_contrast,
+                               uint8_t* theta) {
+    for (int x = 0; x < n; ++x) {
+        const auto middle = uint8_t((low[x] + high[x] + 1) >> 1), contrast = uint8_t(high[x] - low[x]);
+        theta[x] = contrast >= min_contrast ? middle : theta[x];
+    }
+}
+
+/// Every value twice.
+ROUNDEL_CLONES void double_row(const uint8_t* from, int n, uint8_t* to) {
+    for (int x = 0; x < n / 2; ++x) to[2 * x] = to[2 * x + 1] = from[x];
+    if (n % 2) to[n - 1] = from[n / 2];
+}
+
+std::vector<uint8_t> settle_level(const Range& range, uint8_t min_contrast,
+                                  const std::vector<uint8_t>& coarser) {
+    std::vector<uint8_t> theta(range.low.size());
+    const size_t columns = (size_t(range.columns) + 1) / 2;
+    for (int y = 0; y < range.rows; ++y) {
+        const size_t first = range.at(0, y);
+        double_row(&coarser[size_t(y / 2) * columns], range.columns, &theta[first]);
+        settle_row(&range.low[first], &range.high[first], range.columns, min_contrast, &theta[first]);
+    }
+    return theta;
 }
 
 }  // namespace
@@ -105,19 +179,10 @@ Range halve(const Range& range) {
 ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta) {
     std::vector<Range> pyramid{dilate(tile_range(image))};
     while (pyramid.size() < kLevels) pyramid.push_back(halve(pyramid.back()));
-    const int columns = pyramid[0].columns, rows = pyramid[0].rows;
-    ThresholdMap map{kTile, columns, std::vector<uint8_t>(size_t(columns) * size_t(rows), theta)};
-    for (int y = 0; y < rows; ++y)
-        for (int x = 0; x < columns; ++x)
-            for (int level = 0; level < kLevels; ++level) {
-                const Range& range = pyramid[size_t(level)];
-                const size_t at = size_t(y >> level) * size_t(range.columns) + size_t(x >> level);
-                if (range.high[at] - range.low[at] < min_contrast) continue;
-                map.theta[size_t(y) * size_t(columns) + size_t(x)] =
-                    uint8_t((range.low[at] + range.high[at] + 1) / 2);
-                break;
-            }
-    return map;
+    std::vector<uint8_t> settled(pyramid.back().low.size(), theta);
+    for (auto range = pyramid.rbegin(); range != pyramid.rend(); ++range)
+        settled = settle_level(*range, uint8_t(min_contrast), settled);
+    return {kShift, pyramid[0].columns, std::move(settled)};
 }
 
 }  // namespace roundel

@@ -2,6 +2,7 @@
 """`python -m calib` end to end: files in, a rig out; faults are one line and exit code 2."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from calib.rig import Rig, load_rig, save_rig
 from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
 from tests.calib.synthetic import Arena, errors, record, ring
+from tests.calib.test_world import L_FRAME, elsewhere, lie_still
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
@@ -82,6 +84,58 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert len(done.stderr.splitlines()) == 1
     assert fault in done.stderr
     assert (tmp_path / "rig.yaml").read_text() == "precious"
+
+
+def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, waved: Arena):
+    """The rig of the recording itself: it stands as it says, halves agree, and the figures land in the copy."""
+    write_observations(tmp_path / "observations.csv", record(waved, 16.0, sigma_px=0.1, numbered=True))
+    observations = ("--observations", tmp_path / "observations.csv")
+    assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
+    before = (tmp_path / "rig.yaml").read_text()
+    wrote = ("--out", tmp_path / "checked.yaml", "--map", tmp_path / "map.png")
+    done = calib(
+        "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *wrote
+    )
+    assert done.returncode == 0, done.stderr
+    for said in ("the two halves of the recording agree", "the rig and the recording agree", "grade "):
+        assert said in done.stdout
+    assert (tmp_path / "rig.yaml").read_text() == before
+    check = load_rig(tmp_path / "checked.yaml").calibration["check"]
+    assert check["halves"]["agree"]
+    assert check["expected_mm"]["median"] < 2
+    assert cv2.imread(str(tmp_path / "map.png")) is not None
+
+
+def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
+    """Observations of an L and its YAML in, the true world out; what fixes no world is one line, and no file."""
+    arena = ring()
+    save_rig(elsewhere(arena.truth), tmp_path / "rig.yaml")
+    write_observations(tmp_path / "floor.csv", lie_still(arena, L_FRAME))
+    (tmp_path / "l.yaml").write_text(f"diameter_m: 0.1\nmarkers: {list(L_FRAME.values())}\n")
+    options = ["--rig", tmp_path / "rig.yaml", "--observations", tmp_path / "floor.csv", "--out"]
+    done = calib("world", "--frame", tmp_path / "l.yaml", *options, tmp_path / "world.yaml")
+    assert done.returncode == 0, done.stderr
+    for name, camera in load_rig(tmp_path / "world.yaml").cameras.items():
+        assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+    (tmp_path / "line.csv").write_text("name,x,y,z\na,0,0,0\nb,1,0,0\nc,2,0,0\n")
+    done = calib("world", "--points", tmp_path / "line.csv", *options, tmp_path / "none.yaml")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "line.csv lie on a line" in done.stderr
+    assert not (tmp_path / "none.yaml").exists()
+
+
+@pytest.mark.parametrize("word", ["undo", "--undo"])
+def test_undo_brings_the_rig_before_back(tmp_path: Path, waved: Arena, word: str):
+    before = (tmp_path / "rig.yaml", tmp_path / "rig.1.yaml")
+    for path in before:
+        shutil.copy(tmp_path / "lenses.yaml", path)
+    (tmp_path / "rig.yaml").write_text("a mistake")
+    done = calib(word, "--rig", tmp_path / "rig.yaml")
+    assert (done.returncode, "is again rig.1.yaml" in done.stdout) == (0, True), done.stderr
+    assert load_rig(tmp_path / "rig.yaml") == load_rig(tmp_path / "lenses.yaml")
+    assert (tmp_path / "rig.undone.yaml").read_text() == "a mistake"
+    done = calib(word, "--rig", tmp_path / "rig.yaml")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
 
 
 def test_a_folder_of_one_camera_or_of_a_stranger_is_named(tmp_path: Path, waved: Arena):

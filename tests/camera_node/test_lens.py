@@ -36,6 +36,30 @@ def test_the_jacobian_is_that_of_the_projection(lens: Lens):
 
 
 @lenses
+def test_the_jacobian_by_the_lens_is_that_of_its_parameters(lens: Lens):
+    """Central differences again; all parameters act linearly on the pixel but fx and k, whose products are smooth."""
+    p, h = points(), 1e-5
+    uv, _, J = lens.project_with_jacobians(p)
+    assert J.shape == (len(p), 2, 4 + len(lens.distortion))
+    for k, step in enumerate(h * np.eye(len(lens.parameters))):
+        ahead, behind = (
+            lens.with_parameters(lens.parameters + step),
+            lens.with_parameters(lens.parameters - step),
+        )
+        np.testing.assert_allclose(J[:, :, k], (ahead.project(p) - behind.project(p)) / (2 * h), atol=1e-3)
+    np.testing.assert_allclose(uv, lens.project(p), atol=1e-9)
+
+
+def test_a_fisheye_sees_to_the_side():
+    """Rays up to 88 degrees from the axis come back, also where theta_d is above 90 degrees."""
+    lens = Lens(**{**SHAPE, "fx": 300.0, "fy": 300.0}, distortion=(0.05, -0.01, 0.002, 0.0), model="fisheye")
+    theta, phi = np.radians([[5, 40, 70, 85, 88]]), np.radians(np.arange(0, 360, 30))[:, None]
+    away = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi]
+    rays = np.stack(away, axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(lens.rays(lens.project(rays)), rays, atol=1e-9)
+
+
+@lenses
 def test_normalise_inverts_project(lens: Lens):
     """1e-6 of a focal length is 0.0006 px, far below any detector; the inverse is iterative."""
     p = points()
@@ -77,3 +101,8 @@ def test_pixels_that_the_lens_can_not_give_have_no_ray():
 def test_impossible_lenses_are_refused(change: dict):
     with pytest.raises(ValueError, match=r"focal|possible|finite|distortion"):
         Lens(**{**SHAPE, **change})
+
+
+def test_impossible_parameters_are_refused():
+    with pytest.raises(ValueError, match="focal"):
+        LENSES["pinhole"].with_parameters([-1.0, 1.0, 1.0, 1.0, 0, 0, 0, 0, 0])

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`calib check`: whether a rig can be trusted, by a recording of a waved wand."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from rich.console import Console
+
+from calib.agreement import Agreement, Placed, compare
+from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.recording import read_recording
+from calib.errors import CalibrationError
+from calib.report import print_report
+from calib.residual_map import save_map
+from calib.rig import Rig, load_rig
+from camera_node.body import Body
+from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
+from camera_node.messages import Detections
+
+if TYPE_CHECKING:
+    from calib.wand import Calibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Judge a rig by a recording of a waved wand: does it still stand as it says, do two halves agree, how precise is
+    it where robots drive, and which camera is the weakest. Nothing is written unless --map or --out ask for it."""
+
+    rig: Path
+    """The rig to judge."""
+    wand: Path = Path("configs/wand.yaml")
+    """The wand that was waved: diameter_m and markers, metres."""
+    frames: Path | None = None
+    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
+    observations: Path | None = None
+    """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    height: float = 0.1
+    """Metres above the floor at which robots carry their roundels."""
+    map: Path | None = None
+    """A PNG of the expected errors across the arena."""
+    out: Path | None = None
+    """Write the rig again, with what was found in its `calibration`."""
+
+    def execute(self, console: Console) -> None:
+        """Calibrate anew, whole and in halves, and compare."""
+        if (self.frames is None) == (self.observations is None):
+            raise ConfigError("give one of --frames FOLDER and --observations CSV")
+        for out in filter(None, (self.out, self.map)):
+            check_folder(out)
+        rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        messages = read_recording(rig, self.frames, self.observations, wand)
+        said = self._judge(rig, wand, messages, console)
+        if self.out is not None:
+            told = {**rig.calibration, "check": {**provenance(), **said}}
+            write_rig(msgspec.structs.replace(rig, calibration=told), self.out, console)
+
+    def _judge(
+        self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console
+    ) -> dict[str, Any]:
+        from calib.trust import assess
+        from calib.wand import calibrate
+
+        with console.status("placing cameras"):
+            result = calibrate(rig, wand, messages)
+        trust = assess(result, wand, self.height)
+        print_report(result, trust, console)
+        halves = _compare_halves(result.rig, wand, messages, console)
+        stands = _compare_with_rig(rig, result, console)
+        if self.map is not None and trust.expected is not None:
+            save_map(self.map, trust.expected.draw(result.rig.placed()))
+            say(console, f"wrote {self.map}")
+        return {**trust.as_dict(), "halves": _figures(halves), "rig": _figures(stands)}
+
+
+def _compare_halves(
+    rig: Rig, wand: Body, messages: Sequence[Detections], console: Console
+) -> Agreement | None:
+    """Both halves start from the lenses that the whole recording gave: where these were refined, a half that refines
+    them less would turn its cameras instead."""
+    from calib.wand import calibrate
+
+    try:
+        with console.status("placing cameras by each half"):
+            first, second = (calibrate(rig, wand, half) for half in split(messages))
+            agreement = compare(placed(first), placed(second))
+    except CalibrationError as error:
+        say(console, f"warning: the halves of the recording can't be compared: {error}")
+        return None
+    say(console, ("" if agreement.holds else "warning: ") + agreement.sentence())
+    return agreement
+
+
+def _compare_with_rig(rig: Rig, result: "Calibration", console: Console) -> Agreement | None:
+    known = Placed.of_rig(rig)
+    if len([name for name in known.names if name in result.names]) < 2:
+        say(console, "the rig has no places with covariances to compare; the recording alone was judged")
+        return None
+    agreement = compare(known, placed(result))
+    advice = "" if agreement.holds else "; wave the wand again and run python -m calib wand"
+    say(
+        console,
+        ("" if agreement.holds else "warning: ") + agreement.sentence("the rig and the recording") + advice,
+    )
+    return agreement
+
+
+def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detections]]:
+    """The two halves of a recording, by time."""
+    times = [message.t_ns for message in messages]
+    middle = (min(times) + max(times)) // 2
+    return [m for m in messages if m.t_ns <= middle], [m for m in messages if m.t_ns > middle]
+
+
+def placed(result: "Calibration") -> Placed:
+    """The cameras of a calibration, for comparing."""
+    return Placed(result.names, result.adjusted.state.cameras, result.covariance)
+
+
+def _figures(agreement: Agreement | None) -> dict[str, Any] | None:
+    if agreement is None:
+        return None
+    return {
+        "agree": agreement.holds,
+        "chi2": round(agreement.chi2, 2),
+        "degrees": agreement.degrees,
+        "probability": agreement.probability,
+        "shift_mm": {name: round(shift, 3) for name, shift in agreement.shift_mm.items()},
+    }

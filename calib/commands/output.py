@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What all subcommands do with their result: write it, say where, and how it was made."""
+
+import shlex
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from calib.rig import Rig, save_rig
+from camera_node.errors import ConfigError
+
+
+def check_folder(out: Path) -> None:
+    """Raise ConfigError, before any work is done, where `out` can't be written."""
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out.parent} is no folder; --out can't be written there")
+    if out.is_dir():
+        raise ConfigError(f"{out} is a folder; give --out a file such as {out / 'rig.yaml'}")
+
+
+def write_rig(rig: Rig, out: Path, console: Console) -> None:
+    """Write the rig and say so."""
+    kept = save_rig(rig, out)
+    say(console, f"wrote {out}" + (f"; the one before is kept as {kept.name}" if kept else ""))
+
+
+def say(console: Console, text: str) -> None:
+    """One line as it stands."""
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def provenance() -> dict[str, Any]:
+    """Date and command, for the `calibration` map of a rig."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(["python", "-m", "calib", *sys.argv[1:]]),
+    }

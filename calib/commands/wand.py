@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`calib wand`: where cameras stand, by a wand waved before them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+from zenoh import Session
+
+from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.recording import read_recording
+from calib.live import publish
+from calib.report import clocks_as_dict, print_report, show_progress
+from calib.rig import Rig, load_rig
+from calib.waving import wave
+from camera_node.body import Body
+from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
+from camera_node.messages import Detections
+from camera_node.network import open_client
+
+MOST_S = 180.0  # that a wave may last when it ends by itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wand:
+    """Place the cameras by a wand that was waved before them."""
+
+    wand: Path = Path("configs/wand.yaml")
+    """The wand: diameter_m and markers, metres."""
+    rig: Path
+    """Intrinsics of every camera; poses in it are not used."""
+    out: Path
+    """Where the rig with poses is written; a rig that is there is kept as rig.1.yaml, ..."""
+    frames: Path | None = None
+    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
+    observations: Path | None = None
+    """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    live: bool = False
+    """Or subscribe to the running cameras, and hand them the result."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name in the keys."""
+    seconds: float | None = None
+    """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
+    height: float = 0.1
+    """Metres above the floor at which robots carry their roundels: where errors are foretold."""
+    zenoh: Path | None = None
+    """A Zenoh configuration of your own."""
+
+    def execute(self, console: Console) -> None:
+        """Nothing is written unless two cameras or more were placed."""
+        check_folder(self.out)
+        if (self.frames is not None) + (self.observations is not None) + self.live != 1:
+            raise ConfigError("give one of --frames FOLDER, --observations CSV and --live")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
+        rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        if self.live:
+            self._run_live(rig, wand, console)
+        else:
+            self._place(rig, wand, read_recording(rig, self.frames, self.observations, wand), console)
+
+    def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
+        from calib.trust import assess
+        from calib.wand import calibrate
+
+        with console.status("placing cameras"):
+            result = calibrate(rig, wand, messages)
+        trust = assess(result, wand, self.height)
+        print_report(result, trust, console)
+        told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
+        told |= _of_lenses(rig)
+        placed = msgspec.structs.replace(result.rig, calibration=told)
+        write_rig(placed, self.out, console)
+        return placed
+
+    def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
+        with open_client(self.connect, self.zenoh) as session:
+            messages, bad, why = self._wave(session, rig, wand, console)
+            say(console, f"the wave ended: {why}")
+            if bad:
+                say(console, f"warning: {bad} messages were none and were skipped")
+            placed = self._place(rig, wand, messages, console)
+            if not publish(session, self.arena, placed):
+                say(console, "warning: nobody took the rig; give the server the file that was written")
+
+    def _wave(
+        self, session: Session, rig: Rig, wand: Body, console: Console
+    ) -> tuple[list[Detections], int, str]:
+        # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
+        trials = self.seconds is None or console.is_terminal
+        with Live(console=console, transient=True) as live:
+            return wave(
+                session,
+                self.arena,
+                rig,
+                wand,
+                self.seconds or MOST_S,
+                lambda told: live.update(show_progress(told)),
+                by_itself=trials and self.seconds is None,
+                trials=trials,
+            )
+
+
+def _of_lenses(rig: Rig) -> dict:
+    """What the lenses' own calibration said stays true."""
+    return {key: value for key, value in rig.calibration.items() if key == "lenses"}

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`calib world`: ground plane, origin and axes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.recording import read_recording
+from calib.errors import CalibrationError
+from calib.landmarks import is_line, locate_places, still_roundels
+from calib.live import collect, publish
+from calib.rig import Rig, load_rig
+from calib.world import align, align_places, read_positions, stand
+from camera_node.body import Body
+from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
+from camera_node.messages import Detections
+from camera_node.network import open_client
+
+Places = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """Choose the world: by surveyed cameras, by roundels at known places, by an L-shaped frame, or by the wand
+    standing upright on the floor. z is up, metres."""
+
+    rig: Path
+    """A rig with poses."""
+    out: Path
+    """Where the moved rig is written; a rig that is there is kept as rig.1.yaml, ..."""
+    positions: Path | None = None
+    """CSV with camera,x,y,z: where three or more cameras stand, metres."""
+    points: Path | None = None
+    """CSV with name,x,y,z, or YAML of name: [x, y, z]: where three or more roundels lie still, metres."""
+    frame: Path | None = None
+    """Roundels on an L-shaped frame, as YAML with diameter_m and markers: its own axes become the world's."""
+    standing: Path | None = None
+    """A straight wand's YAML, the wand standing upright where the origin shall be."""
+    foot: float = 0.0
+    """Metres from the floor to the centre of the standing wand's lowest roundel."""
+    frames: Path | None = None
+    """Where roundels lie: detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
+    observations: Path | None = None
+    """Or take centres from a CSV: t_ns,camera,u,v[,marker]; a marker may be a point's name."""
+    live: bool = False
+    """Or look through the running cameras, and hand them the result."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name in the keys."""
+    seconds: float = 3.0
+    """How long to look through running cameras."""
+    zenoh: Path | None = None
+    """A Zenoh configuration of your own."""
+
+    def execute(self, console: Console) -> None:
+        """Nothing is written unless the world is fixed."""
+        check_folder(self.out)
+        ways = [self.positions, self.points, self.frame, self.standing]
+        if sum(way is not None for way in ways) != 1:
+            raise ConfigError("give one of --positions CSV, --points FILE, --frame YAML and --standing YAML")
+        rig = load_rig(self.rig)
+        rig.require_placed(self.rig)
+        moved, misses = self._move(rig, console)
+        for name, miss in misses.items():
+            say(console, f"{name}: {miss * 1e3:.1f} mm from its surveyed place")
+        world = {**provenance(), "misses_mm": {name: round(miss * 1e3, 2) for name, miss in misses.items()}}
+        moved = msgspec.structs.replace(moved, calibration={**moved.calibration, "world": world})
+        write_rig(moved, self.out, console)
+        if self.live:
+            with open_client(self.connect, self.zenoh) as session:
+                if not publish(session, self.arena, moved):
+                    say(console, f"warning: nobody took the rig; give the server {self.out}")
+
+    def _move(self, rig: Rig, console: Console) -> tuple[Rig, dict[str, float]]:
+        if self.positions is not None:
+            return align(rig, read_positions(self.positions))
+        file = self.points or self.frame or self.standing
+        assert file is not None
+        body = None if self.points else load_yaml(file, Body)
+        places = read_positions(file, "name") if body is None else _markers(body)
+        _check(places, file, on_line=self.standing is not None)
+        found = locate_places(rig.placed(), still_roundels(self._look(rig, body)), places)
+        if missing := [name for name in places if name not in found]:
+            say(
+                console,
+                f"warning: two cameras did not see the roundel at {', '.join(missing)}; it is not used",
+            )
+        if self.standing is not None:
+            return stand(rig, np.array(list(found.values())), self.foot), {}
+        return align_places(rig, found, places, "roundel")
+
+    def _look(self, rig: Rig, body: Body | None) -> list[Detections]:
+        if (self.frames is not None) + (self.observations is not None) + self.live != 1:
+            raise ConfigError(
+                "give one of --frames FOLDER, --observations CSV and --live, to see the roundels"
+            )
+        if not self.live:
+            return read_recording(rig, self.frames, self.observations, body)
+        if not self.seconds > 0:
+            raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
+        with open_client(self.connect, self.zenoh) as session:
+            return collect(session, self.arena, self.seconds, "looking")[0]
+
+
+def _markers(body: Body) -> dict[str, NDArray[np.float64]]:
+    return {str(k): point for k, point in enumerate(body.points)}
+
+
+def _check(places: Places, file: Path, on_line: bool) -> None:
+    """Refuse places that can't fix a world, before any work is done."""
+    points: Any = np.array(list(places.values())).reshape(-1, 3)
+    if on_line and (len(points) < 2 or not is_line(points)):
+        raise CalibrationError(f"{file} is no straight wand of two or more roundels; give it as --frame")
+    if not on_line and len(points) < 3:
+        raise CalibrationError(f"{file} has {len(points)} places; three or more fix a world")
+    if not on_line and is_line(points):
+        raise CalibrationError(
+            f"the places in {file} lie on a line: the turn about it stays open; lay a roundel away from that line, "
+            "or stand a straight wand upright and give it as --standing"
+        )

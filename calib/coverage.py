@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which part of an image has been used, and where the rest is, in words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+CELLS = (6, 8)  # rows and columns in which an image is counted
+REGIONS = (
+    ("upper left", "upper middle", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower middle", "lower right"),
+)
+THIN = 1 / 3  # of a region's cells used: below, it is named
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How many points fell into each cell of an image: (rows, columns), upper left first."""
+
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, uv: ArrayLike, width: int, height: int, cells: tuple[int, int] = CELLS) -> "Coverage":
+        """Count pixels (N, 2) of an image; those outside, or not finite, belong to no cell."""
+        uv = np.asarray(uv, float).reshape(-1, 2)
+        edges = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
+        known = uv[np.isfinite(uv).all(axis=1)]
+        return cls(np.histogram2d(known[:, 1], known[:, 0], cells, edges)[0].astype(np.int64))
+
+    def __add__(self, other: "Coverage") -> "Coverage":
+        return Coverage(self.counts + other.counts)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(rows, columns) the cells with at least one point."""
+        return self.counts > 0
+
+    def share(self, useful: NDArray[np.bool_] | None = None) -> float:
+        """Part of the cells, or of those that are useful, that are used; 1 where none is useful."""
+        cells = self.used if useful is None else self.used[useful]
+        return float(cells.mean()) if cells.size else 1.0
+
+    def missing(self, useful: NDArray[np.bool_] | None = None) -> list[str]:
+        """Names of the thirds of the image that are hardly used, emptiest first."""
+        wanted = np.ones(self.counts.shape, bool) if useful is None else useful
+        told = []
+        for name, part in regions(self.counts.shape):
+            if wanted[part].mean() < 0.5:
+                continue
+            if (share := float(self.used[part][wanted[part]].mean())) < THIN:
+                told.append((share, name))
+        return [name for _, name in sorted(told, key=lambda pair: pair[0])]
+
+
+def regions(shape: tuple[int, ...]) -> list[tuple[str, tuple[slice, slice]]]:
+    """The nine thirds of a grid of cells: name, rows and columns."""
+    rows, columns = (np.linspace(0, n, 4).round().astype(int) for n in shape)
+    return [
+        (REGIONS[r][c], (slice(rows[r], rows[r + 1]), slice(columns[c], columns[c + 1])))
+        for r in range(3)
+        for c in range(3)
+    ]
+
+
+def region_of(uv: ArrayLike, width: int, height: int) -> str:
+    """The name of the third of the image in which a pixel (2,) lies."""
+    u, v = np.asarray(uv, float)
+    row, column = (int(np.clip(3 * (x + 0.5) / n, 0, 2)) for x, n in ((v, height), (u, width)))
+    return REGIONS[row][column]
+
+
+def enumerate_words(words: list[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def cell_centres(width: int, height: int, cells: tuple[int, int] = CELLS) -> Array:
+    """(rows * columns, 2) the pixel in the middle of each cell."""
+    rows, columns = cells
+    v, u = np.mgrid[0:rows, 0:columns]
+    return np.column_stack(
+        [(u.ravel() + 0.5) * width / columns - 0.5, (v.ravel() + 0.5) * height / rows - 0.5]
+    )

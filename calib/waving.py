@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A wand waved before running cameras: how far it is, and when more waving would not help.
+
+The rule by which it stops. Every few seconds a part of what was seen is solved, in a process of its own because GTSAM
+holds the GIL. Covariances shrink with the number of frames, so what all frames would give follows. It is enough when
+
+- every camera that delivers is placed,
+- no camera's own covariance adds more than 5 % to the error of a roundel's pixel, and
+- half of what each camera shares with others was waved through, or nothing was added to that for 15 s.
+"""
+
+import os
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.pool import AsyncResult
+
+import zenoh
+
+from calib.coverage import Coverage
+from calib.errors import CalibrationError
+from calib.live import nothing_came
+from calib.rig import Rig
+from camera_node.body import Body
+from camera_node.messages import Detections, Keys, MessageError, decode
+
+TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions
+TRIAL_FRAMES = 150  # of each camera: a solution of a second or less
+BLOCK_S = 0.5  # frames that are taken or left together, so that the motion between them is known
+ADDS = 0.05  # to the error of a pixel, that a camera's covariance may add
+USED = 0.5  # of what a camera shares with others
+IDLE_S = 15.0  # without anything added to that
+TELL_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What a part of the frames gives.
+
+    Attributes:
+        fault: why no two cameras could be placed; empty where they were.
+        unplaced: names of cameras that could not.
+        strain: by camera, its covariance in the image over the noise of its pixels.
+        used: by camera, the part of what it shares with others that was waved through.
+        advice: by camera, where to wave next.
+        expected_mm: the expected error of points across the arena, were all frames used; None without metres.
+        grade: of the part.
+    """
+
+    fault: str = ""
+    unplaced: tuple[str, ...] = ()
+    strain: dict[str, float] = field(default_factory=dict)
+    used: dict[str, float] = field(default_factory=dict)
+    advice: dict[str, str] = field(default_factory=dict)
+    expected_mm: float | None = None
+    grade: str = "D"
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a wave is: seconds, frames with roundels and the share of the image that had them by camera, the latest
+    trial, whether it is enough, and what to do next."""
+
+    seconds: float
+    frames: dict[str, int]
+    covered: dict[str, float]
+    trial: Trial | None
+    enough: bool
+    advice: str
+
+
+@dataclass(slots=True)
+class _Wave:
+    """What came so far."""
+
+    messages: list[Detections] = field(default_factory=list)
+    frames: Counter[str] = field(default_factory=Counter)
+    coverage: dict[str, Coverage] = field(default_factory=dict)
+    bad: int = 0
+    best_used: float = 0.0
+    grown: float = 0.0
+
+    def take(self, data: bytes) -> None:
+        """Count and keep a message, or count what is none."""
+        try:
+            message = decode(data, Detections)
+        except MessageError:
+            self.bad += 1
+            return
+        self.messages.append(message)
+        if not len(message):
+            return
+        self.frames[message.camera] += 1
+        seen = Coverage.of(message.unpack().uv, message.width, message.height)
+        before = self.coverage.get(message.camera)
+        self.coverage[message.camera] = before + seen if before else seen
+
+    def judge(self, trial: Trial, now: float) -> bool:
+        """Whether it is enough."""
+        if (used := sum(trial.used.values())) > self.best_used + 0.01:
+            self.best_used, self.grown = used, now
+        if trial.fault or trial.unplaced:
+            return False
+        # Variances add: (1 + strain^2) ^ 1/2 < 1 + ADDS.
+        precise = max(trial.strain.values()) ** 2 < (1 + ADDS) ** 2 - 1
+        return precise and (min(trial.used.values()) >= USED or now - self.grown > IDLE_S)
+
+
+def wave(
+    session: zenoh.Session,
+    arena: str,
+    rig: Rig,
+    wand: Body,
+    seconds: float,
+    tell: Callable[[Progress], None] = lambda progress: None,
+    ended: threading.Event | None = None,
+    by_itself: bool = True,
+    trials: bool = True,
+    every_s: float = TRIAL_EVERY_S,
+) -> tuple[list[Detections], int, str]:
+    """Collect the detections of all cameras of an arena while a wand is waved.
+
+    Args:
+        session, arena: where cameras publish.
+        rig: intrinsics of the cameras.
+        wand: the wand.
+        seconds: how long at the most.
+        tell: called a few times a second, with what a person wants to know; from this thread.
+        ended: ends it from another thread.
+        by_itself: whether it ends when a trial solution says that it is enough.
+        trials: whether trial solutions are made.
+        every_s: how long to wait from one to the next.
+
+    Returns:
+        the detections, the number of bad messages, and why it ended.
+
+    Raises:
+        CalibrationError: nothing came.
+    """
+    arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    key = Keys(arena).detections()
+    subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
+    try:
+        with _Trials(rig, wand, trials, every_s) as solver:
+            state, why = _follow(arrived, solver, seconds, tell, ended or threading.Event(), by_itself)
+    finally:
+        subscriber.undeclare()
+    if not state.messages:
+        raise CalibrationError(nothing_came(key, seconds, state.bad))
+    return state.messages, state.bad, why
+
+
+def _follow(
+    arrived: queue.SimpleQueue[bytes],
+    trials: "_Trials",
+    seconds: float,
+    tell: Callable[[Progress], None],
+    ended: threading.Event,
+    by_itself: bool,
+) -> tuple[_Wave, str]:
+    state, begun, told = _Wave(), time.monotonic(), 0.0
+    while (passed := time.monotonic() - begun) < seconds:
+        with suppress(queue.Empty):
+            state.take(arrived.get(timeout=min(seconds - passed, TELL_EVERY_S)))
+        if ended.is_set():
+            return state, "ended by hand"
+        if passed - told < TELL_EVERY_S:
+            continue
+        told, trial = passed, trials.step(state.messages, passed)
+        enough = trial is not None and state.judge(trial, passed)
+        tell(progress(state, passed, trial, enough))
+        if enough and by_itself:
+            return state, "more waving would not help"
+    return state, f"{seconds:g} s are over"
+
+
+def progress(state: _Wave, passed: float, trial: Trial | None, enough: bool) -> Progress:
+    """What to tell a person."""
+    covered = {name: coverage.share() for name, coverage in sorted(state.coverage.items())}
+    return Progress(
+        passed, dict(sorted(state.frames.items())), covered, trial, enough, _advise(state, trial, enough)
+    )
+
+
+def _advise(state: _Wave, trial: Trial | None, enough: bool) -> str:
+    if enough:
+        return "that is enough"
+    if not state.frames:
+        return "waiting for roundels" if state.messages else "waiting for cameras"
+    if trial is None:
+        return "wave the wand where two cameras or more see it"
+    if trial.fault:
+        return trial.fault
+    if trial.unplaced:
+        return f"wave where '{trial.unplaced[0]}' and another camera see the wand"
+    name = min(trial.used, key=trial.used.__getitem__)
+    if trial.used[name] < USED and trial.advice.get(name):
+        return f"{name}: {trial.advice[name]}"
+    weakest = max(trial.strain, key=trial.strain.__getitem__)
+    return f"go on, most before '{weakest}'"
+
+
+class _Trials:
+    """Trial solutions, one at a time, in a process of their own."""
+
+    def __init__(self, rig: Rig, wand: Body, wanted: bool, every_s: float) -> None:
+        self._rig, self._wand, self._every_s = rig, wand, every_s
+        self._pool = get_context("spawn").Pool(1, os.nice, (10,)) if wanted else None
+        self._running: AsyncResult[Trial] | None = None
+        self._latest: Trial | None = None
+        self._due = every_s
+
+    def __enter__(self) -> "_Trials":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.terminate()
+            self._pool.join()
+
+    def step(self, messages: Sequence[Detections], now: float) -> Trial | None:
+        """Take a finished trial, start another when it is due; the latest one."""
+        if self._running is not None and self._running.ready():
+            self._latest, self._running = self._running.get(), None
+            self._due = now + self._every_s
+        if self._pool is not None and self._running is None and now >= self._due and messages:
+            part = thin(messages)
+            share = len(part) / len(messages)
+            self._running = self._pool.apply_async(try_part, (self._rig, self._wand, part, share))
+        return self._latest
+
+
+def thin(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Detections]:
+    """Messages of whole half seconds, evenly spread, with about `frames` of the camera that has most."""
+    most = max(Counter(message.camera for message in messages).values())
+    stride = -(-most // frames)
+    start = min(message.t_ns for message in messages)
+    return [m for m in messages if int((m.t_ns - start) * 1e-9 / BLOCK_S) % stride == 0]
+
+
+def try_part(rig: Rig, wand: Body, part: Sequence[Detections], share: float) -> Trial:
+    """Solve a part, `share` of all frames, and say what all of them would give."""
+    from calib.trust import assess
+    from calib.wand import calibrate
+
+    try:
+        result = calibrate(rig, wand, part)
+    except CalibrationError as error:
+        return Trial(fault=str(error))
+    except Exception as error:  # a wave that somebody took trouble over is not lost by a trial
+        return Trial(fault=f"the trial solution failed ({type(error).__name__}: {error}); the wave goes on")
+    trust, fewer = assess(result, wand), share**0.5
+    delivering = {message.camera for message in part}
+    return Trial(
+        unplaced=tuple(name for name in trust.unplaced if name in delivering),
+        strain={c.name: fewer * c.strain for c in trust.cameras},
+        used={c.name: 1 - c.figures["unused"] for c in trust.cameras},
+        advice={c.name: c.wave_next for c in trust.cameras},
+        expected_mm=trust.expected.typical_mm if trust.expected else None,
+        grade=trust.grade,
+    )

@@ -1,0 +1,165 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "chords.hpp"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <cstring>
+
+#include "simd.hpp"
+
+namespace roundel {
+
+namespace {
+
+// In sixteenths of a pixel, or of one.
+constexpr int kSlack = 24;   // by which a run may be off its proportion: a pixel's edge and blur
+constexpr int kUneven = 26;  // of one dark run to the other, in a chord that nothing covers
+constexpr int kDrift = 3;    // pixels that the middle may move from one line to the next
+
+/// The places of the bits of a word. Eight are written without asking how many there are.
+inline int* append_bits(uint64_t bits, int base, int* to) {
+    const int count = std::popcount(bits);
+    for (int k = 0; k < count; k += 8)
+        for (int j = k; j < k + 8; ++j, bits &= bits - 1) to[j] = base + std::countr_zero(bits);
+    return to + count;
+}
+
+/// Where a line turns dark and bright again, in turns; returns how many dark runs. Beyond it all is bright.
+ROUNDEL_CLONES int find_runs(const uint64_t* line, int words, int length, int* edges) {
+    int* to = edges;
+    uint64_t carry = 0;
+    for (int n = 0; n < words; ++n) {
+        to = append_bits(line[n] ^ (line[n] << 1 | carry), n * 64, to);
+        carry = line[n] >> 63;
+    }
+    if (carry && (length & 63) == 0) *to++ = length;
+    return int(to - edges) / 2;
+}
+
+/// Which bright runs lie in the middle of a roundel, by their lengths and those of the dark runs beside them.
+/// All in sixteenths of a pixel, so that whole numbers do.
+ROUNDEL_CLONES void test_chords(const int* edges, int count, const Proportions& limits, int* passes) {
+    const Proportions p = limits;  // a copy that `passes` can't overlap
+    for (int k = 0; k + 1 < count; ++k) {
+        const int left = edges[2 * k + 1] - edges[2 * k], right = edges[2 * k + 3] - edges[2 * k + 2];
+        const int inner = edges[2 * k + 2] - edges[2 * k + 1];
+        const int dark = left < right ? left : right, uneven = left < right ? right : left;
+        const int total = inner + 2 * dark;
+        passes[k] = (total >= p.least) & (total <= p.most) & (16 * dark <= p.thick * inner + kSlack) &
+                    (16 * dark + kSlack >= p.thin * inner) & (16 * uneven <= kUneven * dark + kSlack);
+    }
+}
+
+/// The numbers of the `count` flags that are set.
+ROUNDEL_CLONES int collect(const int* flags, int count, int* numbers) {
+    int n = 0;
+    for (int k = 0; k < count; ++k) {
+        numbers[n] = k;
+        n += flags[k];
+    }
+    return n;
+}
+
+/// The darkest of three pixels in the middle of a run: a thin ring is that dark on one of them only.
+template <typename Level>
+int darkest(const Level& level, int begin, int end) {
+    const int middle = (begin + end) / 2;
+    int least = level(middle);
+    for (const int k : {middle - 1, middle + 1})
+        if (k >= begin && k < end) least = std::min(least, level(k));
+    return least;
+}
+
+}  // namespace
+
+ChordSearch::ChordSearch(const Settings& settings) {
+    const auto [low, high] = std::minmax_element(settings.inner_ratios.begin(), settings.inner_ratios.end());
+    const double r = std::max(0.05, *low - settings.ratio_tolerance);
+    const double R = std::min(0.95, *high + settings.ratio_tolerance);
+    // The shortest chord through the centre is the minor axis.
+    limits_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2),
+               int(std::lround(16 * (1 - r) / (2 * r))), int(std::lround(16 * (1 - R) / (2 * R)))};
+    min_contrast_ = int(settings.min_contrast / 2);
+}
+
+bool ChordSearch::is_diametral(int dark, int inner) const {
+    return dark > 0 && inner + 2 * dark <= limits_.most && 16 * dark <= limits_.thick * inner + kSlack &&
+           16 * dark + kSlack >= limits_.thin * inner;
+}
+
+void ChordSearch::find_chords(const BitImage& along, int line) {
+    chords_.clear();
+    const int count = find_runs(along.line(line), along.words, along.length, edges_.data());
+    if (count < 2) return;
+    test_chords(edges_.data(), count, limits_, passes_.data());
+    const int found = collect(passes_.data(), count - 1, numbers_.data());
+    for (int k = 0; k < found; ++k) {
+        const int* edge = &edges_[2 * size_t(numbers_[size_t(k)])];
+        const int b = edge[1], c = edge[2];
+        chords_.push_back({(b + c - 1) / 2, c - b, line, line});
+    }
+}
+
+/// Puts the chords of a line on the stacks that they continue. Both are in the order of their middles.
+void ChordSearch::link(int line) {
+    next_.clear();
+    auto chord = chords_.begin();
+    for (const Stack& stack : open_) {
+        while (chord != chords_.end() && chord->middle < stack.middle - kDrift) next_.push_back(*chord++);
+        const bool same = chord != chords_.end() && chord->middle <= stack.middle + kDrift &&
+                          std::abs(chord->inner - stack.inner) <= 2 + stack.inner / 4;
+        if (same)
+            next_.push_back({chord->middle, chord->inner, stack.first, line}), ++chord;
+        else if (stack.last + 2 > line)
+            next_.push_back(stack);
+        else
+            close(stack);
+    }
+    next_.insert(next_.end(), chord, chords_.end());
+    open_.swap(next_);
+}
+
+/// A stack of two chords or more is tried across its middle.
+void ChordSearch::close(const Stack& stack) {
+    if (stack.first == stack.last) return;
+    const BitImage& across = *across_;
+    const int at = stack.middle, line = at / 2, middle = stack.first + stack.last;  // two pixels a line
+    if (across.is_dark(line, middle)) return;
+    const int b = across.run_begin(line, middle), c = across.run_end(line, middle);
+    const int a = b > 0 ? across.run_begin(line, b - 1) : b;
+    const int d = c < across.length ? across.run_end(line, c) : c;
+    if (!is_diametral(b - a, c - b) && !is_diametral(d - c, c - b)) return;
+    if (6 * (stack.last - stack.first + 1) < c - b) return;  // much of the hole's lines are diametral
+    const auto level = [&](int k) -> int { return along_rows_ ? image_->row(k)[at] : image_->row(at)[k]; };
+    const bool upper = b > a && (d == c || b - a <= d - c);
+    const int m_d = upper ? darkest(level, a, b) : darkest(level, c, d), m_b = level((b + c - 1) / 2);
+    if (m_b - m_d < min_contrast_) return;
+    const float x = float(at), y = float(b + c - 1) / 2;
+    const auto reach =
+        float(std::max(c - b, stack.inner) + 2);  // of a slanted hole, twice what its chords do
+    seeds_.push_back({along_rows_ ? x : y, along_rows_ ? y : x, reach, m_d, m_b});
+}
+
+void ChordSearch::scan(const BitImage& along, const BitImage& across, bool along_rows) {
+    across_ = &across, along_rows_ = along_rows;
+    edges_.resize(size_t(along.length) + 80);  // append_bits writes up to 8 more than there are
+    passes_.resize(edges_.size() / 2), numbers_.resize(edges_.size() / 2);
+    open_.clear();
+    for (int line = 0; line < along.lines; ++line) {
+        find_chords(along, line);
+        link(line);
+    }
+    for (const Stack& stack : open_) close(stack);
+}
+
+const std::vector<Seed>& ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
+    seeds_.clear();
+    image_ = &image;
+    binarise(image, threshold, rows_, columns_);
+    scan(rows_, columns_, true);
+    scan(columns_, rows_, false);
+    return seeds_;
+}
+
+}  // namespace roundel

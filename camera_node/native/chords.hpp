@@ -1,0 +1,60 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <vector>
+
+#include "bits.hpp"
+#include "paper.hpp"
+
+namespace roundel {
+
+/// A place where a roundel's middle may be.
+struct Seed {
+    float x, y;
+    float reach;       // how far from here the hole's edge may be, pixels
+    int dark, bright;  // m_d and m_b of the paper, from a few pixels
+};
+
+/// What a chord of a roundel may be: the least and the most of its length, pixels, and of one dark run over
+/// the bright one, (1 - r) / 2r, in sixteenths.
+struct Proportions {
+    int least, most, thick, thin;
+};
+
+/// Looks for roundels along all rows and columns of a picture.
+///
+/// A line through a roundel's centre is dark, bright and dark in the proportions (1 - r) : 2r : (1 - r) at
+/// any slant, r being the ratio of the diameters: an affine picture keeps ratios along a line (1 : 3 : 1 for
+/// the paper's 0.6), and lines that pass the centre within half the inner radius differ little. Chords of
+/// neighbouring lines that agree make a stack; its middle is where the line across is tried. There one of
+/// the dark runs is enough, so a roundel that something covers in part is found by the other direction.
+class ChordSearch {
+  public:
+    explicit ChordSearch(const Settings& settings);
+    /// The seeds of an image; a roundel may have several.
+    const std::vector<Seed>& run(const ImageView& image, const ThresholdMap& threshold);
+
+  private:
+    /// A bright run between two dark ones, on one or more neighbouring lines.
+    struct Stack {
+        int middle, inner;  // of the last line: middle of the bright run, and its length, pixels
+        int first, last;    // lines, of two pixels each
+    };
+    void scan(const BitImage& along, const BitImage& across, bool along_rows);
+    void find_chords(const BitImage& along, int line);
+    void link(int line);
+    void close(const Stack& stack);
+    bool is_diametral(int dark, int inner) const;
+
+    Proportions limits_{};
+    int min_contrast_;  // grey levels
+    BitImage rows_, columns_;
+    std::vector<int> edges_;             // begin, end, begin, end, ... of the dark runs of a line
+    std::vector<int> passes_, numbers_;  // which bright runs between two dark ones are diametral
+    std::vector<Stack> chords_, open_, next_;
+    std::vector<Seed> seeds_;
+    const ImageView* image_ = nullptr;
+    const BitImage* across_ = nullptr;
+    bool along_rows_ = true;
+};
+
+}  // namespace roundel

@@ -1,0 +1,322 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "rays.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numbers>
+
+#include "cholesky.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr int kRays = 16;
+constexpr int kLeast = 9;           // rays of each kind that must agree: what 30 % of a disc covered leaves
+constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
+constexpr int kReweights = 4;       // at most, where crossings disagree
+constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
+constexpr double kAbsolute = 0.5;   // so many pixels
+
+struct Direction {
+    float x, y;
+};
+
+const std::array<Direction, kRays> kDirections = [] {
+    std::array<Direction, kRays> directions;
+    for (int k = 0; k < kRays; ++k) {
+        const double angle = 2 * std::numbers::pi * k / kRays;
+        directions[size_t(k)] = {float(std::cos(angle)), float(std::sin(angle))};
+    }
+    return directions;
+}();
+
+/// Grey level between pixels; below 0 outside the image.
+inline float sample(const ImageView& image, float x, float y) {
+    const int u = int(x), v = int(y);
+    if (!(x >= 0 && y >= 0 && u < image.width - 1 && v < image.height - 1)) return -1;
+    const uint8_t *upper = image.row(v) + u, *lower = upper + image.stride;
+    const float a = x - float(u), b = y - float(v);
+    const float above = float(upper[0]) + a * (float(upper[1]) - float(upper[0]));
+    const float below = float(lower[0]) + a * (float(lower[1]) - float(lower[0]));
+    return above + b * (below - above);
+}
+
+/// A ray that walks outwards from (x, y) pixel by pixel, as far as the image goes.
+class Ray {
+  public:
+    Ray(const ImageView& image, float x, float y, Direction d)
+        : image_(image),
+          x_(x),
+          y_(y),
+          d_(d),
+          end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
+    /// The distance at which the ray next turns dark (or bright), before `limit`; negative where it does not.
+    float turn(bool dark, float theta, float limit) {
+        const int last = int(std::min(limit, end_)), below = int(std::ceil(theta));
+        while (t_ < last && (nearest(t_) < below) == dark) ++t_;
+        while (t_ < last && (nearest(t_) < below) != dark) ++t_;
+        return t_ < last ? between(theta) : -1;
+    }
+
+  private:
+    /// How far a ray goes until half a pixel before the image's last one; nothing is seen from outside.
+    static float room(float at, float step, int length) {
+        if (!(at >= 0 && at <= float(length - 1))) return 0;
+        const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
+        return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
+    }
+    int nearest(int t) const {  // in 1/65536 of a pixel: whole numbers are faster here
+        return image_.row((v_ + t * dv_) >> 16)[(u_ + t * du_) >> 16];
+    }
+    float level(float t) const { return sample(image_, x_ + t * d_.x, y_ + t * d_.y); }
+    /// Where the level is theta, near the pixel at which it was passed.
+    float between(float theta) const {
+        float t = float(std::max(t_ - 2, 0)), before = level(t);
+        for (int k = 0; k < 3; ++k) {
+            const float after = level(t + 1);
+            if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
+            before = after, t += 1;
+        }
+        return float(t_) - 0.5f;
+    }
+
+    const ImageView& image_;
+    float x_, y_;
+    Direction d_;
+    float end_;
+    int u_ = int(65536 * x_) + 32768, v_ = int(65536 * y_) + 32768;
+    int du_ = int(65536 * d_.x), dv_ = int(65536 * d_.y);
+    int t_ = 0;
+};
+
+/// Where a ray crosses the edge of the disc or of the hole in it, from the ray's origin.
+struct Crossing {
+    double x, y;
+    bool outer;
+    float ratio;  // of the ray's inner distance to its outer one; 0 where it has one only
+};
+
+struct Crossings {
+    std::array<Crossing, 2 * kRays> list;
+    int count = 0;
+    void add(Direction direction, double at, bool outer, float ratio) {
+        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer, ratio};
+    }
+};
+
+/// Least and most of inner over outer distance on a ray from near the middle.
+struct Ratios {
+    double least, most;
+};
+
+Ratios ratios_near_middle(const Settings& settings) {
+    const auto [low, high] = std::minmax_element(settings.inner_ratios.begin(), settings.inner_ratios.end());
+    const double slack = settings.ratio_tolerance + 0.1;  // a quarter of a radius off the middle
+    return {std::max(0.1, *low - slack), std::min(0.95, *high + slack)};
+}
+
+/// Diagonals first, then what lies between: with the chords along row and column, few rays tell early that
+/// nothing is there.
+constexpr std::array<int, kRays> kOrder{2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15, 0, 8, 4, 12};
+
+Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
+    const float theta = float(seed.dark + seed.bright) / 2;
+    Crossings crossings;
+    int missed = 0;
+    for (int k = 0; k < kRays && missed <= 2 + k / 3; ++k) {
+        const Direction direction = kDirections[size_t(kOrder[size_t(k)])];
+        Ray ray(image, seed.x, seed.y, direction);
+        const float inner = ray.turn(true, theta, seed.reach);
+        const float outer = inner < 0 ? -1 : ray.turn(false, theta, inner / float(ratios.least) + 2);
+        const bool both = outer >= 0 && double(inner) < ratios.most * double(outer) + 1;
+        const float ratio = both ? inner / outer : 0;
+        if (inner >= 0) crossings.add(direction, double(inner), false, ratio);
+        if (both) crossings.add(direction, double(outer), true, ratio);
+        missed += !both;
+    }
+    return crossings;
+}
+
+/// The weight of what is off by so many scales (Geman and McClure).
+double redescend(double off) { return 1 / ((1 + off * off) * (1 + off * off)); }
+
+/// Two ellipses of one centre and shape: p^T M p + v p = 1 is the outer one and = level the inner one.
+struct Conics {
+    double a, b, c, d, e, level;
+    double at(double x, double y) const { return a * x * x + b * x * y + c * y * y + d * x + e * y; }
+    double middle_x() const { return (b * e - 2 * c * d) / (4 * a * c - b * b); }
+    double middle_y() const { return (b * d - 2 * a * e) / (4 * a * c - b * b); }
+    bool are_ellipses() const { return a > 0 && 4 * a * c > b * b; }
+};
+
+/// Linear least squares, each crossing with its weight.
+std::optional<Conics> solve(const Crossings& crossings, const std::array<double, 2 * kRays>& weights) {
+    std::array<Vector<6>, 6> H{};
+    Vector<6> g{};
+    for (int k = 0; k < crossings.count; ++k) {
+        const Crossing& p = crossings.list[size_t(k)];
+        const Vector<6> row{p.x * p.x, p.x * p.y, p.y * p.y, p.x, p.y, p.outer ? 0.0 : -1.0};
+        const double w = weights[size_t(k)];
+        for (int i = 0; i < 6; ++i) {
+            for (int j = 0; j <= i; ++j) H[i][j] += w * row[i] * row[j];
+            g[i] += p.outer ? w * row[i] : 0;
+        }
+    }
+    const Cholesky<6> factor(H);
+    if (!factor.positive()) return std::nullopt;
+    const Vector<6> s = factor.solve(g);
+    const Conics conics{s[0], s[1], s[2], s[3], s[4], s[5]};
+    return conics.are_ellipses() ? std::optional(conics) : std::nullopt;
+}
+
+/// The conics' own frame: their middle, and the form's values there and on both ellipses.
+struct Frame {
+    double x, y, outer, inner;
+    explicit Frame(const Conics& c) : x(c.middle_x()), y(c.middle_y()) {
+        const double least = c.at(x, y);  // negative
+        outer = 1 - least, inner = c.level - least;
+    }
+    bool is_valid() const { return inner > 0 && inner < outer; }
+};
+
+/// Weights by distance from the ellipses; returns the share of rays whose crossings of the worse kind agree.
+int reweigh(const Crossings& crossings, const Conics& conics, std::array<double, 2 * kRays>& weights) {
+    const Frame frame(conics);
+    int agree[2] = {0, 0};
+    for (int k = 0; k < crossings.count; ++k) {
+        const Crossing& p = crossings.list[size_t(k)];
+        const double dx = p.x - frame.x, dy = p.y - frame.y, radius = std::sqrt(dx * dx + dy * dy);
+        const double share = (conics.at(p.x, p.y) - 1 + frame.outer) / (p.outer ? frame.outer : frame.inner);
+        const double off = radius * (std::sqrt(std::max(share, 0.0)) - 1) / (kRelative * radius + kAbsolute);
+        agree[p.outer] += std::abs(off) < 1;
+        weights[size_t(k)] = redescend(2 * off) / (p.outer ? 1 : frame.inner / frame.outer);
+    }
+    return std::min(agree[0], agree[1]);
+}
+
+/// Weights to begin with: from near the middle, rays that nothing covers have about the same ratio.
+std::array<double, 2 * kRays> weigh(const Crossings& crossings) {
+    std::array<float, 2 * kRays> ratios;
+    int n = 0;
+    for (int k = 0; k < crossings.count; ++k)
+        if (const Crossing& p = crossings.list[size_t(k)]; p.outer) ratios[size_t(n++)] = p.ratio;
+    std::nth_element(ratios.begin(), ratios.begin() + n / 2, ratios.begin() + n);
+    std::array<double, 2 * kRays> weights;
+    for (int k = 0; k < crossings.count; ++k)
+        weights[size_t(k)] = redescend(double(crossings.list[size_t(k)].ratio - ratios[size_t(n / 2)]) / 0.1);
+    return weights;
+}
+
+std::optional<Conics> fit(const Crossings& crossings) {
+    std::array<double, 2 * kRays> weights = weigh(crossings);
+    std::optional<Conics> conics;
+    for (int k = 0, agree = 0; k < kReweights && 2 * agree < crossings.count; ++k) {
+        conics = solve(crossings, weights);
+        if (!conics || !Frame(*conics).is_valid()) return std::nullopt;
+        agree = reweigh(crossings, *conics, weights);
+        if (agree < kLeast - kReweights + 1 + k) return std::nullopt;  // ever more must agree
+    }
+    return conics;
+}
+
+Ellipse outer_ellipse(const Conics& c, const Frame& frame) {
+    const double det = c.a * c.c - c.b * c.b / 4;
+    const Eigen e = eigen({c.c / det, -c.b / 2 / det, c.a / det});  // of M^-1
+    return {frame.x, frame.y, 2 * std::sqrt(frame.outer * e.first), 2 * std::sqrt(frame.outer * e.second),
+            e.angle};
+}
+
+/// Grey levels on the ellipse that is `scale` times the outer one; below 0 outside the image.
+std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
+    std::array<float, kRays> levels;
+    const double c = std::cos(e.angle), s = std::sin(e.angle);
+    for (int k = 0; k < kRays; ++k) {
+        const Direction d = kDirections[size_t(k)];
+        const double along = scale * e.major / 2 * double(d.x), across = scale * e.minor / 2 * double(d.y);
+        levels[size_t(k)] =
+            sample(image, float(e.x + c * along - s * across), float(e.y + s * along + c * across));
+    }
+    return levels;
+}
+
+double median_level(const ImageView& image, const Ellipse& e, double scale) {
+    auto levels = levels_on(image, e, scale);
+    std::nth_element(levels.begin(), levels.begin() + kRays / 2, levels.end());
+    return double(levels[kRays / 2]);
+}
+
+}  // namespace
+
+std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const Settings& settings) {
+    const Ratios ratios = ratios_near_middle(settings);
+    Seed from = seed;
+    std::optional<Start> start;
+    for (int k = 0; k < kCasts; ++k) {
+        const Crossings crossings = cast(image, from, ratios);
+        if (crossings.count < 2 * kLeast) return std::nullopt;
+        const auto conics = fit(crossings);
+        if (!conics) return std::nullopt;
+        const Frame frame(*conics);
+        Ellipse outer = outer_ellipse(*conics, frame);
+        const double ratio = std::sqrt(frame.inner / frame.outer), moved = std::hypot(frame.x, frame.y);
+        if (!(moved < outer.major)) return std::nullopt;
+        outer.x += double(from.x), outer.y += double(from.y);
+        const double m_d = median_level(image, outer, (1 + ratio) / 2);
+        const double m_b = median_level(image, outer, ratio / 3);
+        start = Start{outer, ratio, m_d, m_b};
+        const double theta = double(from.dark + from.bright) / 2;
+        if (moved < 0.1 * outer.minor && std::abs((m_d + m_b) / 2 - theta) < 0.1 * (m_b - m_d)) break;
+        from = {float(outer.x), float(outer.y), float(outer.major), int(m_d), int(m_b)};
+    }
+    const double slack = settings.ratio_tolerance + 1 / start->outer.minor;
+    const bool ratio = std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(),
+                                   [&](double r) { return std::abs(start->ratio - r) < slack; });
+    const bool size = start->outer.major > 0.8 * settings.min_diameter &&
+                      start->outer.major < 1.2 * settings.max_diameter && start->outer.minor > 3;
+    return ratio && size && start->bright - start->dark > settings.min_contrast / 2 ? start : std::nullopt;
+}
+
+Surface inspect(const ImageView& image, const Fit& fit) {
+    const Ellipse& e = fit.outer;
+    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // beyond it, levels are plain
+    const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
+    Surface surface;
+    const auto test = [&](double scale, bool dark) {
+        for (const float value : levels_on(image, e, scale)) {
+            if (value < 0) continue;
+            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
+            const bool off = std::abs(share - (dark ? 0 : 1)) > 0.3;
+            ++surface.seen, surface.off += off, surface.ring_off += off && dark;
+        }
+    };
+    for (const double share : {0.25, 0.5, 0.75})
+        if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
+    for (const double share : {0.2, 0.5, 0.8})
+        if ((1 - share) * hole > edge) test(share * fit.ratio, false);
+    test(1 + 2.2 * edge / e.minor, false);  // just outside
+    return surface;
+}
+
+bool is_bullseye(const ImageView& image, const Fit& fit) {
+    // Thin rings are blurred and not so dark.
+    const float theta = float(fit.bright - 0.3 * (fit.bright - fit.dark));
+    const Ellipse& e = fit.outer;
+    float least = 1e9f, most = 0;
+    for (int k = 0; k < kRays; k += 2) {
+        Ray ray(image, float(e.x), float(e.y), kDirections[size_t(k)]);
+        const auto limit = float(4 * e.major);
+        float edge = 0;
+        for (int ring = 0; ring < 3 && edge >= 0; ++ring)
+            if (ray.turn(true, theta, limit) < 0 || (edge = ray.turn(false, theta, limit)) < 0) return false;
+        const double u = double(kDirections[size_t(k)].x), v = double(kDirections[size_t(k)].y);
+        const double along = u * std::cos(e.angle) + v * std::sin(e.angle);
+        const double across = v * std::cos(e.angle) - u * std::sin(e.angle);
+        const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
+        least = std::min(least, share), most = std::max(most, share);
+    }
+    return most < 1.3f * least;
+}
+
+}  // namespace roundel

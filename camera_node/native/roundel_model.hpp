@@ -1,0 +1,143 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <array>
+
+#include "cholesky.hpp"
+#include "ellipse.hpp"
+#include "lanes.hpp"
+
+namespace roundel {
+
+/// The unknowns of a roundel's picture. Its plane is seen by x = c + A X / (1 + g . X), X in outer radii: c
+/// is where the disc's own centre projects, g its perspective, and every circle |X| = r an ellipse.
+///
+/// The pose stands last, so that its covariance is the last block of a Cholesky factor.
+enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
+constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
+using Parameters = Vector<kCount>;
+using Matrix = std::array<Parameters, kCount>;
+
+/// The image of the circle |X| = r: from its dual conic M diag(r^2, r^2, -1) M^T, M = [A + c g^T, c; g^T, 1]
+/// (Hartley and Zisserman, result 2.14). `shape` S gives the points centre + S^(1/2) u, |u| = 1.
+struct CircleImage {
+    double x, y;
+    Symmetric shape;
+};
+
+inline CircleImage circle_image(const Parameters& p, double r) {
+    const double hx = p[kAxx] * p[kGx] + p[kAxy] * p[kGy], hy = p[kAxy] * p[kGx] + p[kAyy] * p[kGy];
+    const double k = r * r / (1 - r * r * (p[kGx] * p[kGx] + p[kGy] * p[kGy]));
+    const Symmetric AA{p[kAxx] * p[kAxx] + p[kAxy] * p[kAxy], p[kAxy] * (p[kAxx] + p[kAyy]),
+                       p[kAxy] * p[kAxy] + p[kAyy] * p[kAyy]};
+    return {p[kX] - k * hx,
+            p[kY] - k * hy,
+            {k * AA.xx + k * k * hx * hx, k * AA.xy + k * k * hx * hy, k * AA.yy + k * k * hy * hy}};
+}
+
+constexpr int kChunk =
+    31;  // lanes at a time: columns fit the first cache, and odd, so that they share no bank
+
+/// The grey level that the parameters say, its gradient by them, and what the ring's two edges have in its
+/// change with the distance, of a chunk of pixels.
+struct Gradient {
+    Lanes by[kCount][kChunk], level[kChunk], ring[kChunk];
+};
+
+/// What the parameters say of pixels' grey levels.
+///
+/// Each edge is a normal distribution of the distance to its ellipse, to first order (f - r) / |grad f|,
+/// where f = |X|. Blur moves the half level of an edge towards its centre of curvature, by curvature
+/// blur^2 / 2. The work is cut into loops that are short enough for a processor to overlap their turns.
+class Model {
+  public:
+    explicit Model(const Parameters& p) {
+        const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
+        x_ = float(p[kX]), y_ = float(p[kY]), gx_ = float(p[kGx]), gy_ = float(p[kGy]);
+        inverse_xx_ = float(p[kAyy] / det), inverse_xy_ = float(-p[kAxy] / det);
+        inverse_yy_ = float(p[kAxx] / det);
+        ratio_ = float(p[kRatio]), card_ = float(p[kCard]);
+        bright_ = float(p[kBright]), fall_ = float(p[kDark] - p[kBright]);
+        drop_ = float(p[kGround] - p[kBright]);
+        per_blur_ = float(1 / p[kBlur]), peak_ = float(0.39894228 / p[kBlur]);
+        zgx_ = inverse_xx_ * gx_ + inverse_xy_ * gy_, zgy_ = inverse_xy_ * gx_ + inverse_yy_ * gy_;
+        blur_ = float(p[kBlur]), half_bend_ = float(p[kBlur] / (2 * det * det));
+        half_flat_ = float(1.5 * p[kBlur]);
+    }
+
+    /// `x` and `y` are `count` lanes of pixels in the frame of the parameters.
+    ROUNDEL_INLINE void evaluate(const float* x, const float* y, int count, Gradient& to) const {
+        Geometry at;
+        for (int k = 0; k < count; ++k) locate(load(x + k * kLanes), load(y + k * kLanes), k, at);
+        Edge outer, inner, card;
+        blur_edge(at, 1, count, outer);
+        blur_edge(at, ratio_, count, inner);
+        blur_edge(at, card_, count, card);
+        for (int k = 0; k < count; ++k) differentiate(at, outer, inner, card, k, to);
+    }
+
+  private:
+    /// Where pixels are: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the shift of
+    /// an edge of radius 1 by blur, and by how much the distance changes with g . q.
+    struct Geometry {
+        Lanes qx[kChunk], qy[kChunk], f[kChunk], nx[kChunk], ny[kChunk], stretch[kChunk], bow[kChunk],
+            bend[kChunk], flat[kChunk], tip[kChunk];
+    };
+
+    ROUNDEL_INLINE void locate(const Lanes& x, const Lanes& y, int k, Geometry& at) const {
+        const Lanes dx = x - x_, dy = y - y_;
+        const Lanes qx = inverse_xx_ * dx + inverse_xy_ * dy, qy = inverse_xy_ * dx + inverse_yy_ * dy;
+        const Lanes qq = qx * qx + qy * qy + 1e-12f, per_q = inverse_sqrt(qq);
+        const Lanes depth = 1.0f - gx_ * qx - gy_ * qy, per_depth = 1.0f / depth, f = qq * per_q * per_depth;
+        const Lanes mx = qx * per_q + f * gx_, my = qy * per_q + f * gy_;  // grad f = A^-1 m / depth
+        const Lanes vx = inverse_xx_ * mx + inverse_xy_ * my, vy = inverse_xy_ * mx + inverse_yy_ * my;
+        const Lanes vv = vx * vx + vy * vy + 1e-12f, per_v = inverse_sqrt(vv);
+        at.qx[k] = qx, at.qy[k] = qy, at.f[k] = f;
+        at.nx[k] = vx * per_v, at.ny[k] = vy * per_v;
+        const Lanes near = per_v * per_depth;
+        at.stretch[k] = per_v * depth, at.tip[k] = f * per_v;
+        at.bend[k] = half_bend_ * near * near * near, at.flat[k] = half_flat_ * vv * per_v;
+        const Lanes zx = inverse_xx_ * vx + inverse_xy_ * vy, zy = inverse_xy_ * vx + inverse_yy_ * vy;
+        const Lanes across = (qx * zy - qy * zx) * per_q * per_v, persp = vx * zgx_ + vy * zgy_;
+        at.bow[k] = per_v * per_v * (0.5f * across * across * per_q + persp);
+    }
+
+    /// The share of the inside that a pixel sees, and its derivatives by the distance and by the blur.
+    struct Edge {
+        Lanes inside[kChunk], slope[kChunk], by_blur[kChunk];
+    };
+
+    ROUNDEL_INLINE void blur_edge(const Geometry& at, float r, int count, Edge& to) const {
+        const float per_r = 1 / r;
+        for (int k = 0; k < count; ++k) {
+            const Lanes over = at.f[k] - r, distance = over * at.stretch[k] * (1.0f + over * at.bow[k]);
+            const Lanes bend = at.bend[k] * per_r, narrow = 1.0f / (1.0f + bend * bend);
+            const Lanes shift = blur_ * bend * (1.0f + bend * at.flat[k] * per_r);
+            const Normal normal = normal_tail((distance + shift) * per_blur_ * narrow);
+            to.inside[k] = normal.tail, to.slope[k] = -peak_ * normal.density * narrow;
+            to.by_blur[k] = to.slope[k] * (shift - distance) * per_blur_;
+        }
+    }
+
+    ROUNDEL_INLINE void differentiate(const Geometry& at, const Edge& outer, const Edge& inner,
+                                      const Edge& card, int k, Gradient& to) const {
+        const Lanes by_inner = -fall_ * inner.slope[k], by_card = -drop_ * card.slope[k];
+        const Lanes ring = fall_ * outer.slope[k] + by_inner;
+        const Lanes by = ring + by_card;  // the level by the distance outwards
+        const Lanes dark = outer.inside[k] - inner.inside[k], ground = 1.0f - card.inside[k];
+        const Lanes by_x = -by * at.nx[k], by_y = -by * at.ny[k], tip = by * at.tip[k];
+        const Lanes qx = at.qx[k], qy = at.qy[k];
+        to.by[kDark][k] = dark, to.by[kGround][k] = ground, to.by[kBright][k] = 1.0f - dark - ground;
+        to.by[kBlur][k] = fall_ * (outer.by_blur[k] - inner.by_blur[k]) - drop_ * card.by_blur[k];
+        to.by[kRatio][k] = -by_inner * at.stretch[k], to.by[kCard][k] = -by_card * at.stretch[k];
+        to.by[kX][k] = by_x, to.by[kY][k] = by_y;
+        to.by[kAxx][k] = by_x * qx, to.by[kAxy][k] = by_x * qy + by_y * qx, to.by[kAyy][k] = by_y * qy;
+        to.by[kGx][k] = tip * qx, to.by[kGy][k] = tip * qy;
+        to.ring[k] = ring;
+        to.level[k] = bright_ + fall_ * dark + drop_ * ground;
+    }
+
+    float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;
+    float bright_, fall_, drop_, per_blur_, peak_, blur_, half_bend_, half_flat_, zgx_, zgy_;
+};
+
+}  // namespace roundel

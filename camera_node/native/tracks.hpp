@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <vector>
+
+#include "chords.hpp"
+#include "refine.hpp"
+
+namespace roundel {
+
+/// A roundel of a frame; its number stays with it from frame to frame.
+struct Roundel {
+    Fit fit;
+    int track;
+};
+
+/// Roundels of the frames before, each expected where its last motion takes it.
+class Tracks {
+  public:
+    /// Where to look for those that the last frame showed, and their numbers. A lost one is not looked for.
+    struct Expected {
+        Seed seed;
+        int track;
+    };
+    std::vector<Expected> expect() const;
+    /// Takes the roundels of a frame. Those without a number (below 0) get that of a track that is expected
+    /// within a diameter, the nearest first, or a new one. A lost track keeps its number for a while.
+    void update(std::vector<Roundel>& found);
+
+  private:
+    struct Track {
+        int number;
+        Fit fit;
+        double vx, vy;  // pixels a frame
+        int missed;     // frames
+    };
+    const Track* nearest(const Fit& fit, const std::vector<bool>& taken) const;
+
+    std::vector<Track> tracks_;
+    int next_ = 0;
+};
+
+}  // namespace roundel

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the detector reaches, each figure beside its goal: `python -m tests.benchmarks.detector [PART ...]`."""
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from camera_node.detector import Detector
+from camera_node.errors import ConfigError
+from tests.benchmarks.detector import accuracy, negatives, pose, recall, speed
+from tests.benchmarks.detector.table import Run, print_verdicts
+
+PARTS = {
+    "speed": speed.measure,
+    "accuracy": accuracy.measure,
+    "recall": recall.measure,
+    "false_positives": negatives.measure,
+    "pose": pose.measure,
+}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Measure detectors against the goals of the issue. Everything is seeded; times are those of this machine."""
+
+    parts: Annotated[
+        tuple[Literal["speed", "accuracy", "recall", "false_positives", "pose", "all"], ...],
+        tyro.conf.Positional,
+    ] = ("all",)
+    """What to measure."""
+    detector: tuple[str, ...] = ("chords",)
+    """Which detectors, as `Detector(detector=...)` takes them."""
+    thorough: bool = False
+    """The whole grid and many more draws, for hours, rather than two minutes."""
+
+    def run(self) -> None:
+        """Print the tables of every detector, then its goals."""
+        console = Console(width=None if sys.stdout.isatty() else 140)
+        parts = PARTS if "all" in self.parts else {name: PARTS[name] for name in dict.fromkeys(self.parts)}
+        for name in self.detector:
+            make = partial(Detector, detector=name)  # pyright: ignore[reportArgumentType] checked when called
+            try:
+                make()
+            except ConfigError as error:
+                console.print(f"{name}: not measured, {error}")
+                continue
+            run = Run(name, make, self.thorough)
+            print_verdicts(console, name, [v for measure in parts.values() for v in measure(run, console)])
+
+
+if __name__ == "__main__":
+    tyro.cli(Benchmark, prog="tests.benchmarks.detector").run()

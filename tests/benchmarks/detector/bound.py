@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The Cramer-Rao bound of a roundel's centre and distance: what no unbiased detector can do better.
+
+The unknowns are the five of the pose, the dark, bright and ground levels, and the blur; their derivatives are those of
+the ray-traced picture, by central differences. Who does not know the lens has two more: the inner circle's image may
+then lie anywhere in the outer one's, as the unknown place of the optical axis has it.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from camera_node.lens import Lens
+from tests.camera_node.tracing import Array, Sight, ellipse_of, trace
+
+AXIS_PX = 20.0  # a step of the optical axis: the inner circle moves by far less than a pixel
+ROUNDING = 1 / 12  # variance that 8 bits add, square grey levels
+
+
+@dataclass(frozen=True)
+class Bound:
+    """For noise of one grey level: covariance (2, 2) of the ellipse's centre, and the distance's relative variance.
+
+    `without_lens` is the covariance for who does not know the lens.
+    """
+
+    centre: Array
+    without_lens: Array
+    distance: float
+
+    def centre_variance(self, noise: float, knows_lens: bool = True) -> float:
+        """Of one coordinate, the mean of both, square pixels, with the rounding to grey levels."""
+        cov = self.centre if knows_lens else self.without_lens
+        return float(np.trace(cov)) / 2 * (noise**2 + ROUNDING)
+
+    def distance_variance(self, noise: float) -> float:
+        """Of the distance over itself."""
+        return self.distance * (noise**2 + ROUNDING)
+
+
+def bound(sight: Sight, pieces: int) -> Bound:
+    """The bound for a roundel seen by a lens without distortion."""
+    grey, centre = [], []
+    for move in _moves(sight):
+        ahead, behind = move(1.0), move(-1.0)
+        grey.append((trace(ahead, pieces) - trace(behind, pieces)).ravel() / 2)
+        centre.append((ellipse_of(ahead)[0] - ellipse_of(behind)[0]) / 2)
+    J, c = np.array(grey), np.array(centre)
+    information = J @ J.T  # in steps
+    known = np.s_[:-2, :-2]
+    cov, blind = np.linalg.inv(information[known]), np.linalg.inv(information)
+    distance = float(cov[2, 2]) * _distance_step(sight) ** 2
+    return Bound(c[:-2].T @ cov @ c[:-2], c.T @ blind @ c, distance)
+
+
+def _distance_step(sight: Sight) -> float:
+    """What moves the edge by 0.05 px, over the distance."""
+    return 0.1 / _width(sight)
+
+
+def _width(sight: Sight) -> float:
+    return sight.lens.fx * sight.diameter_m / sight.distance_m
+
+
+def _moves(sight: Sight) -> Iterator[Callable[[float], Sight]]:
+    """For each unknown, the scene after so many steps of it; each is small against what it makes nonlinear."""
+    n, angle, (u, v) = sight.normal, 0.3 / _width(sight), sight.uv
+    first = np.cross(n, [1.0, 0.0, 0.0])
+    second = np.cross(n, first)
+    yield lambda k: replace(sight, uv=(u + 0.05 * k, v))
+    yield lambda k: replace(sight, uv=(u, v + 0.05 * k))
+    yield lambda k: replace(sight, distance_m=sight.distance_m * (1 + k * _distance_step(sight)))
+    yield lambda k: sight.with_normal(n + k * angle * first)
+    yield lambda k: sight.with_normal(n + k * angle * second)
+    for level in ("dark", "bright", "ground"):
+        yield lambda k, level=level: replace(sight, **{level: getattr(sight, level) + k})
+    yield lambda k: replace(sight, blur=sight.blur + 0.02 * k)
+    for axis in ("cx", "cy"):
+        yield lambda k, axis=axis: replace(sight, lens=_shifted(sight.lens, axis, AXIS_PX * k))
+
+
+def _shifted(lens: Lens, axis: str, by: float) -> Lens:
+    return msgspec.structs.replace(lens, **{axis: getattr(lens, axis) + by})

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs without roundels: those beside the checkout, frames of its videos, and what scikit-image ships."""
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from camera_node.source import read_grey
+from tests.benchmarks.detector.pictures import Grey
+
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+LENGTH = 960  # what scikit-image ships is brought to this length, and seen at half of it too
+
+
+def photographs(n: int) -> Iterator[Grey]:
+    """Up to `n` photographs, as far as they are there."""
+    files = [SHARED / "photos" / name for name in ("cctag_01.png", "monocam_Test_Image.jpg")]
+    yield from (read_grey(path) for path in files if path.exists())
+    shipped = list(_shipped())
+    for image in shipped:
+        yield from (_scaled(image, length) for length in (LENGTH, LENGTH // 2))
+    videos = sorted((SHARED / "webcams").glob("cam_*.mp4"))
+    for video in videos:
+        yield from _frames(video, (n - 2 * len(shipped)) // len(videos))
+
+
+def _shipped() -> Iterator[Grey]:
+    try:
+        folder = Path(str(importlib.import_module("skimage.data").__file__)).parent
+    except ImportError:
+        return
+    drawn = ("color.png", "phantom.png", "logo.png", "horse.png", "chessboard_GRAY.png", "chessboard_RGB.png")
+    for path in sorted(folder.iterdir()):
+        if path.suffix in (".png", ".jpg", ".jpeg", ".tif") and path.name not in drawn:
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if image is not None:
+                yield image.astype(np.uint8)
+
+
+def _scaled(image: Grey, length: int) -> Grey:
+    scale = length / max(image.shape)
+    return cv2.resize(
+        image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    ).astype(np.uint8)
+
+
+def _frames(video: Path, n: int) -> Iterator[Grey]:
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    every = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) // max(1, n))
+    for k in range(n * every):
+        if not capture.grab():
+            break
+        if k % every == 0:
+            yield cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2GRAY).astype(np.uint8)
+    capture.release()

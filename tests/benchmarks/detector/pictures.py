@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pictures with roundels in them: grounds, and cards that are ray-traced onto them."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.lens import Lens
+from tests.camera_node.tracing import Array, Sight, pixels_across, trace
+
+Grey = NDArray[np.uint8]
+F = 600.0  # focal length of all pictures, pixels
+NOISE = 3.0  # grey levels, of pictures of which nothing else is said
+PIECES = 4  # a pixel is cut into so many squared
+
+
+def dead_leaves(size: tuple[int, int], rng: np.random.Generator) -> Array:
+    """Clutter (h, w): shapes of all sizes that hide each other have the statistics of photographs (Lee et al. 2001)."""
+    h, w = size
+    image = np.full(size, 110, np.uint8)
+    sizes = 1 / np.sqrt(rng.uniform(1 / 160**2, 1 / 4**2, h * w // 150))  # a density of size^-3
+    for reach in sizes:
+        centre, level = rng.uniform((0, 0), (w, h)), float(rng.uniform(15, 240))
+        box = (centre.tolist(), (reach * rng.uniform(0.4, 1), reach), float(rng.uniform(0, 180)))
+        if rng.random() < 0.3:
+            cv2.ellipse(image, box, level, -1, cv2.LINE_AA)
+        else:
+            cv2.fillConvexPoly(image, cv2.boxPoints(box).astype(np.int32), level, cv2.LINE_AA)
+    return image.astype(float) + np.asarray(cv2.GaussianBlur(rng.normal(0, 12, size), (0, 0), 1.5), float)
+
+
+def flat(size: tuple[int, int], level: float) -> Array:
+    """One grey level (h, w)."""
+    return np.full(size, level)
+
+
+@dataclass(frozen=True)
+class Card:
+    """A card to paste: where its disc's centre is seen, how wide it would be frontally, pixels, and its attitude."""
+
+    uv: tuple[float, float]
+    diameter: float
+    tilt: float = 0.0
+    turn: float = 0.0
+
+
+def paste(
+    image: Array, cards: list[Card], blur: float = 0.7, *, dark: float = 40.0, bright: float = 190.0
+) -> Array:
+    """The picture (h, w) blurred, with cards on it: each hides the ground in proportion to its part of a pixel."""
+    h, w = image.shape
+    out = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), float)
+    for card in cards:
+        reach = int(0.75 * card.diameter + 4 * blur + 3)
+        u, v = (round(x) for x in card.uv)
+        box = (max(u - reach, 0), max(v - reach, 0), min(u + reach, w), min(v + reach, h))
+        light, cover = _layers(card, box, (w, h), blur, dark, bright)
+        part = out[box[1] : box[3], box[0] : box[2]]
+        part += light - cover * part
+    return out
+
+
+@lru_cache(maxsize=256)  # the same cards are shown on several grounds
+def _layers(
+    card: Card, box: tuple[int, int, int, int], size: tuple[int, int], blur: float, dark: float, bright: float
+) -> tuple[Array, Array]:
+    """The light of a card in a box u0, v0, u1, v1 of the picture (w, h), and how much it covers of each pixel."""
+    x0, y0, x1, y1 = box
+    cx, cy = (size[0] - 1) / 2 - x0, (size[1] - 1) / 2 - y0
+    lens = Lens(width=x1 - x0, height=y1 - y0, fx=F, fy=F, cx=cx, cy=cy)
+    uv, distance = (card.uv[0] - x0, card.uv[1] - y0), pixels_across(lens, 0.1, card.diameter)
+    sight = Sight(lens, uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, blur=blur)
+    light = trace(replace(sight, dark=dark, bright=bright), PIECES)
+    return light, trace(replace(sight, dark=1.0, bright=1.0), PIECES)
+
+
+def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:
+    """`count` places on a grid that fills the picture (h, w), each moved by less than a pixel."""
+    h, w = size
+    columns = max(1, int(np.ceil(np.sqrt(count * w / h))))
+    rows = int(np.ceil(count / columns))
+    cells = [(k % columns, k // columns) for k in range(count)]
+    moved = rng.uniform(-0.5, 0.5, (count, 2))
+    return [
+        (w * (i + 0.5) / columns + du, h * (j + 0.5) / rows + dv)
+        for (i, j), (du, dv) in zip(cells, moved.tolist(), strict=True)
+    ]
+
+
+def expose(image: Array, noise: float, rng: np.random.Generator) -> Grey:
+    """An 8-bit picture with Gaussian noise."""
+    noisy = image + np.float32(noise) * rng.standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def missed(cards: list[Card], found: Array) -> int:
+    """How many cards no detection (N, 2) lies on: within a fifth of the diameter of the centre."""
+    if not (cards and len(found)):
+        return len(cards)
+    apart = np.linalg.norm(np.array([card.uv for card in cards])[:, None] - found, axis=2).min(axis=1)
+    return int((apart > [0.2 * card.diameter for card in cards]).sum())

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pictures come out of folders, videos and running cameras, each with a name."""
+
+import socket
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.footage import find_cameras, read_frames, take_snapshots
+from camera_node.errors import CameraError
+from camera_node.messages import Keys
+from camera_node.network import open_client, open_router
+from camera_node.requests import answering, encode_jpeg, parse_quality
+
+IMAGE = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def test_folders_and_videos_are_found_and_read(tmp_path: Path):
+    (tmp_path / "north").mkdir()
+    for name in ("b.png", "a.jpg"):
+        cv2.imwrite(str(tmp_path / "north" / name), IMAGE)
+    writer = cv2.VideoWriter(str(tmp_path / "south.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for _ in range(3):
+        writer.write(cv2.cvtColor(IMAGE, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    found = find_cameras(tmp_path, None)
+    assert list(found) == ["north", "south"]
+    assert [name for name, _ in read_frames(found["north"])] == ["a.jpg", "b.png"]
+    frames = list(read_frames(found["south"]))
+    assert [name for name, _ in frames] == ["frame 0", "frame 1", "frame 2"]
+    assert frames[0][1].shape == IMAGE.shape
+    assert list(find_cameras(tmp_path / "north", None)) == ["north"]
+    assert list(find_cameras(tmp_path / "south.avi", "east")) == ["east"]
+    with pytest.raises(CameraError, match="no frames of west"):
+        find_cameras(tmp_path, "west")
+
+
+def test_a_running_camera_is_asked(endpoint: str):
+    """The camera's own answer, in the quality that is asked for."""
+    asked = threading.Event()
+
+    def answer(query) -> bytes:
+        asked.set()
+        return encode_jpeg(IMAGE, parse_quality(query.parameters))
+
+    with open_router([endpoint]) as router, open_client([endpoint]) as client:
+        key = Keys("test").snapshot("north")
+        queryable = router.declare_queryable(key, answering(answer, lambda: None))
+        pictures = take_snapshots(client, "test", "north", 20.0)
+        (first, image), (second, _) = next(pictures), next(pictures)
+        queryable.undeclare()
+    assert asked.is_set()
+    assert (first, second) == ("snapshot 0", "snapshot 1")
+    assert np.abs(image.astype(int) - IMAGE).max() <= 8  # JPEG of quality 95 on a ramp
+
+
+def test_a_camera_that_is_not_there_is_named(endpoint: str):
+    with (
+        open_client([endpoint]) as client,
+        pytest.raises(CameraError, match="camera 'north' sends no pictures"),
+    ):
+        next(take_snapshots(client, "test", "north", 60.0, patience_s=0.2))

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A wave before running cameras tells how far it is, and ends when more would not help."""
+
+import socket
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from calib.errors import CalibrationError
+from calib.waving import IDLE_S, Progress, Trial, _Wave, progress, thin, wave
+from camera_node.messages import Detections, Keys, encode
+from camera_node.network import open_client, open_router
+from tests.calib.synthetic import record, ring
+
+
+@contextmanager
+def sending(messages: list[Detections]) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
+    """A client of a router that publishes messages, and junk, as soon as somebody listens."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    listening = threading.Event()
+    with open_router([endpoint]) as router, open_client([endpoint]) as client:
+        block = zenoh.CongestionControl.BLOCK  # so fast, nothing must be dropped
+        sender = router.declare_publisher(Keys("test").detections("cam0"), congestion_control=block)
+        sender.declare_matching_listener(lambda status: listening.set())
+
+        def send() -> None:
+            assert listening.wait(20)
+            for payload in [b"no message", *map(encode, messages)]:
+                sender.put(payload)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        yield client, lambda: thread.join(20)
+
+
+def test_it_ends_by_itself():
+    """20 s of a wave at 0.02 px, all at once: the first trial says that a pixel's noise is what counts."""
+    arena, told = ring(3), []
+    with sending(record(arena, 20.0, sigma_px=0.02)) as (client, done):
+        messages, bad, why = wave(
+            client, "test", arena.intrinsics, arena.wand, 90.0, told.append, every_s=1.0
+        )
+        done()
+    assert (len(messages), bad) == (600, 1)
+    assert why == "more waving would not help"
+    assert told[-1].enough
+    assert told[-1].trial.expected_mm < 1
+    assert set(told[-1].frames) == {"cam0", "cam1", "cam2"}
+    assert told[-1].advice == "that is enough"
+
+
+def test_it_is_ended_by_time_or_by_hand():
+    arena, ended = ring(2), threading.Event()
+
+    def tell(told: Progress) -> None:
+        if sum(told.frames.values()):
+            ended.set()
+
+    with sending(record(arena, 1.0)) as (client, done):
+        why = wave(client, "test", arena.intrinsics, arena.wand, 60.0, tell, ended, trials=False)[2]
+        done()
+        assert why == "ended by hand"
+        with pytest.raises(CalibrationError, match="no detections on test/"):
+            wave(client, "test", arena.intrinsics, arena.wand, 0.1, trials=False)
+
+
+def test_the_rule():
+    """Precise and covered is enough; precise and idle for long too; a camera that is missing never is."""
+    good = Trial(strain={"a": 0.3, "b": 0.1}, used={"a": 0.6, "b": 0.9})
+    thin_ = Trial(strain=good.strain, used={"a": 0.2, "b": 0.9}, advice={"a": "wave in its left"})
+    weak = Trial(strain={"a": 0.4, "b": 0.1}, used=good.used)
+    assert _Wave().judge(good, 10.0)
+    assert not _Wave().judge(weak, 10.0)  # (1 + 0.4^2)^1/2 = 1.077
+    state = _Wave()
+    assert not state.judge(thin_, 10.0)
+    assert not state.judge(thin_, 10.0 + IDLE_S)
+    assert state.judge(thin_, 10.1 + IDLE_S)
+    missing = Trial(strain=good.strain, used=good.used, unplaced=("c",))
+    assert not state.judge(missing, 99.0)
+    state.frames = Counter({"a": 1, "b": 1, "c": 1})
+    advice = [
+        progress(state, 5.0, trial, False).advice
+        for trial in (None, thin_, weak, missing, Trial("it failed"))
+    ]
+    assert advice == [
+        "wave the wand where two cameras or more see it",
+        "a: wave in its left",
+        "go on, most before 'a'",
+        "wave where 'c' and another camera see the wand",
+        "it failed",
+    ]
+
+
+def test_a_part_holds_whole_runs_of_all_cameras():
+    """Half seconds are taken whole, evenly over the recording."""
+    messages = record(ring(2), 20.0)
+    part = thin(messages, frames=50)
+    assert {name: n for name, n in Counter(m.camera for m in part).items()} == {"cam0": 50, "cam1": 50}
+    seqs = [m.seq for m in part if m.camera == "cam0"]
+    assert seqs[:6] == [0, 1, 2, 3, 4, 20]
+    assert seqs[-1] > 150

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Images of one roundel by brute force through any lens, smooth enough to be differentiated numerically.
+
+Every pixel is cut into pieces; the ray of each piece meets the printed plane at some radius, and an edge's part of a
+piece falls linearly over the piece. No ellipse and no model of a blurred edge stands in here, so it can judge both.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.lens import Lens
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A roundel before a camera, and its light.
+
+    Attributes:
+        uv: raw pixel where the disc's own centre projects.
+        distance_m: of the disc's centre from the camera, along the optical axis.
+        diameter_m: d_o; `ratio` is d_i / d_o, `card` d / d_o.
+        tilt: between the printed side's normal and the line of sight, radians; `turn` its direction.
+        dark, bright, ground: grey levels; the card lies on the ground.
+        blur: standard deviation of the Gaussian that the lens spreads a point by, pixels; a pixel's own width adds.
+    """
+
+    lens: Lens
+    uv: tuple[float, float]
+    distance_m: float
+    diameter_m: float = 0.1
+    tilt: float = 0.0
+    turn: float = 0.0
+    ratio: float = 0.6
+    card: float = 9 / 7
+    dark: float = 40.0
+    bright: float = 190.0
+    ground: float = 90.0
+    blur: float = 0.7
+
+    @property
+    def position(self) -> Array:
+        """(3,) the disc's centre, metres, camera frame."""
+        return np.append(self.lens.normalise(self.uv)[0], 1.0) * self.distance_m
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit vector out of the printed side, camera frame."""
+        return self._axes.T @ [
+            np.sin(self.tilt) * np.cos(self.turn),
+            np.sin(self.tilt) * np.sin(self.turn),
+            -np.cos(self.tilt),
+        ]
+
+    def with_normal(self, normal: Array) -> "Sight":
+        """The same with another normal (3,), of any length."""
+        x, y, z = self._axes @ normal
+        return replace(self, tilt=float(np.arctan2(np.hypot(x, y), -z)), turn=float(np.arctan2(y, x)))
+
+    @property
+    def _axes(self) -> Array:
+        """Rows: two directions across the line of sight, the first level with the image's rows, and the line."""
+        line = self.position / np.linalg.norm(self.position)
+        down = np.cross(line, [1.0, 0.0, 0.0])
+        down /= np.linalg.norm(down)
+        return np.array([np.cross(down, line), down, line])
+
+
+def pixels_across(lens: Lens, diameter_m: float, px: float) -> float:
+    """The distance at which a frontal disc of `diameter_m` is `px` wide."""
+    return lens.fx * diameter_m / px
+
+
+def trace(sight: Sight, pieces: int = 6) -> Array:
+    """Grey levels (h, w) of the whole image of `sight.lens`, without noise; each pixel is cut into pieces squared."""
+    margin = int(np.ceil(4 * sight.blur)) + 1
+    radius = _trace_radius(sight, margin, pieces)
+    card, black, white = (_part(radius, r) for r in (sight.card, 1.0, sight.ratio))
+    fine = sight.ground + (sight.bright - sight.ground) * card - (sight.bright - sight.dark) * (black - white)
+    if sight.blur:
+        fine = cv2.GaussianBlur(fine, (0, 0), sight.blur * pieces, borderType=cv2.BORDER_REPLICATE)
+    h, w = fine.shape[0] // pieces, fine.shape[1] // pieces
+    whole = fine.reshape(h, pieces, w, pieces).mean(axis=(1, 3))
+    return whole[margin : h - margin, margin : w - margin]
+
+
+def _trace_radius(sight: Sight, margin: int, pieces: int) -> Array:
+    """Distance from the disc's centre, in outer radii, of what each piece sees; one piece more on every side."""
+    lens = sight.lens
+    u, v = (_pieces(n, margin, pieces) for n in (lens.width, lens.height))
+    if lens.distortion:
+        xy = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)).reshape(len(v), len(u), 2)
+    else:
+        xy = np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), -1)
+    n, c = sight.normal, sight.position
+    depth = (c @ n) / (xy @ n[:2] + n[2])
+    squared = (depth * xy[..., 0] - c[0]) ** 2 + (depth * xy[..., 1] - c[1]) ** 2 + (depth - c[2]) ** 2
+    return np.sqrt(squared) / (sight.diameter_m / 2)
+
+
+def _pieces(n: int, margin: int, pieces: int) -> Array:
+    return (np.arange(-margin * pieces - 1, (n + margin) * pieces + 1) + 0.5) / pieces - 0.5
+
+
+def _part(radius: Array, edge: float) -> Array:
+    """What part of each piece lies within an edge: it falls from 1 to 0 over one piece along the steeper axis."""
+    across = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2])
+    down = np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
+    return np.clip(0.5 + (edge - radius[1:-1, 1:-1]) / (np.maximum(across, down) / 2 + 1e-12), 0, 1)
+
+
+def ellipse_of(sight: Sight) -> tuple[Array, Array]:
+    """Centre (2,) and full axes (2,) in pixels of the outer edge's image, for a lens without distortion.
+
+    From the dual conic c c^T - r^2 (I - n n^T) of a circle of radius r around c with normal n.
+    """
+    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
+    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
+    dual /= dual[2, 2]
+    centre = dual[:2, 2]
+    return centre, 2 * np.sqrt(np.linalg.eigvalsh(np.outer(centre, centre) - dual[:2, :2])[::-1])
