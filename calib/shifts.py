@@ -24,6 +24,9 @@ ROUNDS = 5  # of reweighting
 EVIDENCE = 12.0
 FITTED = 8
 MIN_COMMON = 16
+MIN_MOMENTS = (
+    15  # at which both saw the wand; the markers of one moment tell little more than two of them would
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +70,10 @@ def find_shift(tracks: list[Track], label: Index, t_s: Array, xy: Array, gap_s: 
     misfits = misfit(xy, _interpolate(tracks, label, t_s + coarse[:, None], gap_s))
     together = misfits[len(coarse) // 2]
     best = int(np.nanargmin(misfits)) if np.isfinite(misfits).any() else len(coarse) // 2
-    common = np.isfinite(_interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0]).sum()
-    if common <= FITTED or not together > misfits[best] * np.exp(EVIDENCE / (common - FITTED)):
+    common = np.isfinite(_interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
+    moments = len(np.unique(t_s[common]))
+    told = min(int(common.sum()), 2 * moments) - FITTED
+    if moments < MIN_MOMENTS or not together > misfits[best] * np.exp(EVIDENCE / told):
         return 0.0
     fine = coarse[best] + STEP_S * np.linspace(-1, 1, 11)
     misfits = misfit(xy, _interpolate(tracks, label, t_s + fine[:, None], gap_s))
