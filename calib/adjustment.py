@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.linearisation import Linearisation, Observations, Problem, State, unobserved
+from calib.elimination import camera_information, solve
+from calib.linearisation import Linearisation
+from calib.problem import Observations, Problem, State, unobserved
 
 Array = NDArray[np.float64]
 
@@ -35,8 +37,8 @@ class Adjusted:
         used: (n,) the observations that were not rejected.
         residuals: (n, 2) seen less expected, pixels, of all observations.
         scale: what the residuals are over what their covariances claim; all covariances are scaled by it.
-        information: (C d, C d) of the cameras' free parameters, poses in their own frames, rotation then translation;
-            its null space is the choice of the world, and of the clock that all others are compared with.
+        information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
+            translation; its null space is the choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
     """
 
@@ -51,11 +53,16 @@ class Adjusted:
     def joint_covariance(self) -> Array:
         """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
         and the time what their clocks say on average (inner constraints; Triggs et al., Bundle Adjustment, section
-        9.3)."""
+        9.3). Where only some cameras were sought, it is theirs in the world of the others, which are taken as known."""
+        count, d = len(self.state.cameras), len(self.problem.free)
+        if self.problem.sought is not None:
+            full = np.zeros((count, d, count, d))
+            rows = np.ix_(self.problem.sought, range(d), self.problem.sought, range(d))
+            full[rows] = np.linalg.inv(self.information).reshape(full[rows].shape)
+            return full
         gauge = unobserved(self.state, self.problem.free)
         rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
         full = np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
-        count, d = len(self.state.cameras), len(self.problem.free)
         return full.reshape(count, d, count, d)
 
     def covariance(self, parameters: tuple[int, ...]) -> Array:
@@ -94,7 +101,7 @@ def adjust(problem: Problem, observations: Observations, start: State) -> Adjust
     kept = Linearisation(problem, observations.select(used), broken)
     kept.weigh(state)
     scale = _variance_factor(kept, state)
-    information = kept.camera_information(state) / scale**2
+    information = camera_information(kept, state) / scale**2
     return Adjusted(problem, state, used, every.residuals(state), scale, information, rounds)
 
 
@@ -125,7 +132,7 @@ def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[
         linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2), 1 / (1 + (strain / slack) ** 2))
         while True:
             try:
-                trial = state.moved(*linearisation.solve(damping))
+                trial = state.moved(*solve(linearisation, damping))
                 if (after := linearisation.cost(trial, scale, slack)) <= before:
                     break
             except RuntimeError:  # GTSAM's word for a system too near to singular

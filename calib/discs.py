@@ -9,7 +9,7 @@ shapes of all ellipses of a moment tell where the wand's printed side looks, as 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.linearisation import Observations
+from calib.problem import Observations
 from camera_node.lens import Lens
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from calib.errors import CalibrationError
 from calib.lens_adjustment import AdjustedLens, BoardView, adjust_lens, locate, start_lens
 from calib.rig import Rig
 from camera_node.lens import Lens
-from camera_node.source import Grey
+from camera_node.pixels import Grey
 
 Array = NDArray[np.float64]
 Model = Literal["pinhole", "fisheye"]

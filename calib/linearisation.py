@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The least squares problem of a wand's bundle adjustment, linearised in numpy and eliminated by GTSAM.
+"""The least squares problem of a wand's bundle adjustment, linearised in numpy.
 
 Every observation depends on one camera and on the two knots around its time. All are linearised in one batch; those
-of one camera between two knots become one HessianFactor on (knot, next knot, camera). GTSAM eliminates knots first.
+of one camera between two knots become one augmented Hessian on (knot, next knot, camera).
 """
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.trajectory import AffineWand, hermite_rate, interpolate, locate, whitened_motion
+from calib.problem import LENS, PER_CAMERA, POSE, Observations, Problem, State, skew
+from calib.trajectory import hermite_rate, interpolate, locate, whitened_motion
 from camera_node.lens import Lens
-from camera_node.pose import rotation_from_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -23,149 +22,14 @@ Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians,
 RIGID_M = 2e-4  # by which a wand bends while it is waved
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
 STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
-# Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
-ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
 FIXED = 1e-6  # to which a distance that carries the scale is kept
-PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
 # What is known of a camera before: of clocks, which may be slewed, and of lenses that were calibrated some time ago.
 PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
-@dataclass(frozen=True, slots=True)
-class Observations:
-    """Marker centres, one row each.
-
-    Attributes:
-        camera: (n,) index of the camera.
-        knot: (n,) the instant they belong to.
-        label: (n,) marker of the wand.
-        t_s: (n,) stamp, seconds.
-        uv: (n, 2) raw pixels, where the disc's own centre is seen.
-        cov: (n, 2, 2) covariance of `uv`.
-        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
-    """
-
-    camera: Index
-    knot: Index
-    label: Index
-    t_s: Array
-    uv: Array
-    cov: Array
-    axes_px: Array
-    angle_rad: Array
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> "Observations":
-        """The rows that a mask or an index array names."""
-        return Observations(*(getattr(self, name)[rows] for name in self.__slots__))
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """The unknowns.
-
-    Attributes:
-        cameras: (C, 4, 4) T_world_cam.
-        clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
-        lenses: (C, 4) log of the focal lengths' factor, and what is added to cx, cy and k1.
-        motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots.
-    """
-
-    cameras: Array
-    clocks: Array
-    lenses: Array
-    motion: Array
-
-    @classmethod
-    def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
-        """Cameras and motion, clocks without drift, lenses as they are given."""
-        clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
-        return cls(cameras, clocks, np.zeros((len(cameras), 4)), motion)
-
-    def moved(self, by: Array, along: Array) -> "State":
-        """Cameras changed by `by` (C, 12), turned and shifted in their own frames, the motion by `along` (K, 6 B)."""
-        cameras = self.cameras.copy()
-        for T, xi in zip(cameras, by, strict=True):
-            T[:3, 3] += T[:3, :3] @ xi[3:6]
-            T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:]
-        return State(cameras, clocks, lenses, self.motion + along.reshape(self.motion.shape))
-
-    def lens(self, camera: int, lens: Lens) -> Lens:
-        """The camera's lens, as adjusted."""
-        scale, cx, cy, k1 = self.lenses[camera].tolist()
-        if not any((scale, cx, cy, k1)):
-            return lens
-        rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
-        factor = float(np.exp(scale))
-        return msgspec.structs.replace(
-            lens,
-            fx=lens.fx * factor,
-            fy=lens.fy * factor,
-            cx=lens.cx + cx,
-            cy=lens.cy + cy,
-            distortion=(rest[0] + k1, *rest[1:]),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """What stays the same from iteration to iteration.
-
-    Attributes:
-        lenses: of the C cameras.
-        wand: in affine coordinates.
-        knot_s: (K,) ascending, K >= 2.
-        gap_s: knots further apart say nothing of each other.
-        density: power spectral density of the wand's acceleration, m^2/s^3.
-        middle_s: the stamp to which time offsets refer.
-        free: which of a camera's 12 parameters are sought.
-        fixed_distance: two cameras and their distance, where no wand length carries the scale.
-    """
-
-    lenses: list[Lens]
-    wand: AffineWand
-    knot_s: Array
-    gap_s: float
-    density: float
-    middle_s: float
-    free: tuple[int, ...] = POSE
-    fixed_distance: tuple[int, int, float] | None = None
-
-    def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
-        """The same with other parameters sought."""
-        return replace(self, free=tuple(sorted(sum(parameters, ()))))
-
-
-def cauchy(squares: Array, scale: float) -> float:
-    """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
-    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
-
-
-def skew(v: Array) -> Array:
-    """(..., 3, 3) the matrix of the cross product with v (..., 3)."""
-    S = np.zeros((*v.shape, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return S - np.swapaxes(S, -1, -2)
-
-
-def unobserved(state: State, free: tuple[int, ...]) -> Array:
-    """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
-    columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
-    for T, rows in zip(state.cameras, columns, strict=True):
-        R, p = T[:3, :3], T[:3, 3]
-        rows[:6, :6] = np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]])
-        rows[6, 6] = rows[7, 7] = 1.0
-    kept = [g for g in range(8) if g < 6 or g in free]
-    return columns[:, free][:, :, kept].reshape(-1, len(kept))
-
-
 @dataclass(slots=True)
 class Linearisation:
-    """The problem with its observations; `relinearise` makes the factors around a state, `solve` the step."""
+    """The problem with its observations; `relinearise` makes the Hessians around a state."""
 
     problem: Problem
     observations: Observations
@@ -258,7 +122,9 @@ class Linearisation:
     def _rig_terms(self, state: State) -> list[Term]:
         """What is known of the cameras before: their numbers, Jacobians, and whitened errors with the sign turned."""
         free = list(self.problem.free)
-        known = np.column_stack([np.zeros((len(state.cameras), 6)), state.clocks, state.lenses])[:, free]
+        known = np.column_stack([np.zeros((len(state.cameras), len(POSE))), state.clocks, state.lenses])[
+            :, free
+        ]
         sigma = PRIOR_SIGMA[free]
         terms: list[Term] = [((c,), (np.diag(1 / sigma),), -values / sigma) for c, values in enumerate(known)]
         if self.problem.fixed_distance:
@@ -340,67 +206,10 @@ class Linearisation:
             self.chain[links, at : at + 6 * B, at : at + 6 * B] += H[knots]
             self.chain[links, at : at + 6 * B, -1] += g[knots]
 
-    def _graph(self, damping: float) -> Any:
-        """GTSAM's graph: keys are the K knots, then the cameras."""
-        import gtsam
 
-        factor: Any = gtsam.JacobianFactor
-        half, d = 6 * len(self.problem.wand.basis), len(self.problem.free)
-        count, graph = len(self.problem.knot_s), gtsam.GaussianFactorGraph()
-        a, b, c = slice(0, half), slice(half, 2 * half), slice(2 * half, 2 * half + d)
-        links, cameras = np.divmod(self.views, len(self.problem.lenses))
-        for k, camera, H in zip(links.tolist(), cameras.tolist(), _damped(self.blocks, damping), strict=True):
-            upper = (H[a, a], H[a, b], H[a, c], H[a, -1], H[b, b], H[b, c], H[b, -1], H[c, c], H[c, -1])
-            graph.add(gtsam.HessianFactor(k, k + 1, count + camera, *upper, 0.0))
-        for k, H in enumerate(_damped(self.chain, damping)):
-            graph.add(gtsam.HessianFactor(k, k + 1, H[a, a], H[a, b], H[a, -1], H[b, b], H[b, -1], 0.0))
-        for keys, J, error in self.rig:
-            unit = gtsam.noiseModel.Unit.Create(len(error))
-            blocks: list[Any] = [
-                part for key, block in zip(keys, J, strict=True) for part in (count + key, block)
-            ]
-            graph.add(factor(*blocks, error, unit))
-        return graph
-
-    def _ordering(self, first: int, last: int) -> Any:
-        import gtsam
-
-        ordering = gtsam.Ordering()
-        for key in range(first, last):
-            ordering.push_back(key)
-        return ordering
-
-    def solve(self, damping: float) -> tuple[Array, Array]:
-        """Levenberg-Marquardt's step: (C, 12) of cameras and (K, 6 B) of the motion. The first camera and its clock
-        stay, as nothing observes the world and the time that all share.
-
-        Raises:
-            RuntimeError: the system is too near to singular; more damping helps.
-        """
-        import gtsam
-
-        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
-        free = list(self.problem.free)
-        graph = self._graph(damping)
-        graph.add(gtsam.HessianFactor(count, np.diag(ANCHOR[free]), 0 * ANCHOR[free], 0.0))
-        step = graph.optimize(self._ordering(0, total))
-        by = np.zeros((total - count, PER_CAMERA))
-        by[:, free] = [step.at(key) for key in range(count, total)]
-        return by, np.array([step.at(key) for key in range(count)])
-
-    def camera_information(self, state: State) -> Array:
-        """(C d, C d) information of the cameras' free parameters with the motion eliminated (Schur complement)."""
-        self.relinearise(state, np.ones(len(self.observations)), np.ones(len(self.smooth)))
-        count, total = len(self.problem.knot_s), len(self.problem.knot_s) + len(self.problem.lenses)
-        rest = self._graph(0.0).eliminatePartialMultifrontal(self._ordering(0, count))[1]
-        return np.asarray(rest.hessian(self._ordering(count, total))[0])
-
-
-def _damped(blocks: Array, damping: float) -> Array:
-    """The Hessians with their diagonals grown (Marquardt), all but the right-hand side's."""
-    grown, diagonal = blocks.copy(), np.arange(blocks.shape[1] - 1)
-    grown[:, diagonal, diagonal] *= 1 + damping
-    return grown
+def cauchy(squares: Array, scale: float) -> float:
+    """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
+    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
 
 
 def _by_lens(lens: Lens, local: Array, uv: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
-from calib.linearisation import DRIFT, OFFSET, POSE, Observations
+from calib.problem import DRIFT, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
 from calib.rig import Rig
 from calib.solution import Solution
@@ -62,8 +62,8 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
     """The rig in an upright world, and the report."""
     adjusted, count = solution.adjusted, len(told.names)
     joint = adjusted.covariance(POSE)
-    offsets, offset_sigma = _clock(adjusted, OFFSET, 1e3)
-    drift, drift_sigma = _clock(adjusted, DRIFT, 1e6)
+    offsets, offset_sigma = clock_values(adjusted, OFFSET, 1e3)
+    drift, drift_sigma = clock_values(adjusted, DRIFT, 1e6)
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
     covariance = joint.reshape(6 * count, 6 * count)
     placed = _place(rig, solution, told, joint, offsets)
@@ -81,7 +81,7 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
     )
 
 
-def _clock(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tuple[Array, Array]:
+def clock_values(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tuple[Array, Array]:
     """Values and standard deviations (C,) of a clock's parameter."""
     values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
     sigma = np.sqrt(np.einsum("cpcp->c", adjusted.covariance(part)))

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.errors import CalibrationError
-from calib.linearisation import LENS, Linearisation, Observations
+from calib.linearisation import Linearisation
+from calib.problem import LENS, Observations
 from calib.sightings import ranges
 from camera_node.body import Body
 from camera_node.lens import Lens

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
-from calib.linearisation import DRIFT, LENS, OFFSET, POSE, Linearisation, Observations, Problem, State
+from calib.linearisation import Linearisation
 from calib.plausibility import check_agreement, check_lenses, check_sizes
+from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
@@ -51,9 +52,9 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
-    few = adjust(problem, _with_disc_centres(wave, problem, state, observations), state)
+    few = adjust(problem, with_disc_centres(wave, problem, state, observations), state)
     free = [part for part in clocks if _tells(few, part, wave.period_s)]
-    few = _with_lenses(few, wave, observations)
+    few = _with_lenses(replace(few, problem=few.problem.freeing(POSE, *free)), wave, observations)
     free += [LENS] if LENS[0] in few.problem.free else []
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
@@ -61,7 +62,7 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     problem = replace(problem.freeing(POSE, *free), density=density)
-    observations = _with_disc_centres(wave, problem, start, observations)
+    observations = with_disc_centres(wave, problem, start, observations)
     adjusted = adjust(problem, observations, start)
     check_agreement(wave.names, adjusted, observations)
     if metric:
@@ -79,7 +80,7 @@ def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjus
     if any(lens.model != "pinhole" for lens in wave.lenses):
         return few
     problem = few.problem.freeing(few.problem.free, LENS)
-    freed = adjust(problem, _with_disc_centres(wave, problem, few.state, observations), few.state)
+    freed = adjust(problem, with_disc_centres(wave, problem, few.state, observations), few.state)
     cov, values = freed.covariance(LENS), freed.state.lenses.ravel()
     sigma = np.sqrt(np.einsum("cpcp->cp", cov))
     squared = values @ np.linalg.solve(cov.reshape(len(values), -1), values)
@@ -108,7 +109,8 @@ def _farthest(cameras: Array) -> tuple[int, int, float]:
     return int(a), int(b), float(gaps[a, b])
 
 
-def _with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observations) -> Observations:
+def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observations) -> Observations:
+    """The observations with discs' own centres in place of their ellipses'."""
     points = Linearisation(problem, seen).positions(state)
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
     return replace(

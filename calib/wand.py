@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class _Recording:
+class Recording:
     """A labelled recording: cameras in order of names."""
 
     names: list[str]
@@ -52,7 +52,7 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
         CalibrationError: the recording or the wand can't place two cameras; the message says why.
     """
     check_recording(rig, messages)
-    recording = _label(rig, wand, messages)
+    recording = read(rig, wand, messages)
     counts = frame_counts(recording.seen, len(recording.names))
     if not len(recording.seen):
         raise CalibrationError(_unseen(recording))
@@ -63,7 +63,7 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
     if len(start.poses) < 2:
         raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced))
     placed = sorted(start.poses)
-    solution = solve(_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric)
+    solution = solve(gather_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric)
     told = Told(
         [recording.names[k] for k in placed],
         [counts[k] for k in placed],
@@ -94,20 +94,21 @@ def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
             )
 
 
-def _label(rig: Rig, wand: Body, messages: Sequence[Detections]) -> _Recording:
+def read(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Recording:
+    """Label a recording's detections."""
     names = sorted({message.camera for message in messages})
     lenses: list[Lens] = [rig.cameras[name] for name in names]
     frames, seen = gather(messages, names, lenses)
-    return _Recording(names, lenses, frames, *label(frames, seen, wand, lenses))
+    return Recording(names, lenses, frames, *label(frames, seen, wand, lenses))
 
 
-def _unseen(recording: _Recording) -> str:
+def _unseen(recording: Recording) -> str:
     reasons = sum(recording.left_out, Counter())
     told = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
     return f"the wand was in no frame ({told}); do the wand file's diameter and markers match the wand?"
 
 
-def _unplaceable(recording: _Recording, counts: list[int], pairs: Pairs, unplaced: dict[str, str]) -> str:
+def _unplaceable(recording: Recording, counts: list[int], pairs: Pairs, unplaced: dict[str, str]) -> str:
     shared = pairs.shared()
     if not (shared - np.diag(np.diag(shared))).any():
         seen = ", ".join(f"{name} {n}" for name, n in zip(recording.names, counts, strict=True))
@@ -116,7 +117,7 @@ def _unplaceable(recording: _Recording, counts: list[int], pairs: Pairs, unplace
     return f"no two cameras could be placed; wave where two see the wand at once ({told})"
 
 
-def _wave(recording: _Recording, pairs: Pairs, wand: Body, placed: list[int]) -> Wave:
+def gather_wave(recording: Recording, pairs: Pairs, wand: Body, placed: list[int]) -> Wave:
     """What the placed cameras saw, numbered anew."""
     number = np.full(len(recording.names), -1)
     number[placed] = np.arange(len(placed))

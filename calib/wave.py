@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.instants import choose_instants, group_instants
-from calib.linearisation import Observations, Problem, State
+from calib.problem import Observations, Problem, State
 from calib.sightings import Sightings
 from calib.start import triangulate
 from calib.tracks import Track

@@ -3,16 +3,17 @@
 
 import contextlib
 import logging
-import re
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from camera_node.config import is_name
 from camera_node.errors import ConfigError, run
+from camera_node.source import Replay, SourceSettings, open_source
 
 
 @dataclass(frozen=True)
@@ -33,30 +34,11 @@ class Publish:
     """The arena's name, the first part of all Zenoh keys."""
     zenoh: Path | None = None
     """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
-    width: int | None = None
-    """Image width, pixels (cameras); the driver's choice unless given."""
-    height: int | None = None
-    """Image height, pixels (cameras)."""
-    fps: float | None = None
-    """Frames a second (cameras, and videos without timestamps.csv)."""
-    exposure_us: float | None = None
-    """Exposure, microseconds (cameras); automatic unless given. Short exposures keep moving roundels sharp."""
-    gain: float | None = None
-    """Gain in the driver's units (cameras)."""
-    fourcc: str | None = None
-    """Pixel format, four letters such as MJPG or YUYV (cameras)."""
-    scene: Path | None = None
-    """The simulated arena (--source sim)."""
-    epoch_ns: int | None = None
-    """Unix time of the simulation's, or with --stamps now the recording's, time 0; else it begins now."""
-    pace: Literal["recorded", "fast"] = "recorded"
-    """Deliver recorded frames when they are due, or as fast as they are read."""
-    stamps: Literal["recorded", "now"] = "recorded"
-    """Keep recorded times as they are, or move them to now, as if the recording were a camera."""
     detector: Literal["chords", "paper"] = "chords"
     """Which search; paper is that of Faigl et al., ICRA 2013, the reference."""
     inner_ratios: tuple[float, ...] = (0.6, 0.41)
     """Inner over outer diameters of the roundels in use."""
+    settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> None:
         """Open everything, publish until the source ends or a signal comes, and close everything."""
@@ -64,35 +46,23 @@ class Publish:
 
         from camera_node.network import open_client
         from camera_node.node import Node
-        from camera_node.source import Replay, open_source
 
-        check_name("name", self.name)
-        check_name("arena", self.arena)
+        _check_name("name", self.name)
+        _check_name("arena", self.arena)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         cv2.setNumThreads(1)  # a camera is one process of several on its machine
         with contextlib.ExitStack() as stack:
-            settings = self.source_settings()
-            source = open_source(self.source, settings)
+            source = open_source(self.source, self.settings, self.name)
             stack.callback(source.close)
             session = stack.enter_context(open_client(self.connect, self.zenoh))
-            keep_stamps = isinstance(source, Replay) and settings.stamps == "recorded"
+            keep_stamps = isinstance(source, Replay) and self.settings.stamps == "recorded"
             detector = {"detector": self.detector, "inner_ratios": self.inner_ratios}
             with contextlib.suppress(KeyboardInterrupt):
                 Node(self.name, source, session, self.arena, detector, keep_stamps).run()
 
-    def source_settings(self):
-        """The part of the options that is the source's."""
-        from camera_node.source import SourceSettings
 
-        if self.fourcc is not None and not re.fullmatch("[ -~]{4}", self.fourcc):
-            raise ConfigError(f"--fourcc {self.fourcc} is no pixel format; give four letters such as MJPG")
-        names = SourceSettings.__dataclass_fields__
-        return SourceSettings(**{name: getattr(self, name) for name in names})
-
-
-def check_name(option: str, name: str) -> None:
-    """Raise ConfigError unless a name can be a part of a Zenoh key."""
-    if not re.fullmatch(r"[^/*$#?\s]+", name):
+def _check_name(option: str, name: str) -> None:
+    if not is_name(name):
         raise ConfigError(
             f"--{option} '{name}' can't be a part of a Zenoh key: leave out / * $ # ? and spaces"
         )

@@ -2,6 +2,7 @@
 """Files that people write: YAML in, checked against a msgspec Struct; text out, atomically."""
 
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,13 @@ import yaml
 from camera_node.errors import ConfigError
 
 T = TypeVar("T")
+
+NAME = re.compile(r"[^/*$#?\s]+")
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can name an arena, a camera or a robot: it becomes a part of Zenoh keys."""
+    return NAME.fullmatch(text) is not None
 
 
 def load_yaml(path: Path, kind: type[T]) -> T:

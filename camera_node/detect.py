@@ -13,12 +13,13 @@ from rich.console import Console
 from rich.table import Table
 
 from camera_node.detector import Detector
-from camera_node.disc import locate
+from camera_node.disc import locate_all
 from camera_node.draw import draw_roundels
 from camera_node.errors import ConfigError
 from camera_node.lens import Lens, load_lens
+from camera_node.pixels import Grey
 from camera_node.roundels import Roundel, Roundels
-from camera_node.source import Grey, read_grey
+from camera_node.source import read_grey
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,8 +112,9 @@ def _describe(roundel: Roundel) -> dict[str, Any]:
 
 def _add_poses(rows: list, roundels: Roundels, detector: Detector, lens: Lens, diameter_m: float) -> None:
     """Adds `centre_u`, `centre_v` (of the likelier pose) and `poses`; nulls where the lens has no inverse."""
-    for row, roundel, offset, cov in zip(rows, roundels, *detector.disc_offsets(), strict=True):
-        poses = locate(roundel, lens, diameter_m, (offset, cov)) or ()
+    located = locate_all(roundels, lens, diameter_m, detector.disc_offsets())
+    for row, both in zip(rows, located, strict=True):
+        poses = both or ()
         centre = poses[0].centre_uv.tolist() if poses else (None, None)
         row["centre_u"], row["centre_v"] = centre
         row["poses"] = [

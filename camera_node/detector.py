@@ -2,7 +2,7 @@
 """The typed face of the native detector."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
 from camera_node.errors import ConfigError
+from camera_node.pixels import grey
 from camera_node.roundels import Roundels
 
 Array = NDArray[np.float64]
@@ -27,7 +28,10 @@ class Detector:
         min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
         search_share: of each frame's rows that is searched for new roundels; those that were in the last frame are
             looked for where they are expected, whatever this is. Less costs less, and finds what is new later.
-        mask: polygons (N, 2) of pixels; a roundel whose centre lies in one is left out.
+        mask: polygons (N, 2) of raw pixels; a roundel whose centre lies in one is left out.
+
+    Attributes:
+        settings: what is in force, by the names above.
 
     Raises:
         ConfigError: a setting is out of its range.
@@ -38,7 +42,7 @@ class Detector:
         *,
         detector: Literal["chords", "paper"] = "chords",
         inner_ratios: tuple[float, ...] = (0.6, 0.41),
-        ratio_tolerance: float = 0.1,
+        ratio_tolerance: float = 0.08,
         min_diameter_px: float = 8.0,
         max_diameter_px: float = 400.0,
         min_contrast: float = 25.0,
@@ -55,9 +59,7 @@ class Detector:
             raise ConfigError(
                 f"diameters of {min_diameter_px} to {max_diameter_px} px; give two in rising order in [6, 10000]"
             )
-        self._mask = [np.asarray(polygon, np.float32) for polygon in mask]
-        if any(p.ndim != 2 or p.shape[1] != 2 or len(p) < 3 or not np.isfinite(p).all() for p in self._mask):
-            raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
+        self._mask = [_check_polygon(polygon) for polygon in mask]
         if not 5 <= min_contrast <= 250:
             raise ConfigError(f"min_contrast is {min_contrast}; give grey levels in [5, 250]")
         if not 0.01 <= search_share <= 1:
@@ -72,6 +74,15 @@ class Detector:
             detector == "paper",
         )
         self._offsets = np.empty((0, 5))
+        self.settings: dict[str, Any] = {
+            "inner_ratios": tuple(inner_ratios),
+            "ratio_tolerance": ratio_tolerance,
+            "min_diameter_px": min_diameter_px,
+            "max_diameter_px": max_diameter_px,
+            "min_contrast": min_contrast,
+            "search_share": search_share,
+            "mask": tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in self._mask),
+        }
 
     @property
     def threshold(self) -> float:
@@ -93,17 +104,18 @@ class Detector:
         """
         return self._offsets[:, :2], self._offsets[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
-    def detect(self, image: NDArray[np.uint8]) -> Roundels:
-        """All roundels of a grey image (h, w), uint8.
+    def detect(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Roundels:
+        """All roundels of a grey image (h, w), uint8, or uint16 of 10 to 16 bits, which are narrowed to 8.
 
         Raises:
             ValueError: the array is no grey image.
         """
-        if image.dtype != np.uint8 or image.ndim != 2:
-            raise ValueError(f"a grey image (h, w) of uint8 is needed, got {image.dtype} {image.shape}")
-        if image.strides[1] != 1 and image.size:
-            image = np.ascontiguousarray(image)
-        table = self._core.detect(image)
+        if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
+            raise ValueError(
+                f"a grey image (h, w) of uint8 or uint16 is needed, got {image.dtype} {image.shape}"
+            )
+        pixels = grey(image)
+        table = self._core.detect(pixels)
         table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
         self._offsets = table[:, 11:16]
         uv, axes = table[:, :2], table[:, 5:7]
@@ -116,3 +128,10 @@ class Detector:
     def _is_masked(self, uv: Array) -> bool:
         at = (float(uv[0]), float(uv[1]))
         return any(cv2.pointPolygonTest(polygon, at, False) >= 0 for polygon in self._mask)
+
+
+def _check_polygon(polygon: ArrayLike) -> NDArray[np.float32]:
+    corners = np.asarray(polygon, np.float32)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
+        raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
+    return corners

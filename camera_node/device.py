@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import cv2
 
 from camera_node.errors import CameraError
-from camera_node.source import Frame, SourceSettings, grey
+from camera_node.pixels import RAW, grey
+from camera_node.source import Frame, SourceSettings
 
 log = logging.getLogger("camera_node.device")
 
@@ -86,6 +87,8 @@ def properties(settings: SourceSettings) -> list[tuple[int, float]]:
     pairs: list[tuple[int, float]] = []
     if settings.fourcc is not None:
         pairs.append((cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc)))
+        if settings.fourcc in RAW:
+            pairs.append((cv2.CAP_PROP_CONVERT_RGB, 0))  # else OpenCV makes colours of the grey, 8 bits each
     for name in ("width", "height", "fps"):
         if (value := getattr(settings, name)) is not None:
             pairs.append((PROPERTY[name], value))
@@ -99,6 +102,7 @@ PROPERTY = {
 }
 NAMES = {
     cv2.CAP_PROP_FOURCC: "pixel format",
+    cv2.CAP_PROP_CONVERT_RGB: "raw pixels",
     cv2.CAP_PROP_FRAME_WIDTH: "width",
     cv2.CAP_PROP_FRAME_HEIGHT: "height",
     cv2.CAP_PROP_FPS: "frame rate",
@@ -226,7 +230,7 @@ class DeviceSource:
         exposure_us = self.settings.exposure_us or 0.0
         stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC)
         t_ns = capture_time(stamp, time.monotonic_ns(), time.time_ns(), exposure_us)
-        self._keep(Frame(grey(image), t_ns, exposure_us))
+        self._keep(Frame(grey(image, self.settings.fourcc), t_ns, exposure_us))
         return True
 
     def _lose(self, capture: Capture) -> None:

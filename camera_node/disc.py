@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where a roundel stands before one camera: an ellipse and a known diameter leave two poses."""
+"""Where roundels stand before one camera: an ellipse and a known diameter leave two poses."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.lens import Lens
-from camera_node.roundels import Roundel
+from camera_node.roundels import Roundel, Roundels
 
 Array = NDArray[np.float64]
-BOUNDARY = 64  # points of the ellipse that are taken through the lens
+BOUNDARY = 24  # points of an ellipse that are taken through the lens
+SCATTER = (
+    1.5  # squared errors of small roundels' offsets over their covariance, which is to first order (measured)
+)
+AROUND = np.linspace(0, 2 * np.pi, BOUNDARY, endpoint=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,79 +35,173 @@ class DiscPose:
     probability: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscPoses:
+    """Both poses of N discs, the likelier first; rows are NaN where the lens has no inverse at an ellipse.
+
+    Shapes: position_m and normal (N, 2, 3), centre_uv (N, 2, 2), probability (N, 2); as in `DiscPose`.
+    """
+
+    position_m: Array
+    normal: Array
+    centre_uv: Array
+    probability: Array
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    def __iter__(self) -> Iterator[tuple[DiscPose, DiscPose] | None]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, k: int) -> tuple[DiscPose, DiscPose] | None:
+        """Both poses of one disc; None where there are none."""
+        if not np.isfinite(self.position_m[k]).all():
+            return None
+        columns = (self.position_m[k], self.normal[k], self.centre_uv[k], self.probability[k])
+        first, second = (DiscPose(p, n, uv, float(odds)) for p, n, uv, odds in zip(*columns, strict=True))
+        return first, second
+
+
 def locate(
     roundel: Roundel,
     lens: Lens,
     diameter_m: float,
     offset: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> tuple[DiscPose, DiscPose] | None:
-    """Both poses of a disc of outer diameter `diameter_m`, the likelier first.
+    """Both poses of one disc, the likelier first, as `locate_all` has them; None where the lens has no inverse."""
+    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
+    offsets = None if offset is None else (np.asarray([offset[0]], float), np.asarray([offset[1]], float))
+    return _locate(ellipse, lens, diameter_m, offsets)[0]
 
-    The ellipse's boundary goes through the lens; the conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et
-    al. 1992). The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: the
-    probability is that of chi-square with two degrees of the measured `offset` from the ellipse's centre (2,) and its
-    covariance (2, 2), as `Detector.disc_offsets` gives them. Without it both are 0.5.
 
-    Returns:
-        None where the lens has no inverse at the ellipse.
+def locate_all(
+    roundels: Roundels,
+    lens: Lens,
+    diameter_m: float,
+    offsets: tuple[Array, Array] | None = None,
+) -> DiscPoses:
+    """Both poses of each disc of outer diameter `diameter_m`, the likelier first.
+
+    The ellipse's boundary goes through the lens, point by point: that a circle's image through distortion is no
+    ellipse then costs nothing to first order. The conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et al.
+    1992).
+
+    The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: the probability is that
+    of chi-square with two degrees of the measured `offsets` from the ellipses' centres (N, 2) and their covariances
+    (N, 2, 2), as `Detector.disc_offsets` gives them, widened by `SCATTER`. Without them all are 0.5.
     """
-    xy = lens.normalise(_boundary(roundel))
-    if not np.isfinite(xy).all():
-        return None
-    Q = _fit_conic(xy)
-    poses = [_pose(n, Q, diameter_m / 2) for n in _normals(Q)]
-    uv = lens.project([position for position, _ in poses])
-    odds = np.array([0.5, 0.5]) if offset is None else _odds(uv - roundel.uv, offset[0], offset[1])
-    first, second = np.argsort(-odds, kind="stable")
-    both = [DiscPose(p, n, at, float(odd)) for (p, n), at, odd in zip(poses, uv, odds, strict=True)]
-    return both[first], both[second]
+    ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
+    return _locate(ellipses, lens, diameter_m, offsets)
 
 
-def _boundary(roundel: Roundel) -> Array:
-    """(N, 2) raw pixels around the outer ellipse."""
-    t = np.linspace(0, 2 * np.pi, BOUNDARY, endpoint=False)
-    c, s = np.cos(roundel.angle_rad), np.sin(roundel.angle_rad)
-    along, across = np.column_stack([np.cos(t), np.sin(t)]).T * roundel.axes_px[:, None] / 2
-    return roundel.uv + np.column_stack([c * along - s * across, s * along + c * across])
+def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
+    """Distance of a disc's centre from the camera, metres, by the ellipse's principal axis; NaN without an inverse.
+
+    Section III-C of Faigl et al. (ICRA 2013): of all diameters of a slanted disc, one stands across the line of sight
+    and is seen as the ellipse's major axis, L = d_o / major. Here the axis is measured in the image plane of a camera
+    of focal length one that looks at the ellipse, so that neither the lens nor the place in the image matters.
+
+    Perspective leaves a systematic error. The dual conic of a circle of radius r around (0, 0, L) that is slanted by
+    theta, c c^T - r^2 (I - n n^T), has major / 2 = r / sqrt(L^2 - r^2 sin^2 theta) and gives the correction
+    L-hat = sqrt((d_o / major)^2 + (d_o / 2)^2 sin^2 theta), sin^2 theta = 1 - (minor / major)^2. The correction is
+    derived here from the geometry; the paper's text was not at hand to compare it with. What remains is of the order of
+    (d_o / L)^4.
+    """
+    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
+    rays = lens.rays(np.vstack([ellipse[:, :2], _boundaries(ellipse)[0]]))
+    if not np.isfinite(rays).all():
+        return float("nan")
+    seen = rays[1:] @ _look_along(rays[0]).T
+    minor, major = _axes(_fit_conics(seen[None, :, :2] / seen[None, :, 2:])[0])
+    sin2 = 1 - (minor / major) ** 2
+    return float(np.hypot(diameter_m / major, diameter_m / 2 * np.sqrt(sin2)))
 
 
-def _fit_conic(xy: Array) -> Array:
-    """Symmetric Q (3, 3) with p^T Q p = 0 for the points p = (x, y, 1) of an ellipse, signature (+, +, -)."""
-    mean, scale = xy.mean(axis=0), xy.std()
-    x, y = ((xy - mean) / scale).T
-    a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(len(x)))[0]
-    H = np.array([[1, 0, -mean[0]], [0, 1, -mean[1]], [0, 0, scale]]) / scale
-    return H.T @ np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, -1.0]]) @ H
+def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array, Array] | None) -> DiscPoses:
+    """Both poses of ellipses (N, 5): u, v, major, minor, angle."""
+    n = len(ellipses)
+    xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
+    seen = np.isfinite(xy).all(axis=(1, 2))
+    position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
+    if seen.any():
+        position[seen], normal[seen] = _decompose(_fit_conics(xy[seen]), diameter_m / 2)
+    uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
+    odds = np.full((n, 2), 0.5) if offsets is None else _odds(uv - ellipses[:, None, :2], *offsets)
+    order = np.argsort(-odds, axis=1, kind="stable")
+    pick = np.arange(n)[:, None], order
+    return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick])
 
 
-def _normals(Q: Array) -> Array:
-    """(2, 3) unit normals of the planes that cut the cone p^T Q p = 0 in circles, one a solution."""
-    (l3, l2, l1), v = np.linalg.eigh(Q)
-    along = np.sqrt(max(l1 - l2, 0.0) / (l1 - l3)) * v[:, 2]
-    up = np.sqrt((l2 - l3) / (l1 - l3)) * v[:, 0]
-    return np.array([along + up, along - up])
+def _boundaries(ellipses: Array) -> Array:
+    """(N, BOUNDARY, 2) raw pixels around ellipses (N, 5)."""
+    c, s = np.cos(ellipses[:, 4]), np.sin(ellipses[:, 4])
+    along = ellipses[:, 2, None] / 2 * np.cos(AROUND)
+    across = ellipses[:, 3, None] / 2 * np.sin(AROUND)
+    u = c[:, None] * along - s[:, None] * across
+    v = s[:, None] * along + c[:, None] * across
+    return ellipses[:, None, :2] + np.stack([u, v], axis=-1)
 
 
-def _pose(n: Array, Q: Array, radius: float) -> tuple[Array, Array]:
-    """Position and normal of the circle of `radius` in the plane of normal `n` (up to its sign).
+def _fit_conics(xy: Array) -> Array:
+    """Symmetric Q (N, 3, 3) with p^T Q p = 0 for points p = (x, y, 1) of N ellipses (N, M, 2), signature (+, +, -)."""
+    mean, scale = xy.mean(axis=1), xy.std(axis=(1, 2))
+    x, y = np.moveaxis((xy - mean[:, None]) / scale[:, None, None], 2, 0)
+    rows = np.stack([x * x, x * y, y * y, x, y], axis=-1)
+    at_one = np.linalg.solve(rows.mT @ rows, rows.sum(axis=1)[..., None])[..., 0]  # rows @ at_one = 1
+    a, b, c, d, e = at_one.T
+    Q = np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, np.full_like(a, -1.0)]])
+    H = np.tile(np.eye(3), (len(xy), 1, 1))
+    H[:, :2, 2], H[:, 2, 2] = -mean, scale
+    return H.mT @ np.moveaxis(Q, 2, 0) @ H / (scale**2)[:, None, None]
+
+
+def _decompose(Q: Array, radius: float) -> tuple[Array, Array]:
+    """Positions and normals (N, 2, 3) of the circles of `radius` whose images are the conics Q (N, 3, 3).
 
     The dual conic of a circle's image is Q^-1 = mu (c c^T - r^2 (I - n n^T)), c its centre.
     """
-    dual = np.linalg.inv(Q)
-    towards = dual @ n  # mu (c . n) c
-    t = np.cross(n, towards / np.linalg.norm(towards))  # at right angles to n and c
-    if np.linalg.norm(t) < 1e-9:
-        t = np.cross(n, [1.0, 0.0, 0.0])
-    t /= np.linalg.norm(t)
-    mu = -(t @ dual @ t) / radius**2
-    c = towards / (mu * np.sqrt(n @ towards / mu))
-    c = c if c[2] > 0 else -c
-    return c, n if n @ c < 0 else -n
+    n, dual = _normals(Q), np.linalg.inv(Q)[:, None]
+    towards = (dual @ n[..., None])[..., 0]  # mu (c . n) c
+    t = _at_right_angles(n, towards)
+    mu = -np.einsum("nki,nkij,nkj->nk", t, dual, t) / radius**2
+    c = towards / (mu * np.sqrt((n * towards).sum(-1) / mu))[..., None]
+    c *= np.where(c[..., 2:] > 0, 1.0, -1.0)
+    return c, n * np.where((n * c).sum(-1, keepdims=True) < 0, 1.0, -1.0)
 
 
-def _odds(predicted: Array, offset: ArrayLike, cov: ArrayLike) -> Array:
-    """Probabilities (2,) of predicted offsets (2, 2) by their chi-square."""
-    error = predicted - np.asarray(offset, float)
-    chi2 = np.einsum("ki,ij,kj->k", error, np.linalg.inv(np.asarray(cov, float)), error)
-    weight = np.exp(-(chi2 - chi2.min()) / 2)
-    return weight / weight.sum()
+def _normals(Q: Array) -> Array:
+    """(N, 2, 3) unit normals of the planes that cut the cones p^T Q p = 0 in circles, one a solution."""
+    values, v = np.linalg.eigh(Q)
+    l3, l2, l1 = values.T[..., None]
+    along = np.sqrt(np.maximum(l1 - l2, 0.0) / (l1 - l3)) * v[:, :, 2]
+    up = np.sqrt((l2 - l3) / (l1 - l3)) * v[:, :, 0]
+    return np.stack([along + up, along - up], axis=1)
+
+
+def _at_right_angles(n: Array, towards: Array) -> Array:
+    """(N, 2, 3) unit vectors at right angles to the normals n and to `towards`; any to n where these are one."""
+    t = np.cross(n, towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+    t = np.where(np.linalg.norm(t, axis=-1, keepdims=True) < 1e-9, np.cross(n, [1.0, 0.0, 0.0]), t)
+    return t / np.linalg.norm(t, axis=-1, keepdims=True)
+
+
+def _odds(predicted: Array, offset: Array, cov: Array) -> Array:
+    """Probabilities (N, 2) of predicted offsets (N, 2, 2) by their chi-square; 0.5 where nothing was predicted."""
+    error = predicted - offset[:, None]
+    chi2 = np.einsum("nki,nij,nkj->nk", error, np.linalg.inv(cov), error)
+    weight = np.exp(-(chi2 - chi2.min(axis=1, keepdims=True)) / 2 / SCATTER)
+    return np.nan_to_num(weight / weight.sum(axis=1, keepdims=True), nan=0.5)
+
+
+def _look_along(ray: Array) -> Array:
+    """A rotation (3, 3) that turns a unit ray (3,) into the optical axis."""
+    x = np.cross([0.0, 1.0, 0.0], ray)
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(ray, x), ray])
+
+
+def _axes(Q: Array) -> Array:
+    """(2,) full minor and major axis of a conic (3, 3)."""
+    centre = np.linalg.solve(Q[:2, :2], -Q[:2, 2])
+    level = -(Q[2, 2] + Q[2, :2] @ centre)
+    return 2 * np.sqrt(level / np.linalg.eigvalsh(Q[:2, :2])[::-1])

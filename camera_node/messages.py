@@ -144,24 +144,27 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     clock_offset_ms: float | None = None
     clock_error_ms: float | None = None
     temperature_c: float | None = None
-    advice: str = ""  # "too dark", "saturated", or nothing
+    advice: str = ""  # "saturated" or "too dark" with what to change by how much, or nothing
     refused: int = 0  # requests for a snapshot or settings that were refused since the node started
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What can be changed while a camera runs. A field that is None is left as it is, or is not known to the camera.
 
-    `mask` lists rectangles [u0, v0, u1, v1] of raw pixels in which roundels are ignored; the others are a camera's
-    and `Detector`'s settings of these names.
+    `mask` lists polygons of three or more [u, v], raw pixels, in which roundels are ignored; exposure and gain are a
+    camera's, the others `Detector`'s settings of these names.
     """
 
     version: int = VERSION
     exposure_us: float | None = None
     gain: float | None = None
-    mask: tuple[tuple[float, float, float, float], ...] | None = None
+    mask: tuple[tuple[tuple[float, float], ...], ...] | None = None
+    inner_ratios: tuple[float, ...] | None = None
+    ratio_tolerance: float | None = None
     min_contrast: float | None = None
     min_diameter_px: float | None = None
     max_diameter_px: float | None = None
+    search_share: float | None = None
 
 
 class ClockReply(msgspec.Struct, frozen=True):

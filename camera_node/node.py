@@ -10,6 +10,7 @@ from typing import Any
 import zenoh
 
 from camera_node.clock import Clock
+from camera_node.draw import draw_roundels
 from camera_node.eye import Eye
 from camera_node.health import Health
 from camera_node.messages import CameraStatus, Detections, Keys, encode
@@ -18,6 +19,7 @@ from camera_node.requests import (
     RequestError,
     answering,
     encode_jpeg,
+    parse_draw,
     parse_quality,
     parse_settings,
     settings_reply,
@@ -74,7 +76,7 @@ class Node:
             for seq, frame in enumerate(self.source):
                 roundels, detect_us = self._detect(frame)
                 publisher.put(self._message(seq, frame, roundels, detect_us))
-                self.health.count(frame, len(roundels), detect_us)
+                self.health.count(frame, roundels, detect_us)
                 self._seen = frame, roundels
 
     def close(self) -> None:
@@ -162,7 +164,10 @@ class Node:
     def _snapshot(self, query: zenoh.Query) -> bytes:
         if self._seen is None:
             raise RequestError("no frame yet")
-        return encode_jpeg(self._seen[0].image, parse_quality(query.parameters))
+        frame, roundels = self._seen
+        drawn = parse_draw(query.parameters)
+        image = draw_roundels(frame.image, roundels) if drawn else frame.image
+        return encode_jpeg(image, parse_quality(query.parameters))
 
     def _change(self, query: zenoh.Query) -> bytes:
         if query.payload and (payload := query.payload.to_bytes()):

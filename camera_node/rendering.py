@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from camera_node.backdrop import paint_floor, plain_floor, view_floor
 from camera_node.body import Body
 from camera_node.lens import Lens
+from camera_node.pixels import Grey
 from camera_node.pose import Array, invert
 from camera_node.scene import Scene
-from camera_node.source import Grey
 
 Picture = NDArray[np.float32]
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print where the lens lets all light through

@@ -12,7 +12,7 @@ import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.messages import MessageError, Settings, decode, encode
-from camera_node.source import Grey
+from camera_node.pixels import Grey
 
 log = logging.getLogger("camera_node.requests")
 
@@ -39,8 +39,7 @@ def parse_settings(payload: bytes) -> Settings:
             settings = decode(payload, Settings)
     except (msgspec.DecodeError, MessageError, RecursionError) as error:
         raise RequestError(str(error)) from None
-    numbers = [settings.exposure_us, settings.gain, *(x for row in settings.mask or () for x in row)]
-    if not all(x is None or math.isfinite(x) for x in numbers):
+    if not all(x is None or math.isfinite(x) for x in (settings.exposure_us, settings.gain)):
         raise RequestError("settings must be finite")
     if settings.exposure_us is not None and not 0 < settings.exposure_us <= 1e7:
         raise RequestError(f"an exposure of {settings.exposure_us} us is not possible")
@@ -48,11 +47,16 @@ def parse_settings(payload: bytes) -> Settings:
 
 
 def encode_jpeg(image: Grey, quality: int) -> bytes:
-    """A JPEG of an image, at a quality of 1 to 100."""
+    """A JPEG of an image, grey or BGR, at a quality of 1 to 100."""
     ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:
         raise RequestError("the picture could not be written as JPEG")
     return data.tobytes()
+
+
+def parse_draw(parameters: zenoh.Parameters) -> bool:
+    """Whether a snapshot's request asks for the roundels to be drawn: `draw`, or `draw=1`."""
+    return "draw" in parameters and parameters.get("draw") not in ("0", "false")
 
 
 def parse_quality(parameters: zenoh.Parameters) -> int:

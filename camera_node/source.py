@@ -12,11 +12,9 @@ from typing import Literal, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.errors import CameraError, ConfigError
-
-Grey = NDArray[np.uint8]
+from camera_node.pixels import Grey, grey
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,43 +38,50 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class SourceSettings:
-    """How a source is opened; each kind of source takes what it knows.
-
-    Attributes:
-        width, height: of a camera's images, pixels; a camera's own choice unless given.
-        fps: frames a second of a camera, or of a video without `timestamps.csv`.
-        exposure_us: a camera's exposure, microseconds; automatic unless given.
-        gain: a camera's gain, in the driver's units.
-        fourcc: a camera's pixel format, such as MJPG or YUYV.
-        scene: the simulated arena's file.
-        name: the camera's name, by which a simulation knows it.
-        epoch_ns: the Unix time of a simulation's or a recording's time 0.
-        pace: whether recorded frames come when they are due, or as fast as they can be read.
-        stamps: whether recorded frames keep their times, or are moved to now (or by `epoch_ns`, where given).
-    """
+    """How a source is opened; each kind of source takes what it knows."""
 
     width: int | None = None
+    """Image width, pixels (cameras); the driver's choice unless given."""
     height: int | None = None
+    """Image height, pixels (cameras)."""
     fps: float | None = None
+    """Frames a second (cameras, and videos without timestamps.csv)."""
     exposure_us: float | None = None
+    """Exposure, microseconds (cameras); automatic unless given. Short exposures keep moving roundels sharp."""
     gain: float | None = None
+    """Gain in the driver's units (cameras)."""
     fourcc: str | None = None
+    """Pixel format, four letters such as MJPG, YUYV, GREY, "Y10 " or RGGB (cameras)."""
     scene: Path | None = None
-    name: str = "cam0"
+    """The simulated arena (--source sim)."""
     epoch_ns: int | None = None
+    """Unix time of the simulation's, or with --stamps now the recording's, time 0; else it begins now."""
     pace: Literal["recorded", "fast"] = "recorded"
+    """Deliver recorded frames when they are due, or as fast as they are read."""
     stamps: Literal["recorded", "now"] = "recorded"
+    """Keep recorded times as they are, or move them to now, as if the recording were a camera."""
+
+    def check(self) -> None:
+        """Raise ConfigError where a setting can't be."""
+        if self.fourcc is not None and not re.fullmatch("[ -~]{4}", self.fourcc):
+            raise ConfigError(f"--fourcc {self.fourcc} is no pixel format; give four letters such as MJPG")
 
 
-def open_source(text: str, settings: SourceSettings) -> Source:
+def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Source:
     """The source that `--source` names: `sim`, a folder, a video file, or a camera by number, path or name.
+
+    Args:
+        text: what `--source` says.
+        settings: as far as this kind of source knows them.
+        name: the camera's name, by which a simulation knows it.
 
     Raises:
         CameraError: there is no such source, or it does not open.
-        ConfigError: a simulation without a scene.
+        ConfigError: a setting that can't be, or a simulation without a scene.
     """
+    settings.check()
     if text == "sim":
-        return _open_simulation(settings)
+        return _open_simulation(settings, name)
     if Path(text).is_dir():
         return Replay(FolderSource(Path(text)), settings)
     if Path(text).is_file():
@@ -86,13 +91,13 @@ def open_source(text: str, settings: SourceSettings) -> Source:
     return DeviceSource(find_device(text), settings)
 
 
-def _open_simulation(settings: SourceSettings) -> Source:
+def _open_simulation(settings: SourceSettings, name: str) -> Source:
     if settings.scene is None:
         raise ConfigError("--source sim needs an arena: add --scene FILE, such as configs/demo/scene.yaml")
     from camera_node.simulation import SimulatedCamera
 
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
-    return SimulatedCamera(settings.scene, settings.name, epoch_ns)
+    return SimulatedCamera(settings.scene, name, epoch_ns)
 
 
 class FolderSource:
@@ -221,20 +226,15 @@ class Replay:
 
 
 def read_grey(path: Path) -> Grey:
-    """The grey image (h, w) uint8 of a file.
+    """The grey image (h, w) uint8 of a file of 8 to 16 bits.
 
     Raises:
         CameraError: the file is missing or is no image.
     """
     if not path.is_file():
         raise CameraError(f"{path} does not exist; check the path")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    depth = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    image = cv2.imdecode(np.fromfile(path, np.uint8), depth) if path.stat().st_size else None
     if image is None:
         raise CameraError(f"{path} is no image that OpenCV reads; give a PNG or JPEG file")
-    return np.ascontiguousarray(image, np.uint8)
-
-
-def grey(image: NDArray) -> Grey:
-    """The grey levels (h, w) of a grey or BGR image."""
-    image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return np.ascontiguousarray(image, np.uint8)
+    return grey(image)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.body import Body
-from camera_node.config import load_yaml
+from camera_node.config import is_name, load_yaml
 from camera_node.errors import ConfigError
 from fusion.errors import FusionError
 
@@ -93,7 +93,7 @@ def load_robots(path: Path) -> dict[str, Robot]:
     robots = load_yaml(path, _Robots).robots
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
-    if bad := [name for name in robots if not name or set(name) & set("/*$#? ")]:
+    if bad := [name for name in robots if not is_name(name)]:
         raise ConfigError(f"{path}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
     require_distinct(robots, str(path))
     return robots

@@ -5,36 +5,15 @@
 #include <cmath>
 #include <optional>
 
+#include "gates.hpp"
 #include "rays.hpp"
-#include "soften.hpp"
 
 namespace roundel {
 
 namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
-constexpr double kNoise = 3;           // grey levels that a picture may differ by from the model
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
-
-/// The gates that end false positives: contrast, ratio, size, and grey levels as the model says but for
-/// `noise`.
-bool is_roundel(const Fit& fit, const Settings& settings, double noise) {
-    const double contrast = fit.bright - fit.dark;
-    const bool ratio = std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(), [&](double r) {
-        return std::abs(fit.ratio - r) <= settings.ratio_tolerance;
-    });
-    return ratio && contrast >= settings.min_contrast && fit.residual < 0.05 * contrast + noise &&
-           fit.outer.major >= settings.min_diameter && fit.outer.major <= settings.max_diameter;
-}
-
-/// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
-/// softened one.
-std::optional<Fit> fit_roundel(const ImageView& image, const Start& start, const Settings& settings) {
-    const auto fit = refine(image, start);
-    if (fit && is_roundel(*fit, settings, kNoise)) return fit;
-    const auto soft = refine_softened(image, start);
-    return soft && is_roundel(*soft, settings, kNoise * 6 / 16) ? soft : std::nullopt;
-}
 
 }  // namespace
 
@@ -43,6 +22,7 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
     found_.clear();
     if (image.width < 3 || image.height < 3) return found_;
     saturated_ = saturated_share(image);
+    noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
     follow(image);
     search(image);
@@ -91,8 +71,8 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
 /// Fits, tests and keeps a roundel, unless it was found before.
 void Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
     if (!start || found_.size() >= kMaxRoundels || claims_.cover(start->outer.x, start->outer.y)) return;
-    const auto fit = fit_roundel(image, *start, settings_);
-    if (!fit || !is_plain(image, *fit) || is_bullseye(image, *fit)) return;
+    const auto fit = fit_roundel(image, *start, settings_, noise_);
+    if (!fit || is_bullseye(image, *fit)) return;
     claims_.add(fit->outer);
     found_.push_back({*fit, track});
 }

@@ -39,6 +39,7 @@ class Detector {
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
     double saturated_ = 0;
+    double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     std::mutex mutex_;
 };

@@ -9,7 +9,7 @@ namespace roundel {
 
 namespace {
 
-constexpr int kMinRows = 12;  // fewer do not tell an ellipse
+constexpr int kMinRows = 10;  // fewer do not tell an ellipse
 
 /// An ellipse, to be cut by rows.
 class Outline {

@@ -9,7 +9,7 @@ namespace roundel {
 /// Pixels near the edges of one roundel, as columns, in a frame of their own near it. What fills the last
 /// eight has level -1 and does not count.
 struct EdgePixels {
-    static constexpr int kMax = 4096;
+    static constexpr int kMax = 6144;
     int origin_x = 0, origin_y = 0;  // of the frame, pixels of the image
     int count = 0;                   // whole lanes
     int used = 0;                    // pixels inside the image
@@ -18,7 +18,7 @@ struct EdgePixels {
 };
 
 /// Fills `pixels` by what lies within `band` pixels of the three edges that `p` says, in every n-th row: n is
-/// the least that leaves about `limit` pixels or less, or a dozen rows. Gives n.
+/// the least that leaves about `limit` pixels or less, or ten rows. Gives n.
 int select_pixels(const ImageView& image, const Parameters& p, double band, int limit, EdgePixels& pixels);
 
 }  // namespace roundel

@@ -14,6 +14,7 @@ namespace roundel {
 constexpr int kLanes = 8;
 typedef float Lanes __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Bits __attribute__((vector_size(4 * kLanes)));
+typedef uint32_t Words __attribute__((vector_size(4 * kLanes)));  // of which sums may wrap around
 
 ROUNDEL_INLINE Lanes all(float value) { return Lanes{} + value; }
 ROUNDEL_INLINE Lanes load(const float* from) {
@@ -25,7 +26,7 @@ ROUNDEL_INLINE Lanes magnitude(const Lanes& x) { return Lanes(Bits(x) & 0x7fffff
 
 /// 1 / sqrt(x) of x > 0 to 5e-6 of itself: a first guess by halving the exponent, and two of Newton's steps.
 ROUNDEL_INLINE Lanes inverse_sqrt(const Lanes& x) {
-    Lanes y = Lanes(0x5f375a86 - (Bits(x) >> 1));
+    Lanes y = Lanes(0x5f375a86 - (Words(x) >> 1));
     const Lanes half = 0.5f * x;
     y = y * (1.5f - half * y * y);
     return y * (1.5f - half * y * y);
@@ -39,7 +40,7 @@ ROUNDEL_INLINE Lanes exp_negative(const Lanes& x) {
     const Lanes z = x - (shifted - 12582912.0f) * 0.693147181f;
     const Lanes zz = z * z,
                 series = (1.0f + z) + zz * ((0.5f + z * (1.0f / 6)) + zz * (1.0f / 24 + z * (1.0f / 120)));
-    return x < -20.0f ? all(0) : Lanes(Bits(series) + (Bits(shifted) << 23));
+    return x < -20.0f ? all(0) : Lanes(Words(series) + (Words(shifted) << 23));
 }
 
 /// Of the normal distribution: 1 - Phi(t), and exp(-t^2 / 2).

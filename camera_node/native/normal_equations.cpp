@@ -2,7 +2,6 @@
 #include "normal_equations.hpp"
 
 #include <algorithm>
-#include <cmath>
 
 #include "simd.hpp"
 
@@ -15,7 +14,7 @@ constexpr int kHigh = 2, kWide = 4;   // products of so many columns stay in reg
 
 struct Sums {
     Lanes gram[kColumns][kColumns];
-    Lanes w, n, rr, ring, agreeing, m, mm, mrr, mwrr, mpsi;
+    Lanes w, n, rr, ring, ring_rr, agreeing, m, mm, mrr, mwrr, mpsi;
 };
 
 using Columns = Lanes[kColumns][kChunk];
@@ -59,6 +58,7 @@ ROUNDEL_INLINE void weigh(const Gradient& model, const Lanes& level, float per_c
     sums.n += own ? all(1) : all(0);
     sums.rr += own ? r * r : all(0);
     sums.ring += ring;
+    sums.ring_rr += ring * r * r;
     sums.agreeing += w * ring;
     sums.m += m;
     sums.mm += m * (bx * bx + by * by);
@@ -79,14 +79,16 @@ ROUNDEL_CLONES void add_up(const EdgePixels& pixels, const Model& model, float p
     }
 }
 
-ROUNDEL_CLONES int add_residuals(const EdgePixels& pixels, const Model& model, int step, float* residuals) {
+ROUNDEL_CLONES int add_residuals(const EdgePixels& pixels, const Model& model, int step, float* residuals,
+                                 float* slopes) {
     Gradient gradient;
     int n = 0;
-    for (int begin = 0; begin + kLanes <= pixels.used; begin += step * kLanes) {
+    for (int begin = 0; begin + kLanes <= pixels.used; begin += step * kLanes, n += kLanes) {
         model.evaluate(pixels.x + begin, pixels.y + begin, 1, gradient);
-        const Lanes r = load(pixels.level + begin) - gradient.level[0];
-        for (int lane = 0; lane < kLanes; ++lane)
-            if (std::abs(gradient.ring[0][lane]) > model.steepest() / 2) residuals[n++] = std::abs(r[lane]);
+        const Lanes r = magnitude(load(pixels.level + begin) - gradient.level[0]);
+        const Lanes slope = magnitude(gradient.ring[0]);
+        __builtin_memcpy(residuals + n, &r, sizeof r);
+        __builtin_memcpy(slopes + n, &slope, sizeof slope);
     }
     return n;
 }
@@ -102,14 +104,22 @@ NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double
         e.g[i] = sum(sums.gram[i][kCount]);
     }
     e.wrr = sum(sums.gram[kCount][kCount]), e.w = sum(sums.w);
-    e.n = sum(sums.n), e.rr = sum(sums.rr), e.ring = sum(sums.ring), e.agreeing = sum(sums.agreeing);
+    e.n = sum(sums.n), e.rr = sum(sums.rr), e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr),
+    e.agreeing = sum(sums.agreeing);
     e.m = sum(sums.m), e.mm = sum(sums.mm);
     e.mrr = sum(sums.mrr), e.mwrr = sum(sums.mwrr), e.mpsi = sum(sums.mpsi);
     return e;
 }
 
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, int limit, float* residuals) {
-    return add_residuals(pixels, Model(p), (pixels.count + limit - 1) / limit, residuals);
+int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals) {
+    float slopes[kSample + kLanes];
+    const int step = (pixels.count + kSample - 1) / kSample;
+    const int n = add_residuals(pixels, Model(p), step, residuals, slopes);
+    const float steep = n > 0 ? *std::max_element(slopes, slopes + n) / 2 : 0;
+    int kept = 0;
+    for (int k = 0; k < n; ++k)
+        if (slopes[k] > steep) residuals[kept++] = residuals[k];
+    return kept;
 }
 
 }  // namespace roundel

@@ -12,6 +12,7 @@ struct NormalEquations {
     double w, wrr;
     double n, rr;           // of all pixels on the card, unweighed
     double ring, agreeing;  // squared slopes of the ring's edges, and weighed
+    double ring_rr;         // squared residuals times these slopes
     /// Sums of w m and w m^2, m being the squared slope of the level: what a pixel tells of the edges. And of
     /// w m r^2, w^2 m r^2 and m psi', where psi = w r.
     double m, mm, mrr, mwrr, mpsi;
@@ -22,7 +23,10 @@ constexpr float kTukey = 6;
 
 NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double scale);
 
-/// Absolute residuals on the ring's edges, of about `limit` pixels spread over all; gives their number.
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, int limit, float* residuals);
+constexpr int kSample = 192;
+
+/// Absolute residuals where the ring's edges are steep, of about kSample pixels spread over all; gives their
+/// number. There is room for kSample and eight.
+int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals);
 
 }  // namespace roundel

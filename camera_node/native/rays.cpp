@@ -18,7 +18,6 @@ constexpr int kCasts = 2;           // at most; again where the middle or theta 
 constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
 constexpr double kAbsolute = 0.5;   // so many pixels
-constexpr double kHidden = 0.35;    // share of a roundel's inside that something may cover
 
 struct Direction {
     float x, y;
@@ -279,22 +278,25 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
     return ratio && size && start->bright - start->dark > settings.min_contrast / 2 ? start : std::nullopt;
 }
 
-bool is_plain(const ImageView& image, const Fit& fit) {
+Surface inspect(const ImageView& image, const Fit& fit) {
     const Ellipse& e = fit.outer;
-    const double thickness = (1 - fit.ratio) * e.minor / 2,
-                 edge = 2 * fit.blur;  // beyond it, levels are plain
-    const double reach = 0.3 * (fit.bright - fit.dark);
-    int seen = 0, off = 0;
-    const auto test = [&](double scale, double level) {
-        for (const float value : levels_on(image, e, scale))
-            if (value >= 0) ++seen, off += std::abs(double(value) - level) > reach;
+    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // beyond it, levels are plain
+    const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
+    Surface surface;
+    const auto test = [&](double scale, bool dark) {
+        for (const float value : levels_on(image, e, scale)) {
+            if (value < 0) continue;
+            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
+            const bool off = std::abs(share - (dark ? 0 : 1)) > 0.3;
+            ++surface.seen, surface.off += off, surface.ring_off += off && dark;
+        }
     };
     for (const double share : {0.25, 0.5, 0.75})
-        if (std::min(share, 1 - share) * thickness > edge)
-            test(fit.ratio + share * (1 - fit.ratio), fit.dark);
+        if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
     for (const double share : {0.2, 0.5, 0.8})
-        if ((1 - share) * fit.ratio * e.minor / 2 > edge) test(share * fit.ratio, fit.bright);
-    return off <= kHidden * seen;
+        if ((1 - share) * hole > edge) test(share * fit.ratio, false);
+    test(1 + 2.2 * edge / e.minor, false);  // just outside
+    return surface;
 }
 
 bool is_bullseye(const ImageView& image, const Fit& fit) {

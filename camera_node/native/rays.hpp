@@ -15,9 +15,12 @@ namespace roundel {
 /// where fewer than nine of either kind agree or the ratio or the size is no roundel's.
 std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const Settings& settings);
 
-/// Whether a roundel is dark all over between its circles and bright in its hole. The fit looks only near the
-/// edges, so it takes several thin rings for a thick one where the light between them is blurred.
-bool is_plain(const ImageView& image, const Fit& fit);
+/// Of samples in the ring, which is dark, and in the hole and just outside, which are bright: how many are
+/// seen, how many are off by a third of the contrast, and how many of these are in the ring.
+struct Surface {
+    int seen = 0, off = 0, ring_off = 0;
+};
+Surface inspect(const ImageView& image, const Fit& fit);
 
 /// Whether two more dark rings lie around a roundel within four of its diameters, which makes it a bullseye.
 /// One may be a plate that it stands on, or the line that its card was cut along.

@@ -14,15 +14,19 @@ namespace {
 
 constexpr double kBand = 2.5;       // pixels on either side of an edge that are used, at the least
 constexpr double kBandBlurs = 2.5;  // blurs, likewise
-constexpr int kCoarsePixels = 300;
+constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
-constexpr int kSample = 128;
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
 constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kStartBlur = 0.8;
 constexpr double kCardRatio = 9.0 / 7;
+constexpr double kBeyond = 64;     // grey levels off the scale that a small or clipped roundel may need
+constexpr double kPrint = 0.002;   // standard deviation of ratios among prints of one kind
+constexpr double kOtherPrint = 3;  // standard deviations
+constexpr double kStrict = 0.5;    // of it at first, when the model still bends to what it disagrees with
+constexpr double kSlack = 1.3;     // of a median of few, over the deviation it stands for
 constexpr double kShortestFocal = 400;  // pixels: no lens shows more perspective
 
 /// Starting values: A is the symmetric square root that maps the unit circle to the ellipse.
@@ -63,43 +67,64 @@ class Fitter {
         // Perspective moves the inner edge and the card's from where the start has them.
         const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
         if (!select(kBand + unknown, kCoarsePixels)) return false;
-        scale_ = start_scale();
-        if (!iterate()) return false;
-        if (step_ == 1 && p[kBlur] * kBandBlurs < kBand) return true;
-        return select(std::max(kBand, kBandBlurs * p[kBlur]), EdgePixels::kMax) && iterate();
+        p[kGround] = start_[kGround] = level_beyond_card();
+        if (!iterate(2)) return false;
+        const double band = std::max(kBand, kBandBlurs * p[kBlur]);
+        if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
+        return iterate(1);
     }
 
+    void learn_print(double ratio);
     Fit fit() const;
     Parameters p;
 
   private:
+    PoseCovariance covariance() const;
+
     bool select(double band, int limit) {
         step_ = select_pixels(image_, p, band, limit, pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
+    /// The mean level of what lies beyond the card's edge; the bright one where nothing does.
+    double level_beyond_card() const {
+        const double det = p[kAxx] * p[kAyy] - square(p[kAxy]);
+        const float xx = float(p[kAyy] / det), xy = float(-p[kAxy] / det), yy = float(p[kAxx] / det);
+        const float x0 = float(p[kX]), y0 = float(p[kY]), edge = float(square(p[kCard]));
+        float sum = 0, n = 0;
+        for (int k = 0; k < pixels_.used; ++k) {
+            const float dx = pixels_.x[k] - x0, dy = pixels_.y[k] - y0;
+            const float qx = xx * dx + xy * dy, qy = xy * dx + yy * dy;
+            if (qx * qx + qy * qy > edge) sum += pixels_.level[k], n += 1;
+        }
+        return n > 0 ? double(sum / n) : p[kBright];
+    }
+
     /// The median of the residuals of a sample of the ring's edges (1.48 of it is a standard deviation).
-    double start_scale() const {
+    double edge_scale() const {
         float residuals[kSample + kLanes];
-        const int n = sample_residuals(pixels_, p, kSample, residuals);
+        const int n = sample_residuals(pixels_, p, residuals);
         if (n < kLanes) return (p[kBright] - p[kDark]) / 4;
         std::nth_element(residuals, residuals + n / 2, residuals + n);
         return std::max(kNoiseFloor, 1.48 * residuals[n / 2]);
     }
 
-    /// Steps until one's own error, of the order of its square over the blur, is small against the standard
-    /// deviation.
-    bool iterate() {
+    /// Steps until what is left, of the order of one's square over the blur, will be small against the
+    /// standard deviation `ahead` steps later.
+    bool iterate(int ahead) {
         for (int k = 0; k < kMaxSteps; ++k) {
-            const double used = scale_;
+            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * edge_scale());
             sums_ = accumulate(pixels_, p, used);
             add_prior();
-            const Cholesky<kCount> factor(sums_.H);
-            if (!factor.positive()) return false;
-            const double moved = advance(factor);
+            factor_.emplace(sums_.H);
+            if (!factor_->positive()) return false;
+            const double moved = advance();
             if (!is_sane()) return false;
             const double deviation = noise_ / std::sqrt(sums_.H[kX][kX] + sums_.H[kY][kY]);
-            if (moved * moved < 0.2 * p[kBlur] * deviation && scale_ > 0.7 * used) return true;
+            double left = moved;
+            for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
+            if (left < 0.2 * deviation && (ahead > 1 || (is_noise_known_ && scale_ > 0.7 * used)))
+                return true;
         }
         return true;
     }
@@ -114,28 +139,36 @@ class Fitter {
     }
 
     /// Takes a step, foretells the residuals after it, and gives its greatest move in pixels.
-    double advance(const Cholesky<kCount>& factor) {
-        const Parameters delta = factor.solve(sums_.g);
-        double moved = std::abs(delta[kBlur]), fall = 0;
-        for (int i = 0; i < kCount; ++i) p[i] += delta[i], fall += delta[i] * sums_.g[i];
-        for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
+    double advance() {
+        const Parameters delta = factor_->solve(sums_.g);
+        for (int i = 0; i < kCount; ++i) p[i] += delta[i];
         p[kBlur] = std::max(p[kBlur], kMinBlur);
-        update_noise(fall);
+        update_noise(delta);
+        double moved = std::abs(delta[kBlur]);
+        for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
         return moved;
     }
 
-    /// What residuals on the edges are left when a step takes `fall` off the sum of squares, most of it
-    /// there; `freedom` is the share of them that the unknowns do not follow.
-    void update_noise(double fall) {
-        const double left = sums_.mm / sums_.m * fall;
+    /// What residuals on the edges are left after a step. It takes delta^T H delta off the sum of squares;
+    /// what belongs to the levels and to the blur is elsewhere. `freedom` is the share that the unknowns do
+    /// not follow.
+    void update_noise(const Parameters& delta) {
+        double all = 0, edges = 0;
+        for (int i = 0; i < kCount; ++i)
+            for (int j = 0; j < kCount; ++j) {
+                const double part = delta[i] * sums_.H[std::max(i, j)][std::min(i, j)] * delta[j];
+                all += part, edges += i > kBlur && j > kBlur ? part : 0;
+            }
+        const double left = sums_.mm / sums_.m * edges;
         const double freedom = std::max(0.1, 1 - kEdgeUnknowns * sums_.mm / square(sums_.m));
         const double slope = std::max(0.5, sums_.mpsi / sums_.m);
         // After a long step what is left is too small a difference to be trusted.
+        is_noise_known_ = left < sums_.mwrr / 4;
         const double mrr = std::max(sums_.mrr / 4, sums_.mrr - left);
         const double mwrr = std::max(sums_.mwrr / 4, sums_.mwrr - left);
         scale_ = std::max(kNoiseFloor, kScale * std::sqrt(mrr / (sums_.m * freedom)));
         noise_ = std::max(kNoiseFloor, std::sqrt(mwrr / (sums_.m * freedom)) / slope);
-        agreeing_ = std::sqrt(std::max(0.0, sums_.wrr - fall) / std::max(1.0, sums_.w));
+        agreeing_ = std::sqrt(std::max(0.0, sums_.wrr - all) / std::max(1.0, sums_.w));
     }
 
     bool is_sane() const {
@@ -144,6 +177,7 @@ class Fitter {
         return std::hypot(p[kX] - start_[kX], p[kY] - start_[kY]) < 1 + 0.1 * std::sqrt(size) &&
                p[kAxx] > 0 && area > square(0.7) && area < square(1.4) && p[kRatio] > 0.1 &&
                p[kRatio] < 0.95 && p[kBlur] < 3 + 0.1 * std::sqrt(size) && p[kCard] > 1 &&
+               p[kDark] > -kBeyond && p[kBright] < 255 + kBeyond &&
                square(p[kGx]) + square(p[kGy]) < square(0.5 / p[kCard]);
     }
 
@@ -151,43 +185,68 @@ class Fitter {
     EdgePixels pixels_;
     Parameters start_, prior_;
     NormalEquations sums_;
+    std::optional<Cholesky<kCount>> factor_;
+    Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
     int step_ = 1;
-    double scale_ = 0, noise_ = 0, agreeing_ = 0;
+    bool is_noise_known_ = false;
+    double scale_ = 255, noise_ = 0, agreeing_ = 0;
 };
 
-/// The outer ellipse's centre and the disc's own less it, by the pose: e = c - A g, to first order in g.
-std::array<Vector<kCount - kPose>, 4> centres_by_pose(const Parameters& p) {
+/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
+/// first order in g.
+std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
     const double gx = p[kGx], gy = p[kGy];
-    const Vector<7> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
-    std::array<Vector<7>, 4> T{};
-    T[2] = hx, T[3] = hy;
-    for (int k = 0; k < 7; ++k) T[0][k] = (k == 0) - hx[k], T[1][k] = (k == 1) - hy[k];
+    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
+    std::array<Vector<kPoseCount>, kPoseCount> T{};
+    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
+    for (int k = 0; k < 5; ++k) T[k][k] += 1;
     return T;
+}
+
+/// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
+void Fitter::learn_print(double ratio) {
+    Parameters unit{};
+    unit[kRatio] = square(noise_);
+    const Parameters with = factor_->solve(unit);  // covariance of all with the ratio
+    const double off = ratio - p[kRatio], variance = with[kRatio] + square(kPrint);
+    if (square(off) > square(kOtherPrint) * variance) return;
+    for (int i = 0; i < kCount; ++i) p[i] += with[i] * off / variance;
+    for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
+}
+
+PoseCovariance Fitter::covariance() const {
+    auto inverse = factor_->inverse_tail<kPoseCount>();
+    for (int i = 0; i < kPoseCount; ++i)
+        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
+    const auto T = outputs_by_pose(p);
+    PoseCovariance half{}, whole{};
+    for (int a = 0; a < kPoseCount; ++a)
+        for (int i = 0; i < kPoseCount; ++i)
+            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
+    for (int a = 0; a < kPoseCount; ++a)
+        for (int b = 0; b < kPoseCount; ++b)
+            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
+    return whole;
 }
 
 Fit Fitter::fit() const {
     const CircleImage outer = circle_image(p, 1);
     const Eigen axes = eigen(outer.shape);
-    const auto inverse = Cholesky<kCount>(sums_.H).inverse_tail<kCount - kPose>();
-    const auto T = centres_by_pose(p);
-    const auto covariance = [&](int a, int b) {
-        double c = 0;
-        for (int i = 0; i < 7; ++i)
-            for (int j = 0; j < 7; ++j) c += T[a][i] * inverse[i][j] * T[b][j];
-        return square(noise_) * c;
-    };
+    const PoseCovariance C = covariance();
     return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                       2 * std::sqrt(axes.second), axes.angle},
-            .covariance = {covariance(0, 0), covariance(0, 1), covariance(1, 1)},
+            .covariance = {C[0][0], C[0][1], C[1][1]},
             .offset_x = p[kX] - outer.x,
             .offset_y = p[kY] - outer.y,
-            .offset_covariance = {covariance(2, 2), covariance(2, 3), covariance(3, 3)},
+            .offset_covariance = {C[5][5], C[5][6], C[6][6]},
+            .pose_covariance = C,
             .ratio = p[kRatio],
             .card = p[kCard],
             .dark = p[kDark],
             .bright = p[kBright],
             .blur = p[kBlur],
             .residual = std::sqrt(sums_.rr / std::max(1.0, sums_.n)),
+            .edge_residual = std::sqrt(sums_.ring_rr / sums_.ring),
             .agreeing_residual = agreeing_,
             .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};
 }
@@ -197,6 +256,7 @@ Fit Fitter::fit() const {
 std::optional<Fit> refine(const ImageView& image, const Start& start) {
     Fitter fitter(image, start);
     if (!fitter.solve()) return std::nullopt;
+    if (start.print > 0) fitter.learn_print(start.print);
     return fitter.fit();
 }
 

@@ -13,7 +13,7 @@ namespace roundel {
 ///
 /// The pose stands last, so that its covariance is the last block of a Cholesky factor.
 enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
-constexpr int kCount = kGy + 1, kPose = kX;  // the pose begins here
+constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
 using Parameters = Vector<kCount>;
 using Matrix = std::array<Parameters, kCount>;
 
@@ -74,9 +74,6 @@ class Model {
         blur_edge(at, card_, count, card);
         for (int k = 0; k < count; ++k) differentiate(at, outer, inner, card, k, to);
     }
-
-    /// Change of level a pixel, in the middle of the ring's edges.
-    float steepest() const { return -fall_ * peak_; }
 
   private:
     /// Where pixels are: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the shift of

@@ -45,6 +45,8 @@ std::optional<Fit> refine_softened(const ImageView& image, const Start& start) {
     fit->outer.x += left, fit->outer.y += top;
     fit->covariance = fit->covariance.scaled(kHidden);
     fit->offset_covariance = fit->offset_covariance.scaled(kHidden);
+    for (auto& row : fit->pose_covariance)
+        for (double& value : row) value *= kHidden;
     return fit;
 }
 

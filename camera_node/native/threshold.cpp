@@ -17,6 +17,24 @@ double saturated_share(const ImageView& image) {
     return double(count) / (double(image.width) * ((image.height + 7) / 8));
 }
 
+double noise_level(const ImageView& image) {
+    constexpr int kPatches = 16;                       // each way, of 8 x 4 pixels
+    constexpr double kFlat = 0.05, kDeviations = 2.9;  // the flattest twentieth of noise spans so many
+    std::vector<int> spans;
+    for (int k = 0; k < kPatches * kPatches; ++k) {
+        const int x = (image.width - 8) * (k % kPatches) / kPatches;
+        const int y = (image.height - 4) * (k / kPatches) / kPatches;
+        uint8_t low = 255, high = 0;
+        for (int v = std::max(y, 0); v < std::min(y + 4, image.height); ++v)
+            for (int u = std::max(x, 0); u < std::min(x + 8, image.width); ++u)
+                low = std::min(low, image.row(v)[u]), high = std::max(high, image.row(v)[u]);
+        spans.push_back(high - low);
+    }
+    const auto flat = spans.begin() + ptrdiff_t(kFlat * double(spans.size()));
+    std::nth_element(spans.begin(), flat, spans.end());
+    return std::clamp(*flat / kDeviations, 1.0, 8.0);
+}
+
 void Theta::settle(double dark, double bright) {
     value_ = (dark + bright) / 2;
     steps_ = 1;

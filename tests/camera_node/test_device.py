@@ -70,6 +70,8 @@ def test_settings_become_properties_in_the_order_that_v4l2_needs():
         (cv2.CAP_PROP_GAIN, 8),
     ]
     assert properties(SourceSettings()) == []
+    raw = [(cv2.CAP_PROP_FOURCC, 0x20303159), (cv2.CAP_PROP_CONVERT_RGB, 0)]
+    assert properties(SourceSettings(fourcc="Y10 ")) == raw
     assert properties(SourceSettings(exposure_us=1))[1] == (cv2.CAP_PROP_EXPOSURE, 1)
 
 

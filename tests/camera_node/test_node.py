@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from camera_node.detector import Detector
 from camera_node.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
 from camera_node.node import Node
 from camera_node.source import SourceSettings, open_source
@@ -151,6 +152,13 @@ def test_a_snapshot_is_a_picture(network, inbox, running, slow):
     assert np.abs(image.astype(int) - render()).max() <= 8
     assert len(ask(router, KEYS.snapshot("cam0") + "?quality=5")[1]) < len(data)
     assert not ask(router, KEYS.snapshot("cam0") + "?quality=best")[0]
+    drawn = cv2.imdecode(
+        np.frombuffer(ask(router, KEYS.snapshot("cam0") + "?draw")[1], np.uint8), cv2.IMREAD_COLOR
+    )
+    assert drawn is not None
+    assert (
+        drawn.max(axis=2).astype(int) - drawn.min(axis=2)
+    ).max() > 100  # colours: the ellipse and its number
 
 
 def test_settings_are_told_and_taken(network, inbox, running, slow):
@@ -160,10 +168,13 @@ def test_settings_are_told_and_taken(network, inbox, running, slow):
     statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
     running(slow)
     assert got.until(lambda items: items and len(items[-1]) == 1)
-    assert decode(ask(router, key)[1], Settings) == Settings(mask=())
-    ok, reply = ask(router, key, b'{"mask": [[100, 100, 200, 200]]}')
+    first = decode(ask(router, key)[1], Settings)
+    assert first == Settings(**Detector().settings)
+    ok, reply = ask(router, key, b'{"mask": [[[100, 100], [200, 100], [200, 200], [100, 200]]]}')
     assert ok
-    assert msgspec.json.decode(reply, type=Settings).mask == ((100, 100, 200, 200),)
+    assert msgspec.json.decode(reply, type=Settings).mask == (
+        ((100, 100), (200, 100), (200, 200), (100, 200)),
+    )
     assert got.until(lambda items: len(items[-1]) == 0)
     assert ask(router, key, encode(Settings(mask=(), min_contrast=20)))[0]
     assert got.until(lambda items: len(items[-1]) == 1)
@@ -174,7 +185,9 @@ def test_settings_are_told_and_taken(network, inbox, running, slow):
         b'{"exposure_us": -1}',
         b'{"min_contrast": 0}',
         b"{" * 5000,
-        b'{"mask": [[0, 0, 1e999, 1]]}',
+        b'{"mask": [[[0, 0], [1, 1]]]}',
+        b'{"mask": [[[0, 0], [1e999, 1], [1, 1]]]}',
+        b'{"ratio_tolerance": 0}',
     ]
     for payload in bad:
         ok, reply = ask(router, key, payload)

@@ -32,7 +32,7 @@ class Benchmark:
         tyro.conf.Positional,
     ] = ("all",)
     """What to measure."""
-    detector: tuple[str, ...] = ("paper",)
+    detector: tuple[str, ...] = ("chords",)
     """Which detectors, as `Detector(detector=...)` takes them."""
     thorough: bool = False
     """The whole grid and many more draws, for hours, rather than two minutes."""

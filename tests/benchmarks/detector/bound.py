@@ -2,29 +2,38 @@
 """The Cramer-Rao bound of a roundel's centre and distance: what no unbiased detector can do better.
 
 The unknowns are the five of the pose, the dark, bright and ground levels, and the blur; their derivatives are those of
-the ray-traced picture, by central differences.
+the ray-traced picture, by central differences. Who does not know the lens has two more: the inner circle's image may
+then lie anywhere in the outer one's, as the unknown place of the optical axis has it.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
+from camera_node.lens import Lens
 from tests.camera_node.tracing import Array, Sight, ellipse_of, trace
 
+AXIS_PX = 20.0  # a step of the optical axis: the inner circle moves by far less than a pixel
 ROUNDING = 1 / 12  # variance that 8 bits add, square grey levels
 
 
 @dataclass(frozen=True)
 class Bound:
-    """For noise of one grey level: covariance (2, 2) of the ellipse's centre, and the distance's relative variance."""
+    """For noise of one grey level: covariance (2, 2) of the ellipse's centre, and the distance's relative variance.
+
+    `without_lens` is the covariance for who does not know the lens.
+    """
 
     centre: Array
+    without_lens: Array
     distance: float
 
-    def centre_variance(self, noise: float) -> float:
+    def centre_variance(self, noise: float, knows_lens: bool = True) -> float:
         """Of one coordinate, the mean of both, square pixels, with the rounding to grey levels."""
-        return float(np.trace(self.centre)) / 2 * (noise**2 + ROUNDING)
+        cov = self.centre if knows_lens else self.without_lens
+        return float(np.trace(cov)) / 2 * (noise**2 + ROUNDING)
 
     def distance_variance(self, noise: float) -> float:
         """Of the distance over itself."""
@@ -39,8 +48,11 @@ def bound(sight: Sight, pieces: int) -> Bound:
         grey.append((trace(ahead, pieces) - trace(behind, pieces)).ravel() / 2)
         centre.append((ellipse_of(ahead)[0] - ellipse_of(behind)[0]) / 2)
     J, c = np.array(grey), np.array(centre)
-    cov = np.linalg.inv(J @ J.T)  # in steps
-    return Bound(c.T @ cov @ c, float(cov[2, 2]) * _distance_step(sight) ** 2)
+    information = J @ J.T  # in steps
+    known = np.s_[:-2, :-2]
+    cov, blind = np.linalg.inv(information[known]), np.linalg.inv(information)
+    distance = float(cov[2, 2]) * _distance_step(sight) ** 2
+    return Bound(c[:-2].T @ cov @ c[:-2], c.T @ blind @ c, distance)
 
 
 def _distance_step(sight: Sight) -> float:
@@ -65,3 +77,9 @@ def _moves(sight: Sight) -> Iterator[Callable[[float], Sight]]:
     for level in ("dark", "bright", "ground"):
         yield lambda k, level=level: replace(sight, **{level: getattr(sight, level) + k})
     yield lambda k: replace(sight, blur=sight.blur + 0.02 * k)
+    for axis in ("cx", "cy"):
+        yield lambda k, axis=axis: replace(sight, lens=_shifted(sight.lens, axis, AXIS_PX * k))
+
+
+def _shifted(lens: Lens, axis: str, by: float) -> Lens:
+    return msgspec.structs.replace(lens, **{axis: getattr(lens, axis) + by})

@@ -50,10 +50,9 @@ def print_verdicts(console: Console, name: str, verdicts: Iterable[Verdict]) -> 
 
 
 def milliseconds(work: Callable[[], object], seconds: float) -> float:
-    """The least processor time of one call, after a warm-up."""
-    work()
+    """The least processor time of one call."""
     times, end = [], time.perf_counter() + seconds
-    while time.perf_counter() < end or len(times) < 3:
+    while time.perf_counter() < end or len(times) < 2:
         start = time.thread_time_ns()
         work()
         times.append(time.thread_time_ns() - start)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a wand's bundle adjustment is about: observations, unknowns, and what stays the same."""
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.trajectory import AffineWand
+from camera_node.lens import Lens
+from camera_node.pose import rotation_from_vector
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
+POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Marker centres, one row each.
+
+    Attributes:
+        camera: (n,) index of the camera.
+        knot: (n,) the instant they belong to.
+        label: (n,) marker of the wand.
+        t_s: (n,) stamp, seconds.
+        uv: (n, 2) raw pixels, where the disc's own centre is seen.
+        cov: (n, 2, 2) covariance of `uv`.
+        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
+    """
+
+    camera: Index
+    knot: Index
+    label: Index
+    t_s: Array
+    uv: Array
+    cov: Array
+    axes_px: Array
+    angle_rad: Array
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def select(self, rows: NDArray) -> "Observations":
+        """The rows that a mask or an index array names."""
+        return Observations(*(getattr(self, name)[rows] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The unknowns.
+
+    Attributes:
+        cameras: (C, 4, 4) T_world_cam.
+        clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
+        lenses: (C, 4) log of the focal lengths' factor, and what is added to cx, cy and k1.
+        motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots.
+    """
+
+    cameras: Array
+    clocks: Array
+    lenses: Array
+    motion: Array
+
+    @classmethod
+    def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
+        """Cameras and motion, clocks without drift, lenses as they are given."""
+        clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
+        return cls(cameras, clocks, np.zeros((len(cameras), 4)), motion)
+
+    def moved(self, by: Array, along: Array) -> "State":
+        """Cameras changed by `by` (C, 12), turned and shifted in their own frames, the motion by `along` (K, 6 B)."""
+        cameras = self.cameras.copy()
+        for T, xi in zip(cameras, by, strict=True):
+            T[:3, 3] += T[:3, :3] @ xi[3:6]
+            T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
+        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:]
+        return State(cameras, clocks, lenses, self.motion + along.reshape(self.motion.shape))
+
+    def lens(self, camera: int, lens: Lens) -> Lens:
+        """The camera's lens, as adjusted."""
+        scale, cx, cy, k1 = self.lenses[camera].tolist()
+        if not any((scale, cx, cy, k1)):
+            return lens
+        rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
+        factor = float(np.exp(scale))
+        return msgspec.structs.replace(
+            lens,
+            fx=lens.fx * factor,
+            fy=lens.fy * factor,
+            cx=lens.cx + cx,
+            cy=lens.cy + cy,
+            distortion=(rest[0] + k1, *rest[1:]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What stays the same from iteration to iteration.
+
+    Attributes:
+        lenses: of the C cameras.
+        wand: in affine coordinates.
+        knot_s: (K,) ascending, K >= 2.
+        gap_s: knots further apart say nothing of each other.
+        density: power spectral density of the wand's acceleration, m^2/s^3.
+        middle_s: the stamp to which time offsets refer.
+        free: which of a camera's 12 parameters are sought.
+        fixed_distance: two cameras and their distance, where no wand length carries the scale.
+        sought: the cameras that are sought; the others stand where they stand. All, unless given.
+    """
+
+    lenses: list[Lens]
+    wand: AffineWand
+    knot_s: Array
+    gap_s: float
+    density: float
+    middle_s: float
+    free: tuple[int, ...] = POSE
+    fixed_distance: tuple[int, int, float] | None = None
+    sought: tuple[int, ...] | None = None
+
+    def cameras(self) -> tuple[int, ...]:
+        """The cameras that are sought."""
+        return tuple(range(len(self.lenses))) if self.sought is None else self.sought
+
+    def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
+        """The same with other parameters sought."""
+        return replace(self, free=tuple(sorted(sum(parameters, ()))))
+
+
+def skew(v: Array) -> Array:
+    """(..., 3, 3) the matrix of the cross product with v (..., 3)."""
+    S = np.zeros((*v.shape, 3))
+    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return S - np.swapaxes(S, -1, -2)
+
+
+def unobserved(state: State, free: tuple[int, ...]) -> Array:
+    """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
+    columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
+    for T, rows in zip(state.cameras, columns, strict=True):
+        R, p = T[:3, :3], T[:3, 3]
+        rows[:6, :6] = np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]])
+        rows[6, 6] = rows[7, 7] = 1.0
+    kept = [g for g in range(8) if g < 6 or g in free]
+    return columns[:, free][:, :, kept].reshape(-1, len(kept))

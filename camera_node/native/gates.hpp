@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <optional>
+
+#include "image.hpp"
+#include "paper.hpp"
+#include "refine.hpp"
+
+namespace roundel {
+
+/// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
+/// softened one; nothing where neither passes the gates that end false positives.
+std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise);
+
+}  // namespace roundel

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The parts of the adjustment: derivatives by differences, discs' centres, trial shifts."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from calib.discs import displacement
+from calib.errors import CalibrationError
+from calib.labelling import label
+from calib.linearisation import Linearisation
+from calib.pairwise import Pairs
+from calib.problem import DRIFT, LENS, OFFSET, POSE
+from calib.rig import Rig
+from calib.sightings import gather
+from calib.trajectory import hermite_rate, interpolate, locate
+from calib.wand import calibrate
+from camera_node.body import Body
+from tests.calib.synthetic import outlines, record, ring
+from tests.calib.wave import Recorded, Wave
+from tests.calib.wave import record as record_wave
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    return record_wave(Wave(cameras=6, seconds=15.0, rate_hz=30.0, seed=3))
+
+
+def test_jacobians_are_those_of_the_residuals():
+    """By central differences: the error is of second order in the step, 1e-5 of the largest entry at most."""
+    arena = ring(3)
+    result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
+    problem = result.adjusted.problem.freeing(POSE, OFFSET, DRIFT, LENS)
+    linear, state = Linearisation(problem, result.observations), result.adjusted.state
+    along = np.zeros((len(state.motion), state.motion[0].size))
+    J = linear._jacobians(state)[1]
+    for parameter, step in enumerate([1e-6] * 6 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-5]):
+        by = np.zeros((len(state.cameras), 12))
+        by[:, parameter] = step
+        there, here = (linear.residuals(state.moved(sign * by, along)) for sign in (1, -1))
+        expected = -(there - here) / (2 * step)
+        assert J[:, :, parameter] == pytest.approx(expected, abs=1e-3 * np.abs(expected).max() + 1e-6)
+
+
+def test_velocity_is_the_derivative_of_position():
+    """Also beyond the knots; in between, of third order."""
+    knot_s, t_s, step = np.array([0.0, 0.1, 0.25, 1.0]), np.array([-0.03, 0.02, 0.13, 0.2, 0.4, 1.02]), 1e-6
+    place = locate(knot_s, t_s, 0.3)
+    change = interpolate(knot_s, t_s + step, place) - interpolate(knot_s, t_s - step, place)
+    assert hermite_rate(knot_s, t_s, place) == pytest.approx(change / (2 * step), abs=1e-6)
+    assert place.inside.tolist() == [False, True, True, True, False, False]
+
+
+def test_ellipses_centres_lie_off_discs_centres_by_what_perspective_does():
+    """Against the outline's exact conic: without distortion there is no other cause. About D^2/4f sin t cos t."""
+    lens = msgspec.structs.replace(ring(3).truth.cameras["cam0"], distortion=())
+    points, tilt = np.array([[0.2, -0.1, 2.0], [0.0, 0.0, 1.5]]), np.radians(45)
+    normals = np.array([[0.0, np.sin(tilt), -np.cos(tilt)], [np.sin(tilt), 0.0, -np.cos(tilt)]])
+    uv = outlines(lens, points, normals, 0.06)[0]
+    off = displacement(lens, points, normals, 0.06)
+    assert off == pytest.approx(uv - lens.project(points), abs=1e-9)
+    D = lens.fx * 0.12 / 1.5
+    assert np.linalg.norm(off[1]) == pytest.approx(D**2 / (4 * lens.fx) / 2, rel=0.02)
+
+
+def test_clocks_far_apart_are_found_before_anything_else_is_known(recorded: Recorded):
+    """To a few milliseconds, from which the adjustment converges; a frame lasts 33."""
+    names = sorted(recorded.truth.cameras)
+    lenses = [recorded.truth.cameras[n] for n in names]
+    frames, seen = gather(recorded.messages, names, lenses)
+    labelled, _ = label(frames, seen, Wave().wand, lenses)
+    pairs = Pairs(labelled, lenses, Wave().wand, frames.period_s())
+    shared = np.triu(pairs.shared(), 1)
+    for a, b in np.argwhere(shared > 40):
+        pair = pairs.relate(int(a), int(b))
+        assert pair is not None
+        expected = lenses[a].time_offset_ms - lenses[b].time_offset_ms
+        assert pair.shift_s * 1e3 == pytest.approx(expected, abs=6)
+
+
+def test_a_jump_of_the_wand_costs_no_sighting():
+    """A third of a second is cut out of the count: what all cameras agree on stays."""
+    wave = Wave(
+        cameras=6, seconds=8.0, rate_hz=30.0, offset_ms=0, drift_ppm=0, free_running=False, outliers=0, seed=3
+    )
+    recorded = record_wave(wave)
+    first, cut = min(m.t_ns for m in recorded.messages), 300_000_000
+    late = [m for m in recorded.messages if m.t_ns - first >= 3_000_000_000 + cut]
+    early = [m for m in recorded.messages if m.t_ns - first < 3_000_000_000]
+    closed = early + [msgspec.structs.replace(m, t_ns=m.t_ns - cut) for m in late]
+    result = calibrate(recorded.intrinsics, wave.wand, closed)
+    assert len(result.names) == 6
+    assert result.adjusted.used.mean() > 0.98
+    assert not result.time_offset_ms.any()
+
+
+def test_clocks_and_lenses_are_adjusted_where_the_data_say_so(recorded: Recorded):
+    """Offsets within four standard deviations and 0.3 ms; a focal length that is two percent off is found, to three
+    times its standard deviation of 0.2 %; true lenses stay as they are given."""
+    result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
+    truth = np.array([recorded.truth.cameras[n].time_offset_ms for n in result.names])
+    error = result.time_offset_ms - truth
+    error -= error.mean()
+    assert (np.abs(error) < np.minimum(4 * result.time_sigma_ms, 0.3)).all()
+    assert not result.adjusted.state.lenses.any()
+    wrong = scale_focal(recorded, "cam02", 1.02)
+    result = calibrate(wrong, Wave().wand, recorded.messages)
+    assert result.rig.cameras["cam02"].fx == pytest.approx(recorded.truth.cameras["cam02"].fx, rel=0.006)
+
+
+def scale_focal(recorded: Recorded, name: str, factor: float) -> Rig:
+    camera = recorded.intrinsics.cameras[name]
+    wrong = msgspec.structs.replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    return Rig(cameras={**recorded.intrinsics.cameras, name: wrong})
+
+
+def test_files_that_the_wave_contradicts_are_named(recorded: Recorded):
+    rig, wand = recorded.intrinsics, Wave().wand
+    with pytest.raises(CalibrationError, match="'cam02' has the wrong intrinsics"):
+        calibrate(scale_focal(recorded, "cam02", 1.1), wand, recorded.messages)
+    swapped = {**rig.cameras, "cam00": rig.cameras["cam03"], "cam03": rig.cameras["cam00"]}
+    with pytest.raises(CalibrationError, match="'cam00' and 'cam03' seem to have each other's names"):
+        calibrate(Rig(cameras=swapped), wand, recorded.messages)
+    longer = Body(diameter_m=wand.diameter_m, markers=tuple((1.08 * x, y, z) for x, y, z in wand.markers))
+    with pytest.raises(CalibrationError, match="lengths and its roundels' sizes disagree"):
+        calibrate(rig, longer, recorded.messages)

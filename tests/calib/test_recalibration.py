@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One camera is placed anew against a rig in force, honestly, and the others stay."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calib.errors import CalibrationError
+from calib.recalibration import place_one
+from calib.rig import Rig
+from tests.calib.wave import Recorded, Wave, record
+
+NAME = "cam02"
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    """Free-running cameras whose clocks are up to 150 ms apart and do not drift."""
+    return record(Wave(cameras=6, seconds=8.0, rate_hz=30.0, drift_ppm=0.0, seed=3))
+
+
+def without(rig: Rig, name: str) -> Rig:
+    """The rig with a camera of which only the lens is known."""
+    bare = msgspec.structs.replace(rig.cameras[name], T_world_cam=None, time_offset_ms=0.0)
+    return Rig(cameras={**rig.cameras, name: bare})
+
+
+def test_a_camera_is_placed_and_its_clock_set_as_well_as_claimed(recorded: Recorded):
+    """The squared Mahalanobis error of the pose is below the 99.9 % quantile of chi-square with 6 degrees."""
+    found = place_one(without(recorded.truth, NAME), Wave().wand, recorded.messages, NAME)
+    here, there = found.rig.cameras[NAME], recorded.truth.cameras[NAME]
+    D = np.linalg.inv(here.matrix()) @ there.matrix()
+    error = np.array([D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]])
+    assert error @ np.linalg.solve(np.array(here.covariance), error) < chi2.ppf(0.999, 6)
+    assert found.sigma_mm < 1
+    assert here.time_offset_ms == pytest.approx(there.time_offset_ms, abs=4 * found.time_sigma_ms)
+    assert found.time_sigma_ms < 0.3
+    assert found.moved_mm is None
+    assert all(found.rig.cameras[n] == c for n, c in recorded.truth.cameras.items() if n != NAME)
+
+
+def test_what_a_camera_moved_by_is_told(recorded: Recorded):
+    camera = recorded.truth.cameras[NAME]
+    assert camera.T_world_cam is not None
+    x, y, z = camera.T_world_cam.position_m
+    pose = msgspec.structs.replace(camera.T_world_cam, position_m=(x + 0.05, y, z))
+    bumped = Rig(cameras={**recorded.truth.cameras, NAME: msgspec.structs.replace(camera, T_world_cam=pose)})
+    found = place_one(bumped, Wave().wand, recorded.messages, NAME)
+    assert found.moved_mm == pytest.approx(50, abs=5 * found.sigma_mm)
+
+
+def test_faults_are_named(recorded: Recorded):
+    wand, truth = Wave().wand, recorded.truth
+    with pytest.raises(CalibrationError, match="'north' is not in the rig"):
+        place_one(truth, wand, recorded.messages, "north")
+    others = [m for m in recorded.messages if m.camera != NAME]
+    with pytest.raises(CalibrationError, match=f"'{NAME}' is not in the recording"):
+        place_one(truth, wand, others, NAME)
+    alone = [m for m in recorded.messages if m.camera == NAME or m.t_ns % 8 == 9]
+    with pytest.raises(CalibrationError, match=f"one camera, '{NAME}'"):
+        place_one(truth, wand, alone, NAME)

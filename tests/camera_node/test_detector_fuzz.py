@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The detector on pictures made to break it: under sanitizers, and by the clock."""
+
+import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.detector import Detector
+
+ROOT = Path(__file__).resolve().parents[2]
+NATIVE = ROOT / "camera_node" / "native"
+FLAGS = ["-std=c++20", "-O1", "-g", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
+SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+
+
+def build(source: Path, folder: Path) -> Path:
+    made = folder / f"{source.stem}.o"
+    subprocess.run(["c++", *FLAGS, *SANITIZERS, "-c", source, "-o", made], check=True, timeout=300)
+    return made
+
+
+@pytest.mark.slow
+def test_no_picture_breaks_the_core(tmp_path: Path):
+    """Sizes from 0 x 0, any stride, noise, rings, checkerboards and strokes, under AddressSanitizer and UBSan."""
+    sources = [path for path in NATIVE.glob("*.cpp") if path.name != "bindings.cpp"]
+    with ThreadPoolExecutor(2) as pool:
+        objects = list(
+            pool.map(lambda path: build(path, tmp_path), [*sources, Path(__file__).with_name("fuzz.cpp")])
+        )
+    subprocess.run(["c++", *SANITIZERS, *objects, "-o", tmp_path / "fuzz"], check=True, timeout=300)
+    done = subprocess.run([tmp_path / "fuzz", "500"], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def rings(size: tuple[int, int], step: int, *radii: float) -> np.ndarray:
+    """A grid of circles, black and white by turns from the outermost."""
+    v, u = (x % step - step / 2 for x in np.mgrid[: size[0], : size[1]])
+    within = sum((np.hypot(u, v) < radius).astype(int) for radius in radii)
+    return cv2.GaussianBlur(np.where(within % 2, 30, 220).astype(np.float32), (0, 0), 0.6).astype(np.uint8)
+
+
+def checkerboard(size: tuple[int, int], side: int) -> np.ndarray:
+    v, u = np.mgrid[: size[0], : size[1]] // side
+    return (220 * ((u + v) % 2)).astype(np.uint8)
+
+
+def noise(size: tuple[int, int], blur: float) -> np.ndarray:
+    rough = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, size), (0, 0), blur)
+    return np.where(rough > 0, 220, 30).astype(np.uint8)
+
+
+HOSTILE = {
+    "roundels of the smallest size": lambda size: rings(size, 10, 4, 2.4),
+    "roundels side by side": lambda size: rings(size, 16, 6, 3.6),
+    "bullseyes": lambda size: rings(size, 48, 22, 18, 14, 10, 6, 2),
+    "rings within rings": lambda size: rings(size, size[1], *np.arange(2, size[1], 4.0)),
+    "checkerboard": lambda size: checkerboard(size, 4),
+    "letters": lambda size: noise(size, 1.2),
+    "noise": lambda size: np.random.default_rng(1).integers(0, 256, size).astype(np.uint8),
+}
+
+
+def seconds(image: np.ndarray) -> float:
+    """Processor time of one search by a new detector, the least of three."""
+    times = []
+    for _ in range(3):
+        detector = Detector(min_diameter_px=6, min_contrast=5)
+        start = time.process_time()
+        detector.detect(image)
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_the_worst_pictures_cost_a_bounded_time(name: str):
+    """Four times the pixels cost about four times the time; what grew with their square would cost sixteen times.
+
+    And no more than 5000 times an empty picture: 2 us a pixel, a few fits for each place that one could stand at.
+    """
+    small, large = (seconds(HOSTILE[name](size)) for size in ((240, 320), (480, 640)))
+    plain = seconds(np.full((480, 640), 128, np.uint8))
+    assert large < 8 * small + 0.005
+    assert large < 5000 * plain

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the detector reaches (a part of `python -m tests.benchmarks.detector`), and that chords and paper agree."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from camera_node.detector import Detector
+from camera_node.lens import Lens
+from tests.benchmarks.detector.accuracy import Errors, measure_cell
+from tests.benchmarks.detector.bound import bound
+from tests.benchmarks.detector.cells import Cell
+from tests.benchmarks.detector.negatives import clutter, print_letters
+from tests.benchmarks.detector.recall import faint, of_size, recall
+from tests.benchmarks.detector.table import Run
+from tests.camera_node.rendering import Disc, expose, outer_conic, render
+from tests.camera_node.tracing import Sight, pixels_across
+
+RUN = Run("chords", Detector, False)
+VIEWS, DRAWS = 4, 40
+CHANCE = 1 + 4 / np.sqrt(
+    2 * VIEWS * DRAWS
+)  # four sigmas of an RMS of so many errors; the centre has twice as many
+
+
+@pytest.mark.parametrize(
+    ("diameter", "centre", "distance"), [(11, 0.0071, 0.195), (20, 0.0048, 0.073), (50, 0.003, 0.018)]
+)
+def test_the_bound_is_that_of_the_study(diameter: float, centre: float, distance: float):
+    """In the middle of the picture, 30 degrees, noise 3, blur 0.7, on white: pixels and %, to the study's digits."""
+    side = int(1.4 * diameter + 20)
+    lens = Lens(width=side, height=side, fx=600, fy=600, cx=side / 2, cy=side / 2)
+    sight = Sight(
+        lens,
+        (side / 2, side / 2),
+        pixels_across(lens, 0.1, diameter),
+        tilt=np.radians(30),
+        turn=0.5,
+        ground=190.0,
+    )
+    limit = bound(sight, 6)
+    assert np.sqrt(limit.centre_variance(3)) == pytest.approx(centre, rel=0.04)
+    assert 100 * np.sqrt(limit.distance_variance(3)) == pytest.approx(distance, rel=0.04)
+
+
+@pytest.fixture(scope="module", params=[(16, 30, 3.0, 0.7), (30, 45, 3.0, 1.0), (40, 15, 1.0, 0.5)])
+def errors(request: pytest.FixtureRequest) -> Errors:
+    return measure_cell(RUN, Cell(*request.param), VIEWS, DRAWS)
+
+
+def test_the_centre_is_as_good_as_an_unknown_lens_allows(errors: Errors):
+    """The goal, 1.15 times the bound, and four sigmas."""
+    assert errors.found == 1
+    assert errors.without_lens < 1.15 * CHANCE
+
+
+def test_the_distance_is_near_its_bound_and_unbiased(errors: Errors):
+    """The goals, 1.5 times the bound and 0.05 %, and chance."""
+    assert errors.distance < 1.5 * CHANCE
+    assert not errors.biased
+
+
+def test_the_reported_covariance_is_honest(errors: Errors):
+    """Chi-square over its two degrees: 1 within 4 sigmas (1 / sqrt of the number each), and a fifth for the model."""
+    assert abs(errors.chi2 - 1) < 0.2 + 4 / np.sqrt(VIEWS * DRAWS)
+
+
+@pytest.mark.parametrize(
+    ("ground", "tilt", "diameter"), [("white", 0, 9), ("white", 45, 12), ("clutter", 0, 16), ("dark", 0, 12)]
+)
+def test_small_ones_are_found_on_the_first_frame(ground: str, tilt: int, diameter: int):
+    """99 of 100; of 120 that leaves 1.2, and four sigmas of it."""
+    assert recall(RUN, 2, of_size(ground, diameter, tilt)) > 1 - (1.2 + 4 * np.sqrt(1.2)) / 120
+
+
+def test_faint_ones_are_found():
+    """95 of 100, less four sigmas of 90."""
+    assert recall(RUN, 3, faint) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 90)
+
+
+@pytest.mark.parametrize("pages", [print_letters, clutter])
+def test_nothing_is_found_where_nothing_is(pages):
+    assert sum(len(Detector().detect(page)) for page in pages(4)) == 0
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
+    """One to four roundels apart from each other, their bright level, the blur and a seed for the noise."""
+    places = draw(
+        st.lists(
+            st.sampled_from([(40.0, 30.0), (120.0, 30.0), (40.0, 90.0), (120.0, 90.0)]),
+            min_size=1,
+            unique=True,
+        )
+    )
+    discs = [
+        Disc(
+            (u + draw(st.floats(-3, 3)), v + draw(st.floats(-3, 3))),
+            draw(st.floats(16, 34)),
+            draw(st.floats(0, 0.7)),
+            draw(st.floats(0, 6.2)),
+            ratio=draw(st.sampled_from([0.6, 0.41])),
+        )
+        for u, v in places
+    ]
+    return discs, draw(st.floats(120, 230)), draw(st.floats(0.5, 0.9)), draw(st.integers(0, 99))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(scenes())
+def test_both_detectors_see_the_same(scene: tuple[list[Disc], float, float, int]):
+    """Every roundel is found by both, where it is; their fits start elsewhere and end at the same place.
+
+    Within a sigma of each other, as a one-step estimate does not depend on its start to first order; and within four
+    sigmas, and the 0.02 px of rounding, of the truth.
+    """
+    discs, bright, blur, seed = scene
+    image = expose(render(discs, bright=bright, blur=blur), 2, np.random.default_rng(seed))
+    by_paper, by_chords = (Detector(detector=name).detect(image) for name in ("paper", "chords"))
+    assert len(by_paper) == len(by_chords) == len(discs)
+    for disc in discs:
+        centre = outer_conic(disc, np.array([79.5, 59.5]))[0]
+        ours, theirs = (r[int(np.linalg.norm(r.uv - centre, axis=1).argmin())] for r in (by_chords, by_paper))
+        sigma = float(np.sqrt(np.trace(ours.cov) / 2))
+        assert np.abs(ours.uv - theirs.uv).max() < sigma
+        assert np.abs(ours.uv - centre).max() < 4 * sigma + 0.02

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a camera says of its light."""
+
+import numpy as np
+import pytest
+
+from camera_node.health import FULL, advise
+from tests.camera_node.rendering import Disc, expose, render
+
+NONE = np.empty((0, 2))
+CENTRE = np.array([[80.0, 60.0]])
+
+
+@pytest.mark.parametrize(
+    ("bright", "says"),
+    [
+        (255.0, "saturated: halve the exposure or the gain"),
+        (220.0, ""),
+        (120.0, ""),
+        (80.0, "too dark: 2.5 times the exposure or the gain"),
+        (40.0, "too dark: 5.0 times the exposure or the gain"),
+    ],
+)
+def test_the_white_of_roundels_tells_what_to_change(bright: float, says: str):
+    """Whatever the ground: dark here, and white where the paper is dark."""
+    roundel = render([Disc((80, 60), 40)], dark=bright / 8, bright=bright, ground=255.0 - bright)
+    assert advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE) == says
+
+
+def test_without_roundels_the_histogram_tells():
+    """A few highlights are no reason to go darker; a dark picture is one to go brighter, up to 16 times."""
+    picture = np.full((80, 80), 90, np.uint8)
+    assert advise(picture, NONE) == ""
+    picture[:8, :16] = 255
+    assert advise(picture, NONE) == ""
+    picture[:40] = FULL
+    assert advise(picture, NONE).startswith("saturated")
+    assert advise(np.full((80, 80), 20, np.uint8), NONE).startswith("too dark: 10.0 times")
+    assert advise(np.zeros((80, 80), np.uint8), NONE).startswith("too dark: 16.0 times")
+    assert advise(np.empty((0, 0), np.uint8), NONE) == ""
