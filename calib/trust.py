@@ -113,8 +113,9 @@ class Trust:
         """The grade, whose fault it is, and what to do."""
         worst = max(self.cameras, key=lambda camera: _strain(camera.worst, camera.figures[camera.worst]))
         if self.unplaced:
-            names = " and ".join(f"'{name}'" for name in self.unplaced)
-            return f"grade D: camera {names} has no place; {ADVICE['unplaced']}"
+            names = enumerate_words([f"'{name}'" for name in self.unplaced])
+            who = f"cameras {names} have" if len(self.unplaced) > 1 else f"camera {names} has"
+            return f"grade D: {who} no place; {ADVICE['unplaced']}"
         if self.length is not None and grade("length", self.length) == self.grade > worst.grade:
             return f"grade {self.grade}: the wand's length is {self.length:.2%} off; {ADVICE['length']}"
         if self.grade == "A":
