@@ -89,11 +89,7 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
 def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, waved: Arena):
     """The rig of the recording itself: it stands as it says, halves agree, and the figures land in the copy."""
     write_observations(
-<<<<<<< HEAD
-        tmp_path / "observations.csv", record(waved, 16.0, sigma_px=0.1, numbered=True, sized=False)
-=======
         tmp_path / "observations.csv", record(waved, 16.0, sigma_px=0.1, numbered=True, free_running=False)
->>>>>>> trust
     )
     observations = ("--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
