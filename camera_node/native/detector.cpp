@@ -71,7 +71,7 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
 /// Fits, tests and keeps a roundel, unless it was found before.
 void Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
     if (!start || found_.size() >= kMaxRoundels || claims_.cover(start->outer.x, start->outer.y)) return;
-    const auto fit = fit_roundel(image, *start, settings_, noise_);
+    const auto fit = fit_roundel(image, *start, settings_, noise_, track >= 0);
     if (!fit || is_bullseye(image, *fit)) return;
     claims_.add(fit->outer);
     found_.push_back({*fit, track});

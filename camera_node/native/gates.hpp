@@ -9,7 +9,9 @@
 namespace roundel {
 
 /// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
-/// softened one; nothing where neither passes the gates that end false positives.
-std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise);
+/// softened one; nothing where neither passes the gates that end false positives. They are wider for what is
+/// `known` from the last frame.
+std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
+                               bool known);
 
 }  // namespace roundel

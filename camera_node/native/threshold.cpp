@@ -9,12 +9,10 @@
 namespace roundel {
 
 double saturated_share(const ImageView& image) {
-    size_t count = 0;
-    for (int y = 0; y < image.height; y += 8) {
-        const uint8_t* row = image.row(y);
-        count += size_t(std::count_if(row, row + image.width, [](uint8_t level) { return level >= 250; }));
-    }
-    return double(count) / (double(image.width) * ((image.height + 7) / 8));
+    size_t seen = 0, bright = 0;
+    for (int y = 0; y < image.height; y += 8)
+        for (int x = 0; x < image.width; x += 8) ++seen, bright += image.row(y)[x] >= 250;
+    return double(bright) / double(seen);
 }
 
 double noise_level(const ImageView& image) {

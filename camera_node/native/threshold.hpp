@@ -8,7 +8,7 @@
 
 namespace roundel {
 
-/// Share of the pixels that are 250 or brighter, of every eighth row.
+/// Share of the pixels that are 250 or brighter, of every eighth each way.
 double saturated_share(const ImageView& image);
 
 /// Standard deviation of the noise, grey levels, from 1 to 8: by the flattest twentieth of some hundred

@@ -241,3 +241,17 @@ def test_distance_by_the_principal_axis():
         assert distance == pytest.approx(1.0, abs=(disc.diameter / disc.f) ** 2)
     with pytest.raises(ValueError, match="above 0"):
         _core.distance_by_principal_axis(0.1, 0.0)
+
+
+def test_a_known_roundel_may_be_covered_in_part():
+    """A bar as bright as paper over the outer fifth: a letter might look so, a roundel of the last frame still is one."""
+    disc = Disc((80.3, 59.8), 36, 0.3, 0.4)
+    clean = render([disc], blur=0)
+    covered = clean.copy()
+    covered[:, 94:101] = 190
+    detector, generator = Detector(), rng()
+    (seen,) = detector.detect(expose(cv2.GaussianBlur(clean, (0, 0), 0.7), 2, generator))
+    frame = expose(cv2.GaussianBlur(covered, (0, 0), 0.7), 2, generator)
+    (still,) = detector.detect(frame)
+    assert still.track == seen.track
+    assert np.abs(still.uv - seen.uv).max() < 0.1
