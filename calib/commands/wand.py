@@ -32,7 +32,7 @@ class Wand:
     wand: Path = Path("configs/wand.yaml")
     """The wand: diameter_m and markers, metres."""
     rig: Path
-    """Intrinsics of every camera; poses in it are not used."""
+    """Intrinsics of every camera; poses in it are not used, but with --only."""
     out: Path
     """Where the rig with poses is written; a rig that is there is kept as rig.1.yaml, ..."""
     frames: Path | None = None
@@ -47,6 +47,8 @@ class Wand:
     """The arena's name in the keys."""
     seconds: float | None = None
     """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
+    only: str | None = None
+    """Place this camera alone, anew, by a short wave; the rig's others stay where they are."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels: where errors are foretold."""
     zenoh: Path | None = None
@@ -69,12 +71,33 @@ class Wand:
         from calib.trust import assess
         from calib.wand import calibrate
 
+        if self.only is not None:
+            return self._place_one(rig, wand, messages, self.only, console)
         with console.status("placing cameras"):
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
         told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
         told |= _of_lenses(rig)
+        placed = msgspec.structs.replace(result.rig, calibration=told)
+        write_rig(placed, self.out, console)
+        return placed
+
+    def _place_one(
+        self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str, console: Console
+    ) -> Rig:
+        from calib.recalibration import place_one
+
+        with console.status(f"placing {name}"):
+            result = place_one(rig, wand, messages, name)
+        moved = (
+            ""
+            if result.moved_mm is None
+            else f"moved {result.moved_mm:.1f} mm, {result.turned_deg:.2f} degrees; "
+        )
+        known = f"its place is known to {result.sigma_mm:.1f} mm, residuals {result.residual_px:.2f} px"
+        say(console, f"{name}: {moved}{known}")
+        told = result.rig.calibration | {"only": {"camera": name, **provenance()}}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed

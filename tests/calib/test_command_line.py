@@ -108,6 +108,25 @@ def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, wa
     assert cv2.imread(str(tmp_path / "map.png")) is not None
 
 
+def test_only_one_camera_is_placed_anew(tmp_path: Path, waved: Arena):
+    """By the same wave it is placed again; the others stay, to the last digit; a stranger is named."""
+    write_observations(
+        tmp_path / "observations.csv", record(waved, 12.0, sigma_px=0.1, numbered=True, sized=False)
+    )
+    options = ("--wand", tmp_path / "wand.yaml", "--observations", tmp_path / "observations.csv")
+    assert calib("wand", *wand_options(tmp_path), *options[2:]).returncode == 0
+    rig = tmp_path / "rig.yaml"
+    done = calib("wand", *options, "--rig", rig, "--out", tmp_path / "one.yaml", "--only", "cam1")
+    assert done.returncode == 0, done.stderr
+    assert "cam1: moved" in done.stdout
+    before, after = load_rig(rig), load_rig(tmp_path / "one.yaml")
+    assert after.cameras["cam0"] == before.cameras["cam0"]
+    assert after.calibration["only"]["camera"] == "cam1"
+    wrong = calib("wand", *options, "--rig", rig, "--out", tmp_path / "one.yaml", "--only", "cam77")
+    assert wrong.returncode == 2
+    assert "cam77" in wrong.stderr
+
+
 def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
     """Observations of an L and its YAML in, the true world out; what fixes no world is one line, and no file."""
     arena = ring()
