@@ -244,7 +244,7 @@ def test_distance_by_the_principal_axis():
 
 
 def test_a_known_roundel_may_be_covered_in_part():
-    """A bar as bright as paper over the outer fifth: a letter might look so, a roundel of the last frame still is one."""
+    """A bar as bright as paper over the outer fifth: a letter might look so, but not one of the last frame."""
     disc = Disc((80.3, 59.8), 36, 0.3, 0.4)
     clean = render([disc], blur=0)
     covered = clean.copy()
