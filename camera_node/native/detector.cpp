@@ -5,8 +5,9 @@
 #include <cmath>
 #include <optional>
 
+#include "circles.hpp"
 #include "gates.hpp"
-#include "rays.hpp"
+#include "surface.hpp"
 
 namespace roundel {
 

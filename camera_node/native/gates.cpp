@@ -4,8 +4,8 @@
 #include <algorithm>
 #include <cmath>
 
-#include "rays.hpp"
 #include "soften.hpp"
+#include "surface.hpp"
 
 namespace roundel {
 

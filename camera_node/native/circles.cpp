@@ -1,95 +1,22 @@
 // SPDX-License-Identifier: BSD-3-Clause
-#include "rays.hpp"
+#include "circles.hpp"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <numbers>
 
 #include "cholesky.hpp"
+#include "ray.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr int kRays = 16;
 constexpr int kLeast = 9;           // rays of each kind that must agree: what 30 % of a disc covered leaves
 constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
 constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
 constexpr double kAbsolute = 0.5;   // so many pixels
-
-struct Direction {
-    float x, y;
-};
-
-const std::array<Direction, kRays> kDirections = [] {
-    std::array<Direction, kRays> directions;
-    for (int k = 0; k < kRays; ++k) {
-        const double angle = 2 * std::numbers::pi * k / kRays;
-        directions[size_t(k)] = {float(std::cos(angle)), float(std::sin(angle))};
-    }
-    return directions;
-}();
-
-/// Grey level between pixels; below 0 outside the image.
-inline float sample(const ImageView& image, float x, float y) {
-    const int u = int(x), v = int(y);
-    if (!(x >= 0 && y >= 0 && u < image.width - 1 && v < image.height - 1)) return -1;
-    const uint8_t *upper = image.row(v) + u, *lower = upper + image.stride;
-    const float a = x - float(u), b = y - float(v);
-    const float above = float(upper[0]) + a * (float(upper[1]) - float(upper[0]));
-    const float below = float(lower[0]) + a * (float(lower[1]) - float(lower[0]));
-    return above + b * (below - above);
-}
-
-/// A ray that walks outwards from (x, y) pixel by pixel, as far as the image goes.
-class Ray {
-  public:
-    Ray(const ImageView& image, float x, float y, Direction d)
-        : image_(image),
-          x_(x),
-          y_(y),
-          d_(d),
-          end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
-    /// The distance at which the ray next turns dark (or bright), before `limit`; negative where it does not.
-    float turn(bool dark, float theta, float limit) {
-        const int last = int(std::min(limit, end_)), below = int(std::ceil(theta));
-        while (t_ < last && (nearest(t_) < below) == dark) ++t_;
-        while (t_ < last && (nearest(t_) < below) != dark) ++t_;
-        return t_ < last ? between(theta) : -1;
-    }
-
-  private:
-    /// How far a ray goes until half a pixel before the image's last one; nothing is seen from outside.
-    static float room(float at, float step, int length) {
-        if (!(at >= 0 && at <= float(length - 1))) return 0;
-        const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
-        return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
-    }
-    int nearest(int t) const {  // in 1/65536 of a pixel: whole numbers are faster here
-        return image_.row((v_ + t * dv_) >> 16)[(u_ + t * du_) >> 16];
-    }
-    float level(float t) const { return sample(image_, x_ + t * d_.x, y_ + t * d_.y); }
-    /// Where the level is theta, near the pixel at which it was passed.
-    float between(float theta) const {
-        float t = float(std::max(t_ - 2, 0)), before = level(t);
-        for (int k = 0; k < 3; ++k) {
-            const float after = level(t + 1);
-            if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
-            before = after, t += 1;
-        }
-        return float(t_) - 0.5f;
-    }
-
-    const ImageView& image_;
-    float x_, y_;
-    Direction d_;
-    float end_;
-    int u_ = int(65536 * x_) + 32768, v_ = int(65536 * y_) + 32768;
-    int du_ = int(65536 * d_.x), dv_ = int(65536 * d_.y);
-    int t_ = 0;
-};
 
 /// Where a ray crosses the edge of the disc or of the hole in it, from the ray's origin.
 struct Crossing {
@@ -228,19 +155,6 @@ Ellipse outer_ellipse(const Conics& c, const Frame& frame) {
             e.angle};
 }
 
-/// Grey levels on the ellipse that is `scale` times the outer one; below 0 outside the image.
-std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
-    std::array<float, kRays> levels;
-    const double c = std::cos(e.angle), s = std::sin(e.angle);
-    for (int k = 0; k < kRays; ++k) {
-        const Direction d = kDirections[size_t(k)];
-        const double along = scale * e.major / 2 * double(d.x), across = scale * e.minor / 2 * double(d.y);
-        levels[size_t(k)] =
-            sample(image, float(e.x + c * along - s * across), float(e.y + s * along + c * across));
-    }
-    return levels;
-}
-
 double median_level(const ImageView& image, const Ellipse& e, double scale) {
     auto levels = levels_on(image, e, scale);
     std::nth_element(levels.begin(), levels.begin() + kRays / 2, levels.end());
@@ -276,47 +190,6 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
     const bool size = start->outer.major > 0.8 * settings.min_diameter &&
                       start->outer.major < 1.2 * settings.max_diameter && start->outer.minor > 3;
     return ratio && size && start->bright - start->dark > settings.min_contrast / 2 ? start : std::nullopt;
-}
-
-Surface inspect(const ImageView& image, const Fit& fit) {
-    const Ellipse& e = fit.outer;
-    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // beyond it, levels are plain
-    const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
-    Surface surface;
-    const auto test = [&](double scale, bool dark) {
-        for (const float value : levels_on(image, e, scale)) {
-            if (value < 0) continue;
-            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
-            const bool off = std::abs(share - (dark ? 0 : 1)) > 0.3;
-            ++surface.seen, surface.off += off, surface.ring_off += off && dark;
-        }
-    };
-    for (const double share : {0.25, 0.5, 0.75})
-        if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
-    for (const double share : {0.2, 0.5, 0.8})
-        if ((1 - share) * hole > edge) test(share * fit.ratio, false);
-    test(1 + 2.2 * edge / e.minor, false);  // just outside
-    return surface;
-}
-
-bool is_bullseye(const ImageView& image, const Fit& fit) {
-    // Thin rings are blurred and not so dark.
-    const float theta = float(fit.bright - 0.3 * (fit.bright - fit.dark));
-    const Ellipse& e = fit.outer;
-    float least = 1e9f, most = 0;
-    for (int k = 0; k < kRays; k += 2) {
-        Ray ray(image, float(e.x), float(e.y), kDirections[size_t(k)]);
-        const auto limit = float(4 * e.major);
-        float edge = 0;
-        for (int ring = 0; ring < 3 && edge >= 0; ++ring)
-            if (ray.turn(true, theta, limit) < 0 || (edge = ray.turn(false, theta, limit)) < 0) return false;
-        const double u = double(kDirections[size_t(k)].x), v = double(kDirections[size_t(k)].y);
-        const double along = u * std::cos(e.angle) + v * std::sin(e.angle);
-        const double across = v * std::cos(e.angle) - u * std::sin(e.angle);
-        const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
-        least = std::min(least, share), most = std::max(most, share);
-    }
-    return most < 1.3f * least;
 }
 
 }  // namespace roundel
