@@ -15,13 +15,11 @@ class Detector:
         by_paper: bool,
     ) -> None: ...
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One row of 17 a roundel.
+        """One row of 16 a roundel.
 
-        u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast, residual; then the disc's own centre:
+        u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast; then the disc's own centre:
         offset_u, offset_v from the ellipse's, and their covariance uu, uv, vv; and the track's number.
         """
 
-    @property
-    def saturated(self) -> float: ...
     @property
     def theta(self) -> float: ...

@@ -89,11 +89,6 @@ class Detector:
         """The paper's theta, grey levels."""
         return self._core.theta
 
-    @property
-    def saturated(self) -> float:
-        """Share of the last frame's pixels that are 250 or brighter."""
-        return self._core.saturated
-
     def disc_offsets(self) -> tuple[Array, Array]:
         """Of the last frame's roundels, in their order: where the discs' own centres project, from `uv`.
 
@@ -117,12 +112,12 @@ class Detector:
         pixels = grey(image)
         table = self._core.detect(pixels)
         table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
-        self._offsets = table[:, 11:16]
+        self._offsets = table[:, 10:15]
         uv, axes = table[:, :2], table[:, 5:7]
         cov = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         none = np.full(len(table), -1, np.int32)
         return Roundels(
-            uv, cov, axes, table[:, 7], table[:, 8], table[:, 9], none, table[:, 16].astype(np.int32)
+            uv, cov, axes, table[:, 7], table[:, 8], table[:, 9], none, table[:, 15].astype(np.int32)
         )
 
     def _is_masked(self, uv: Array) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera_node import _core
 from camera_node.lens import Lens
 from camera_node.roundels import Roundel, Roundels
 
@@ -114,7 +115,8 @@ def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) 
     seen = rays[1:] @ _look_along(rays[0]).T
     minor, major = _axes(_fit_conics(seen[None, :, :2] / seen[None, :, 2:])[0])
     sin2 = 1 - (minor / major) ** 2
-    return float(np.hypot(diameter_m / major, diameter_m / 2 * np.sqrt(sin2)))
+    uncorrected = _core.distance_by_principal_axis(diameter_m, major)
+    return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
 
 
 def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array, Array] | None) -> DiscPoses:

@@ -18,16 +18,17 @@ static roundel::ImageView view(const Grey& image) {
 
 /// One row a roundel, in the order that `_core.pyi` states.
 static Table table(const std::vector<roundel::Roundel>& roundels) {
-    constexpr size_t kColumns = 17;
+    constexpr size_t kColumns = 16;
     auto* rows = new double[roundels.size() * kColumns + 1];
     const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
     double* to = rows;
-    for (const auto& [f, track] : roundels)
-        for (const double value :
-             {f.outer.x, f.outer.y, f.covariance.xx, f.covariance.xy, f.covariance.yy, f.outer.major,
-              f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.residual, f.offset_x, f.offset_y,
-              f.offset_covariance.xx, f.offset_covariance.xy, f.offset_covariance.yy, double(track)})
+    for (const auto& [f, track] : roundels) {
+        const roundel::Symmetric centre = f.centre_covariance(), offset = f.offset_covariance();
+        for (const double value : {f.outer.x, f.outer.y, centre.xx, centre.xy, centre.yy, f.outer.major,
+                                   f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.offset_x,
+                                   f.offset_y, offset.xx, offset.xy, offset.yy, double(track)})
             *to++ = value;
+    }
     return Table(rows, {roundels.size(), kColumns}, owner);
 }
 
@@ -56,6 +57,5 @@ NB_MODULE(_core, m) {
                 return table(roundels);
             },
             nb::arg("image").noconvert())
-        .def_prop_ro("saturated", &roundel::Detector::saturated)
         .def_prop_ro("theta", &roundel::Detector::theta);
 }

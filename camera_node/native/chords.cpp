@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
-#include <cstring>
 
 #include "simd.hpp"
 
@@ -74,9 +73,9 @@ int darkest(const Level& level, int begin, int end) {
 }  // namespace
 
 ChordSearch::ChordSearch(const Settings& settings) {
-    const auto [low, high] = std::minmax_element(settings.inner_ratios.begin(), settings.inner_ratios.end());
-    const double r = std::max(0.05, *low - settings.ratio_tolerance);
-    const double R = std::min(0.95, *high + settings.ratio_tolerance);
+    const auto [low, high] = settings.ratio_range();
+    const double r = std::max(0.05, low - settings.ratio_tolerance);
+    const double R = std::min(0.95, high + settings.ratio_tolerance);
     // The shortest chord through the centre is the minor axis.
     limits_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2),
                int(std::lround(16 * (1 - r) / (2 * r))), int(std::lround(16 * (1 - R) / (2 * R)))};

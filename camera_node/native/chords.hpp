@@ -3,7 +3,7 @@
 #include <vector>
 
 #include "bits.hpp"
-#include "paper.hpp"
+#include "settings.hpp"
 
 namespace roundel {
 

@@ -39,9 +39,9 @@ struct Ratios {
 };
 
 Ratios ratios_near_middle(const Settings& settings) {
-    const auto [low, high] = std::minmax_element(settings.inner_ratios.begin(), settings.inner_ratios.end());
+    const auto [low, high] = settings.ratio_range();
     const double slack = settings.ratio_tolerance + 0.1;  // a quarter of a radius off the middle
-    return {std::max(0.1, *low - slack), std::min(0.95, *high + slack)};
+    return {std::max(0.1, low - slack), std::min(0.95, high + slack)};
 }
 
 /// Diagonals first, then what lies between: with the chords along row and column, few rays tell early that
@@ -108,7 +108,7 @@ struct Frame {
     bool is_valid() const { return inner > 0 && inner < outer; }
 };
 
-/// Weights by distance from the ellipses; returns the share of rays whose crossings of the worse kind agree.
+/// Weights by distance from the ellipses; returns how many crossings agree, of the kind of which fewer do.
 int reweigh(const Crossings& crossings, const Conics& conics, std::array<double, 2 * kRays>& weights) {
     const Frame frame(conics);
     int agree[2] = {0, 0};
@@ -185,8 +185,7 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
         from = {float(outer.x), float(outer.y), float(outer.major), int(m_d), int(m_b)};
     }
     const double slack = settings.ratio_tolerance + 1 / start->outer.minor;
-    const bool ratio = std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(),
-                                   [&](double r) { return std::abs(start->ratio - r) < slack; });
+    const bool ratio = settings.ratio_error(start->ratio) < slack;
     const bool size = start->outer.major > 0.8 * settings.min_diameter &&
                       start->outer.major < 1.2 * settings.max_diameter && start->outer.minor > 3;
     return ratio && size && start->bright - start->dark > settings.min_contrast / 2 ? start : std::nullopt;

@@ -4,8 +4,8 @@
 
 #include "chords.hpp"
 #include "image.hpp"
-#include "paper.hpp"
 #include "refine.hpp"
+#include "settings.hpp"
 
 namespace roundel {
 

@@ -22,7 +22,6 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     found_.clear();
     if (image.width < 3 || image.height < 3) return found_;
-    saturated_ = saturated_share(image);
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
     follow(image);

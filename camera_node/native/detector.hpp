@@ -21,8 +21,6 @@ class Detector {
     std::vector<Roundel> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
-    /// Share of the last frame's pixels at the upper end of the scale.
-    double saturated() const { return saturated_; }
 
   private:
     void follow(const ImageView& image);
@@ -38,7 +36,6 @@ class Detector {
     Tracks tracks_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
-    double saturated_ = 0;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     std::mutex mutex_;

@@ -41,10 +41,8 @@ bool is_covered(const ImageView& image, const Fit& fit, double noise, bool known
 
 /// Contrast, ratio and size within their limits, and levels that a camera can give.
 bool has_limits(const Fit& fit, const Settings& settings) {
-    const bool ratio = std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(), [&](double r) {
-        return std::abs(fit.ratio - r) <= settings.ratio_tolerance;
-    });
-    return ratio && fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
+    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
+           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
            fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
            fit.outer.major <= settings.max_diameter;
 }
@@ -58,16 +56,11 @@ bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings
     return surface.off <= kMostCovered * surface.seen;
 }
 
-double nearest(const std::vector<double>& ratios, double to) {
-    return *std::min_element(ratios.begin(), ratios.end(),
-                             [&](double a, double b) { return std::abs(a - to) < std::abs(b - to); });
-}
-
 }  // namespace
 
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
                                bool known) {
-    start.print = nearest(settings.inner_ratios, start.ratio);
+    start.print = settings.nearest_ratio(start.ratio);
     const auto fit = refine(image, start);
     if (fit && is_roundel(image, *fit, settings, noise, known)) return fit;
     if (!fit || fit->support < kRaggedSupport) return std::nullopt;

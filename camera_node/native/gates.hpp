@@ -3,8 +3,8 @@
 #include <optional>
 
 #include "image.hpp"
-#include "paper.hpp"
 #include "refine.hpp"
+#include "settings.hpp"
 
 namespace roundel {
 

@@ -14,7 +14,7 @@ constexpr int kHigh = 2, kWide = 4;   // products of so many columns stay in reg
 
 struct Sums {
     Lanes gram[kColumns][kColumns];
-    Lanes w, n, rr, ring, ring_rr, agreeing, m, mm, mrr, mwrr, mpsi;
+    Lanes w, ring, ring_rr, agreeing, m, mm, mrr, mwrr, mpsi;
 };
 
 using Columns = Lanes[kColumns][kChunk];
@@ -55,12 +55,9 @@ ROUNDEL_INLINE void weigh(const Gradient& model, const Lanes& level, float per_c
     const Lanes& bx = model.by[kX][k];
     const Lanes& by = model.by[kY][k];
     const Lanes ring = level >= 0.0f ? model.ring[k] * model.ring[k] : all(0), m = w * (bx * bx + by * by);
-    const Bits own = (level >= 0.0f) & (model.by[kGround][k] < 0.5f);
     for (int i = 0; i < kCount; ++i) columns[i][k] = root * model.by[i][k];
     columns[kCount][k] = root * r;
     sums.w += w;
-    sums.n += own ? all(1) : all(0);
-    sums.rr += own ? r * r : all(0);
     sums.ring += ring;
     sums.ring_rr += ring * r * r;
     sums.agreeing += w * ring;
@@ -108,8 +105,7 @@ NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double
         e.g[i] = sum(sums.gram[i][kCount]);
     }
     e.wrr = sum(sums.gram[kCount][kCount]), e.w = sum(sums.w);
-    e.n = sum(sums.n), e.rr = sum(sums.rr), e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr),
-    e.agreeing = sum(sums.agreeing);
+    e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr), e.agreeing = sum(sums.agreeing);
     e.m = sum(sums.m), e.mm = sum(sums.mm);
     e.mrr = sum(sums.mrr), e.mwrr = sum(sums.mwrr), e.mpsi = sum(sums.mpsi);
     return e;

@@ -10,7 +10,6 @@ struct NormalEquations {
     Matrix H;      // J^T W J, the lower triangle
     Parameters g;  // J^T W r
     double w, wrr;
-    double n, rr;           // of all pixels on the card, unweighed
     double ring, agreeing;  // squared slopes of the ring's edges, and weighed
     double ring_rr;         // squared residuals times these slopes
     /// Sums of w m and w m^2, m being the squared slope of the level: what a pixel tells of the edges. And of

@@ -48,8 +48,7 @@ bool are_concentric(const Moments& disc, const Moments& inner) {
 bool has_area_ratio(const Moments& disc, const Moments& inner, const Settings& settings) {
     const double ratio = std::sqrt(inner.n / disc.n);
     const double tolerance = settings.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
-    return std::any_of(settings.inner_ratios.begin(), settings.inner_ratios.end(),
-                       [&](double r) { return std::abs(ratio - r) < tolerance; });
+    return settings.ratio_error(ratio) < tolerance;
 }
 
 Ellipse covariance_ellipse(const Moments& disc) {

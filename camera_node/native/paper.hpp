@@ -5,18 +5,9 @@
 #include "ellipse.hpp"
 #include "refine.hpp"
 #include "segments.hpp"
+#include "settings.hpp"
 
 namespace roundel {
-
-/// What counts as a roundel.
-struct Settings {
-    std::vector<double> inner_ratios{0.6, 0.41};  // inner over outer diameter of the prints in use
-    double ratio_tolerance = 0.08;
-    double min_diameter = 8, max_diameter = 400;  // of the outer ellipse's major axis, pixels
-    double min_contrast = 25;                     // bright less dark, grey levels
-    double search_share = 1;                      // of a frame's rows that are searched for new roundels
-    bool by_paper = false;                        // search by the paper's segments instead of chords
-};
 
 /// A dark segment with a bright one in it: what Section III-B of the paper accepts.
 struct Pair {

@@ -234,20 +234,15 @@ PoseCovariance Fitter::covariance() const {
 Fit Fitter::fit() const {
     const CircleImage outer = circle_image(p, 1);
     const Eigen axes = eigen(outer.shape);
-    const PoseCovariance C = covariance();
     return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                       2 * std::sqrt(axes.second), axes.angle},
-            .covariance = {C[0][0], C[0][1], C[1][1]},
             .offset_x = p[kX] - outer.x,
             .offset_y = p[kY] - outer.y,
-            .offset_covariance = {C[5][5], C[5][6], C[6][6]},
-            .pose_covariance = C,
+            .C = covariance(),
             .ratio = p[kRatio],
-            .card = p[kCard],
             .dark = p[kDark],
             .bright = p[kBright],
             .blur = p[kBlur],
-            .residual = std::sqrt(sums_.rr / std::max(1.0, sums_.n)),
             .edge_residual = edge_residual_,
             .agreeing_residual = agreeing_,
             .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};

@@ -22,18 +22,17 @@ using PoseCovariance = std::array<std::array<double, 7>, 7>;
 /// A roundel fitted to the grey levels around its edges.
 struct Fit {
     Ellipse outer;
-    Symmetric covariance;         // of the centre, square pixels
-    double offset_x, offset_y;    // from the ellipse's centre to where the disc's own centre projects, pixels
-    Symmetric offset_covariance;  // square pixels
-    PoseCovariance pose_covariance;
+    double offset_x, offset_y;  // from the ellipse's centre to where the disc's own centre projects, pixels
+    PoseCovariance C;
     double ratio;          // inner over outer diameter, as measured without the print
-    double card;           // the white card's over the outer diameter, where the card's edge is near
     double dark, bright;   // grey levels
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double residual;       // RMS over all pixels used that are on the card, grey levels
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double agreeing_residual;  // over those that agree
     double support;            // share of the ring's edges that is in the image and agrees
+    /// Of the ellipse's centre and of the offset, square pixels.
+    Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
+    Symmetric offset_covariance() const { return {C[5][5], C[5][6], C[6][6]}; }
 };
 
 /// Fits a photometric model of a roundel to the pixels near its edges, by Gauss-Newton: a bright level, a

@@ -43,9 +43,7 @@ std::optional<Fit> refine_softened(const ImageView& image, const Start& start) {
     std::optional<Fit> fit = refine({soft.data(), width, height, width}, moved);
     if (!fit) return fit;
     fit->outer.x += left, fit->outer.y += top;
-    fit->covariance = fit->covariance.scaled(kHidden);
-    fit->offset_covariance = fit->offset_covariance.scaled(kHidden);
-    for (auto& row : fit->pose_covariance)
+    for (auto& row : fit->C)
         for (double& value : row) value *= kHidden;
     return fit;
 }

@@ -8,13 +8,6 @@
 
 namespace roundel {
 
-double saturated_share(const ImageView& image) {
-    size_t seen = 0, bright = 0;
-    for (int y = 0; y < image.height; y += 8)
-        for (int x = 0; x < image.width; x += 8) ++seen, bright += image.row(y)[x] >= 250;
-    return double(bright) / double(seen);
-}
-
 double noise_level(const ImageView& image) {
     constexpr int kPatches = 16;                       // each way, of 8 x 4 pixels
     constexpr double kFlat = 0.05, kDeviations = 2.9;  // the flattest twentieth of noise spans so many

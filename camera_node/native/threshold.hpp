@@ -8,9 +8,6 @@
 
 namespace roundel {
 
-/// Share of the pixels that are 250 or brighter, of every eighth each way.
-double saturated_share(const ImageView& image);
-
 /// Standard deviation of the noise, grey levels, from 1 to 8: by the flattest twentieth of some hundred
 /// patches.
 double noise_level(const ImageView& image);

@@ -88,7 +88,7 @@ bool is_possible(const roundel::Fit& fit, const roundel::ImageView& image) {
     const auto positive = [](const roundel::Symmetric& m) { return m.xx > 0 && m.yy > 0 && m.det() > 0; };
     return fit.outer.x > -image.width && fit.outer.x < 2 * image.width && fit.outer.y > -image.height &&
            fit.outer.y < 2 * image.height && fit.outer.minor > 0 && fit.outer.major >= fit.outer.minor &&
-           positive(fit.covariance) && positive(fit.offset_covariance) && std::isfinite(fit.ratio);
+           positive(fit.centre_covariance()) && positive(fit.offset_covariance()) && std::isfinite(fit.ratio);
 }
 
 /// Several pictures to one detector, which remembers what it saw in the last; of one size or of several.
