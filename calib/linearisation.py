@@ -11,9 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.problem import LENS, PER_CAMERA, POSE, Observations, Problem, State, skew
+from calib.problem import LENS, PER_CAMERA, POSE, Observations, Problem, State
 from calib.trajectory import hermite_rate, interpolate, locate, whitened_motion
 from camera_node.lens import Lens
+from camera_node.pose import skew
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

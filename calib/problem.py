@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.trajectory import AffineWand
 from camera_node.lens import Lens
-from camera_node.pose import rotation_from_vector
+from camera_node.pose import adjoint, invert, rotation_from_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -132,19 +132,11 @@ class Problem:
         return replace(self, free=tuple(sorted(sum(parameters, ()))))
 
 
-def skew(v: Array) -> Array:
-    """(..., 3, 3) the matrix of the cross product with v (..., 3)."""
-    S = np.zeros((*v.shape, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return S - np.swapaxes(S, -1, -2)
-
-
 def unobserved(state: State, free: tuple[int, ...]) -> Array:
     """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
     columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
     for T, rows in zip(state.cameras, columns, strict=True):
-        R, p = T[:3, :3], T[:3, 3]
-        rows[:6, :6] = np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]])
+        rows[:6, :6] = adjoint(invert(T))
         rows[6, 6] = rows[7, 7] = 1.0
     kept = [g for g in range(8) if g < 6 or g in free]
     return columns[:, free][:, :, kept].reshape(-1, len(kept))

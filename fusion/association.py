@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from camera_node.pose import skew
 from fusion.optics import Discs, Optics, Views
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
@@ -60,7 +61,7 @@ def _spread(
     owner = catalogue.robot[markers]
     arm = np.einsum("nij,jn->ni", states.R[owner], catalogue.marker[:, markers])
     P = states.P[owner]
-    at, along = _lever(states.R[owner], catalogue.marker[:, markers].T), _lever(np.eye(3), arm)
+    at, along = -states.R[owner] @ skew(catalogue.marker[:, markers].T), -skew(arm)
     place, rate = at @ P[:, THETA] + P[:, POSITION], along @ P[:, OMEGA] + P[:, VELOCITY]
     at, along = at.transpose(0, 2, 1), along.transpose(0, 2, 1)
     C0 = place[:, :, THETA] @ at + place[:, :, POSITION]
@@ -75,13 +76,6 @@ def _spread(
     )
     g = (R[0] - views.xy[:, None] * R[1]) / views.centre[2]
     return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C.reshape(3, 3, -1)), g)
-
-
-def _lever(R: Array, v: Array) -> Array:
-    """(N, 3, 3) -R [v]x."""
-    W = np.zeros((len(v), 3, 3))
-    W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = v[:, 2], -v[:, 1], v[:, 0]
-    return R @ (W - W.transpose(0, 2, 1))
 
 
 def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sightings: Sightings) -> _Pairs:

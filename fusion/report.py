@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
+from camera_node.pose import skew
 from fusion.grouping import Marker
 from fusion.instants import Instant
 from fusion.messages import Markers, RobotPose, State
 from fusion.optics import Optics
 from fusion.sightings import Catalogue, Matches, Sightings
-from fusion.state import States, skew, wxyz_of
+from fusion.state import States, wxyz_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

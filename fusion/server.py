@@ -23,13 +23,13 @@ from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig
 from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
 from camera_node.network import open_client, open_router
+from camera_node.requests import encode_reply, parse_request, payload_of, respond
 from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Frame, Instant, Instants
-from fusion.messages import Latency, RobotPose, Robots, State, robots_key, undo_key
+from fusion.messages import Latency, RobotPose, Robots, RobotsRequest, State, robots_key, undo_key
 from fusion.report import Fused, Move
-from fusion.requests import parse_robots, respond, robots_reply
 from fusion.robots import changed, load_robots
 from fusion.shards import Shard
 from fusion.tracker import Tracker
@@ -125,11 +125,11 @@ class Server:
 
         return callback
 
-    def _later(self, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
+    def _later(self, answer: Callable[[zenoh.Query], bytes]) -> Callable[[zenoh.Query], None]:
         """A callback that has the server's thread answer a query."""
         return lambda query: self._put(partial(respond, query, answer))
 
-    def _put(self, task: Callable[[], None]) -> None:
+    def _put(self, task: Callable[[], object]) -> None:
         try:
             self._messages.put_nowait(task)
         except queue.Full:
@@ -224,7 +224,7 @@ class Server:
         assert self.calibration.rig is not None
         return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.calibration.rig))
 
-    def _undo(self, payload: bytes) -> bytes:
+    def _undo(self, _: zenoh.Query) -> bytes:
         """Take the last correction back; that camera is not doubted again until another rig comes."""
         name, camera = self.calibration.undo()
         log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
@@ -235,9 +235,10 @@ class Server:
         self._publish(self.keys.rig, message)
         return encode(message)
 
-    def _change_robots(self, payload: bytes) -> bytes:
+    def _change_robots(self, query: zenoh.Query) -> bytes:
         """Rename, remove and define robots, all or none; what they are then."""
-        request = parse_robots(payload)
+        payload = payload_of(query)
+        request = parse_request(payload, RobotsRequest) if payload else RobotsRequest()
         robots = changed(self.robots, request.rename, request.remove, request.define)
         if robots != self.robots:
             for name in self.robots.keys() - robots.keys():
@@ -246,7 +247,7 @@ class Server:
             log.info("robots: %s", ", ".join(robots) or "none")
             if self._tracker is not None:
                 self._tracker = self._tracker.with_robots(robots, request.rename)
-        return robots_reply(payload, Robots(robots=self.robots))
+        return encode_reply(payload, Robots(robots=self.robots))
 
     def _forget(self, key: str) -> None:
         if key in self._publishers:

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.pose import Pose
+from camera_node.pose import Pose, rotation_from_vector, skew
 from fusion.instants import Frame
-from fusion.state import exp_so3, skew
 
 Array = NDArray[np.float64]
 AGREE_PX = 2.0  # between where a roundel is expected and detected, while a camera stands
@@ -226,7 +225,7 @@ def _fit(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Arra
         step = np.linalg.solve(H, np.einsum("n,nai,na->i", w, A, b))
         T = T.copy()
         T[:3, 3] += T[:3, :3] @ step[3:]
-        T[:3, :3] = T[:3, :3] @ exp_so3(step[None, :3])[0]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
     A, b = _linearise(camera, T, points, measured)
     w = 1 / (1 + np.sum(b**2, 1))
     H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
