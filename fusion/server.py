@@ -58,7 +58,7 @@ class Server:
         self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
         self._tracker: Tracker | None = None
         self._start()
-        self._messages: queue.Queue[Callable[[], None]] = queue.Queue(QUEUE)
+        self._messages: queue.Queue[Callable[[], object]] = queue.Queue(QUEUE)
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
