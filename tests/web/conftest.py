@@ -18,6 +18,7 @@ from camera_node.pose import Pose, look_at
 from camera_node.roundels import Roundels
 from fusion.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, State
 from web.feed import Feed
+from web.subscription import Subscription
 
 DEADLINE_S = 20.0
 
@@ -30,17 +31,13 @@ def wait_for(condition: Callable[[], object], deadline_s: float = DEADLINE_S) ->
         time.sleep(0.01)
 
 
-class Played:
-    """What cameras and server of the arena "test" would publish."""
+class Said:
+    """What cameras and server of the arena "test" would publish, to wherever `put` carries it."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
-        self.keys = Keys("test")
-        self.session = open_router([endpoint])
-        self.rig_queries = 0
+    keys = Keys("test")
 
     def put(self, key: str, data: bytes) -> None:
-        self.session.put(key, data)
+        raise NotImplementedError
 
     def pose(
         self, robot: str, position: tuple[float, float, float], state: State = "tracked", key: str = ""
@@ -113,6 +110,21 @@ class Played:
         )
         self.put(self.keys.fusion_status, encode(message))
 
+    def rig(self, rig: Rig) -> None:
+        self.put(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+
+
+class Played(Said):
+    """Over Zenoh, now."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self.session = open_router([endpoint])
+        self.rig_queries = 0
+
+    def put(self, key: str, data: bytes) -> None:
+        self.session.put(key, data)
+
     def serve_rig(self, rig: Rig) -> zenoh.Queryable:
         """Answer late joiners, as the server does."""
 
@@ -144,16 +156,22 @@ def played() -> Iterator[Played]:
 
 
 @pytest.fixture
-def feed(played: Played) -> Iterator[Feed]:
+def subscription(played: Played) -> Iterator[Subscription]:
     """A feed of that arena, connected: what is published from now on arrives."""
     session = open_client([played.endpoint])
-    feed = Feed(session, "test")
+    subscription = Subscription(session, Feed("test"))
 
     def reached() -> bool:
         played.markers([(0, 0, 0)])
-        return feed.latest().markers is not None
+        return subscription.feed.latest().markers is not None
 
     wait_for(reached)
-    yield feed
-    feed.close()
+    yield subscription
+    subscription.close()
     session.close()
+
+
+@pytest.fixture
+def feed(subscription: Subscription) -> Feed:
+    """What the connected feed knows."""
+    return subscription.feed
