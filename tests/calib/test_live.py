@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Live calibration: detections are collected past bytes that are none, and the rig reaches who listens."""
 
-import socket
 import threading
 
 import pytest
@@ -13,13 +12,6 @@ from calib.rig import dump_rig
 from camera_node.messages import Keys, decode, encode
 from camera_node.network import open_client, open_router
 from tests.calib.synthetic import record, ring
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def test_collects_and_publishes(endpoint: str):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wave before running cameras tells how far it is, and ends when more would not help."""
 
-import socket
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -15,14 +14,13 @@ from calib.waving import IDLE_S, Progress, Trial, _Wave, progress, thin, wave
 from camera_node.messages import Detections, Keys, encode
 from camera_node.network import open_client, open_router
 from tests.calib.synthetic import record, ring
+from tests.conftest import free_port
 
 
 @contextmanager
 def sending(messages: list[Detections]) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
     """A client of a router that publishes messages, and junk, as soon as somebody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     listening = threading.Event()
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         block = zenoh.CongestionControl.BLOCK  # so fast, nothing must be dropped
