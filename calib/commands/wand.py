@@ -13,6 +13,7 @@ from zenoh import Session
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
+from calib.live import Heard
 from calib.report import clocks_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.waving import wave
@@ -98,15 +99,13 @@ class Wand:
 
     def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
         with self.server.open() as session:
-            messages, bad, why = self._wave(session, rig, wand, console)
+            heard, why = self._wave(session, rig, wand, console)
         say(console, f"the wave ended: {why}")
-        if bad:
-            say(console, f"warning: {bad} messages were none and were skipped")
-        self.server.hand_over(self._place(rig, wand, messages, console), self.out, console)
+        if heard.bad:
+            say(console, f"warning: {heard.bad} messages were none and were skipped")
+        self.server.hand_over(self._place(rig, wand, heard.messages, console), self.out, console)
 
-    def _wave(
-        self, session: Session, rig: Rig, wand: Body, console: Console
-    ) -> tuple[list[Detections], int, str]:
+    def _wave(self, session: Session, rig: Rig, wand: Body, console: Console) -> tuple[Heard, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
         trials = self.seconds is None or console.is_terminal
         with Live(console=console, transient=True) as live:

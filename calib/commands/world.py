@@ -101,7 +101,7 @@ class World:
         if not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         with self.server.open() as session:
-            return collect(session, self.server.arena, self.seconds, "looking")[0]
+            return collect(session, self.server.arena, self.seconds, "looking").messages
 
 
 def _markers(body: Body) -> dict[str, NDArray[np.float64]]:

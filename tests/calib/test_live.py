@@ -35,9 +35,9 @@ def test_collects_and_publishes(endpoint: str):
 
         thread = threading.Thread(target=send)
         thread.start()
-        collected, bad = collect(client, "test", 3.0)
+        heard = collect(client, "test", 3.0, "looking")
         thread.join(10)
-        assert (len(collected), bad) == (len(messages), 1)
+        assert (len(heard.messages), heard.bad) == (len(messages), 1)
         assert publish(client, "test", arena.truth)
         assert arrived.wait(10)
         assert rigs[0].yaml == dump_rig(arena.truth)
@@ -45,4 +45,4 @@ def test_collects_and_publishes(endpoint: str):
 
 def test_silence_is_a_fault_with_advice(endpoint: str):
     with open_client([endpoint]) as client, pytest.raises(CalibrationError, match="no detections on test/"):
-        collect(client, "test", 0.1)
+        collect(client, "test", 0.1, "looking")
