@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """An arena that a test plays by hand: a real Zenoh router on loopback, and real messages."""
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 
@@ -17,6 +16,7 @@ from camera_node.network import open_client, open_router
 from camera_node.pose import Pose, look_at
 from camera_node.roundels import Roundels
 from fusion.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, State
+from tests.conftest import free_port
 from web.feed import Feed
 from web.subscription import Subscription
 
@@ -141,11 +141,6 @@ def four_cameras() -> Rig:
     corners = {"north": (0.1, 2, 3), "east": (2, 0.1, 3), "south": (0.1, -2, 3), "west": (-2, 0.1, 3)}
     poses = {name: Pose.from_matrix(look_at(corner, (0, 0, 0.2))) for name, corner in corners.items()}
     return Rig(cameras={name: Camera(**lens, T_world_cam=pose) for name, pose in poses.items()})
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ import pytest
 
 from camera_node.errors import ConfigError
 from fusion.recording import RecordingWriter
-from tests.web.conftest import Said, four_cameras, free_port, wait_for
+from tests.conftest import free_port
+from tests.web.conftest import Said, four_cameras, wait_for
 from web.__main__ import Options, replay
 from web.feed import Feed
 from web.playback import ReplayControls

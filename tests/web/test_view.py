@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
-from tests.web.conftest import Played, four_cameras, free_port, wait_for
+from tests.conftest import free_port
+from tests.web.conftest import Played, four_cameras, wait_for
 from web.controls import LiveControls, decode_jpeg
 from web.drawing import puck
 from web.errors import WebError
