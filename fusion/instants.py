@@ -12,6 +12,7 @@ from calib.camera import Camera
 from camera_node.lens import Lens
 from camera_node.messages import Detections
 from camera_node.roundels import Roundels
+from fusion.undistortion import undistort
 
 Array = NDArray[np.float64]
 
@@ -55,10 +56,7 @@ class Frame:
     @classmethod
     def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":
         """The frame of roundels that a lens saw."""
-        xy = lens.normalise(roundels.uv)
-        scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
-        columns = np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))
-        return cls(name, t_ns, roundels, *columns)
+        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
