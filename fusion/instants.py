@@ -120,6 +120,13 @@ class Instants:
             return []
         return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns, GONE_NS)
 
+    def open(self) -> Instant | None:
+        """What is there already of the instant that is closed next."""
+        if self._end_ns is None or not self.period_ns or not self._waiting:
+            return None
+        opened = self._gather(self._end_ns, self.period_ns)
+        return opened if opened.frames else None
+
     def finish(self) -> list[Instant]:
         """The instants of all frames that are left, at the end of a recording."""
         if self._end_ns is None:
@@ -184,8 +191,12 @@ class Instants:
         return closed
 
     def _cut(self, end_ns: int, period_ns: int) -> Instant:
-        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
+        instant = self._gather(end_ns, period_ns)
         self._waiting = [frame for frame in self._waiting if frame.t_ns >= end_ns]
+        return instant
+
+    def _gather(self, end_ns: int, period_ns: int) -> Instant:
+        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
         return Instant(end_ns - period_ns // 2, tuple(frames))
 
     def _complete(self, end_ns: int) -> bool:

@@ -12,7 +12,7 @@ from calib.camera import Camera
 from camera_node.pose import skew
 from fusion.grouping import Marker
 from fusion.instants import Instant
-from fusion.messages import Markers, RobotPose, State
+from fusion.messages import Latency, Markers, RobotPose, State
 from fusion.optics import Optics
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import States, wxyz_of
@@ -84,6 +84,23 @@ def report(
     markers = _markers(tracker, instant.t_ns, seen, free)
     usage = _usage(tracker, sightings, matches, free)
     return Fused(instant.t_ns, tuple(poses[k] for k in sorted(poses)), markers, usage)
+
+
+def latency_of(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
+    """Where the time went since the newest exposure; None for an instant without frames."""
+    newest = max(instant.frames, key=lambda frame: frame.t_ns, default=None)
+    if newest is None:
+        return None
+    sent_ns = newest.sent_ns or newest.received_ns
+    return Latency(
+        exposure_ms=newest.exposure_us / 2e3,
+        detect_ms=newest.detect_us * 1e-3,
+        camera_ms=(sent_ns - newest.t_ns) * 1e-6,
+        network_ms=(newest.received_ns - sent_ns) * 1e-6,
+        wait_ms=(begun_ns - newest.received_ns) * 1e-6,
+        fuse_ms=(done_ns - begun_ns) * 1e-6,
+        total_ms=(done_ns - newest.t_ns) * 1e-6,
+    )
 
 
 def look(tracker: Told, sightings: Sightings, matches: Matches) -> Seen:
