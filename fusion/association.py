@@ -6,6 +6,7 @@ detections are assigned globally, frame by frame: no detection is of two markers
 log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from camera_node.pose import skew
+from fusion.instants import Frame, Instant
 from fusion.optics import Discs, Optics, Views
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
@@ -35,6 +37,51 @@ class _Pairs:
     marker: Index
     sighting: Index
     cost: Array
+
+
+class Association:
+    """An instant's detections matched to robots frame by frame, so that most is done before the last frame comes.
+
+    Args:
+        optics: the cameras.
+        catalogue: the robots' markers.
+        states: the robots as predicted at `t_ns`.
+        active: (N,) those whose markers are looked for.
+        t_ns: the instant.
+        floor_px: see `Sightings.of`.
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        catalogue: Catalogue,
+        states: States,
+        active: NDArray[np.bool_],
+        t_ns: int,
+        floor_px: float,
+    ) -> None:
+        self._scene = optics, states, catalogue, active
+        self._t_ns, self._floor_px = t_ns, floor_px
+        self._done: dict[int, tuple[Frame, Matches]] = {}  # by the frame's id(), each with its rows from 0
+
+    def add(self, frames: Sequence[Frame]) -> None:
+        """Match those of the frames that are not matched yet, all at once."""
+        new = tuple(frame for frame in frames if id(frame) not in self._done)
+        if not new:
+            return
+        optics, states, catalogue, active = self._scene
+        sightings = Sightings.of(Instant(self._t_ns, new), optics, self._floor_px)
+        parts = match(optics, states, catalogue, active, sightings).split(
+            [len(frame.roundels) for frame in new]
+        )
+        self._done |= {id(frame): (frame, part) for frame, part in zip(new, parts, strict=True)}
+
+    def whole(self, instant: Instant) -> tuple[Sightings, Matches]:
+        """All detections of the instant, and what they are matched to."""
+        self.add(instant.frames)
+        sightings = Sightings.of(instant, self._scene[0], self._floor_px)
+        counts = [len(frame.roundels) for frame in instant.frames]
+        return sightings, Matches.stack([self._done[id(frame)][1] for frame in instant.frames], counts)
 
 
 def match(

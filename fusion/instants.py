@@ -12,6 +12,7 @@ from calib.camera import Camera
 from camera_node.lens import Lens
 from camera_node.messages import Detections
 from camera_node.roundels import Roundels
+from fusion.undistortion import undistort
 
 Array = NDArray[np.float64]
 
@@ -55,10 +56,7 @@ class Frame:
     @classmethod
     def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":
         """The frame of roundels that a lens saw."""
-        xy = lens.normalise(roundels.uv)
-        scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
-        columns = np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))
-        return cls(name, t_ns, roundels, *columns)
+        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +119,13 @@ class Instants:
         if self._end_ns is None and not self._begin(now_ns):
             return []
         return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns, GONE_NS)
+
+    def open(self) -> Instant | None:
+        """What is there already of the instant that is closed next."""
+        if self._end_ns is None or not self.period_ns or not self._waiting:
+            return None
+        opened = self._gather(self._end_ns, self.period_ns)
+        return opened if opened.frames else None
 
     def finish(self) -> list[Instant]:
         """The instants of all frames that are left, at the end of a recording."""
@@ -186,8 +191,12 @@ class Instants:
         return closed
 
     def _cut(self, end_ns: int, period_ns: int) -> Instant:
-        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
+        instant = self._gather(end_ns, period_ns)
         self._waiting = [frame for frame in self._waiting if frame.t_ns >= end_ns]
+        return instant
+
+    def _gather(self, end_ns: int, period_ns: int) -> Instant:
+        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
         return Instant(end_ns - period_ns // 2, tuple(frames))
 
     def _complete(self, end_ns: int) -> bool:
