@@ -39,7 +39,7 @@ class Trial:
 
     Attributes:
         fault: why no two cameras could be placed; empty where they were.
-        unplaced: names of cameras that could not.
+        unplaced: why, by name of cameras that could not.
         strain: by camera, its covariance in the image over the noise of its pixels.
         used: by camera, the part of what it shares with others that was waved through.
         advice: by camera, where to wave next.
@@ -48,7 +48,7 @@ class Trial:
     """
 
     fault: str = ""
-    unplaced: tuple[str, ...] = ()
+    unplaced: dict[str, str] = field(default_factory=dict)
     strain: dict[str, float] = field(default_factory=dict)
     used: dict[str, float] = field(default_factory=dict)
     advice: dict[str, str] = field(default_factory=dict)
@@ -150,7 +150,8 @@ def _advise(heard: Heard, trial: Trial | None, enough: bool) -> str:
     if trial.fault:
         return trial.fault
     if trial.unplaced:
-        return f"wave where '{trial.unplaced[0]}' and another camera see the wand"
+        name, why = next(iter(trial.unplaced.items()))
+        return f"'{name}' has no place yet: {why}"
     name = min(trial.used, key=trial.used.__getitem__)
     if trial.used[name] < USED and trial.advice.get(name):
         return f"{name}: {trial.advice[name]}"
@@ -210,7 +211,7 @@ def try_part(rig: Rig, wand: Body, part: Sequence[Detections], share: float) -> 
     trust, fewer = assess(result, wand), share**0.5
     delivering = {message.camera for message in part}
     return Trial(
-        unplaced=tuple(name for name in trust.unplaced if name in delivering),
+        unplaced={name: why for name, why in trust.unplaced.items() if name in delivering},
         strain={c.name: fewer * c.strain for c in trust.cameras},
         used={c.name: 1 - c.figures["unused"] for c in trust.cameras},
         advice={c.name: c.wave_next for c in trust.cameras},

@@ -78,7 +78,7 @@ def test_the_rule():
     assert not rule.judge(thin_, 10.0)
     assert not rule.judge(thin_, 10.0 + IDLE_S)
     assert rule.judge(thin_, 10.1 + IDLE_S)
-    missing = Trial(strain=good.strain, used=good.used, unplaced=("c",))
+    missing = Trial(strain=good.strain, used=good.used, unplaced={"c": "never saw the wand; wave before it"})
     assert not rule.judge(missing, 99.0)
     heard = Heard(frames=Counter({"a": 1, "b": 1, "c": 1}))
     advice = [
@@ -89,7 +89,7 @@ def test_the_rule():
         "wave the wand where two cameras or more see it",
         "a: wave in its left",
         "go on, most before 'a'",
-        "wave where 'c' and another camera see the wand",
+        "'c' has no place yet: never saw the wand; wave before it",
         "it failed",
     ]
 
