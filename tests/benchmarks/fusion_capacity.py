@@ -36,7 +36,7 @@ class Capacity:
     p99_ms: float
     cpu: float
     tracked: float
-    grown_mb: float  # resident memory from the start to the end
+    grown_mb_min: float  # slope of the resident memory, a line through one sample a second
 
 
 def capacity(load: Load, seconds: float) -> Capacity:
@@ -63,13 +63,14 @@ class _Queue:
 
     def run(self, seconds: float) -> Capacity:
         """All messages of so many seconds; those of the first `START_S` are not counted."""
-        first_ns, memory, collected_ns = 0, 0.0, 0
+        first_ns, memory, collected_ns = 0, list[tuple[int, float]](), 0
         for message in self.load.messages(seconds):
             data, arrival_ns = encode(message), message.t_ns + DELAY_NS
             first_ns = first_ns or arrival_ns
             counted = arrival_ns - first_ns > START_S * 1e9
             if counted and not memory:
-                memory, self.busy_ns, self.free_ns = memory_mb(), 0, arrival_ns
+                memory.append((arrival_ns, memory_mb()))
+                self.busy_ns, self.free_ns = 0, arrival_ns
                 self.latencies, self.tracked = [], []
             if self.free_ns < arrival_ns:
                 self._spend(self._anticipate)
@@ -78,11 +79,12 @@ class _Queue:
             if arrival_ns - collected_ns > 1e9:
                 self._spend(gc.collect)
                 collected_ns = arrival_ns
+                memory += [(arrival_ns, memory_mb())] if memory else []
         p50, p99 = np.percentile(self.latencies, [50, 99])
         cpu = self.busy_ns / ((seconds - START_S) * 1e9)
         found = float(np.mean(self.tracked)) * len(fused_names(self.tracker)) / len(self.load.bodies)
         cost_ms = 1e3 * cpu / self.load.hz
-        return Capacity(cost_ms, p50, p99, cpu, found, memory_mb() - memory)
+        return Capacity(cost_ms, p50, p99, cpu, found, _slope_mb_min(memory))
 
     def _take(self, data: bytes, arrival_ns: int) -> None:
         self._spend(lambda: self._add(data))
@@ -120,6 +122,12 @@ class _Queue:
         self.free_ns += cost
         self.busy_ns += cost
         return done
+
+
+def _slope_mb_min(memory: list[tuple[int, float]]) -> float:
+    """Of times (ns) and sizes (MB)."""
+    t, size = np.array(memory, float).T
+    return float(np.polyfit((t - t[0]) / 60e9, size, 1)[0]) if len(memory) > 2 else 0.0
 
 
 def fused_names(tracker: Tracker) -> list[str]:
