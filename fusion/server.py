@@ -232,8 +232,9 @@ class Server:
 
     def _anticipate(self) -> None:
         """Use the wait for the last frames of an instant."""
-        if self._tracker is not None and (instant := self._instants.open()) is not None:
-            self._tracker.anticipate(instant)
+        instant, owed = self._instants.open()
+        if self._tracker is not None and instant is not None:
+            self._tracker.anticipate(instant, owed)
 
     def _fuse(self, instant: Instant) -> None:
         if self._tracker is None:

@@ -95,9 +95,14 @@ class Tracker:
         self.advance(instant)
         return self.complete()
 
-    def anticipate(self, instant: Instant) -> None:
-        """Do what can be done of an instant of which some frames are still to come."""
-        self._begin(instant.t_ns).association.add(self._trusted(instant).frames)
+    def anticipate(self, instant: Instant, owed: int) -> None:
+        """Do what can be done of an instant of which `owed` frames are still to come.
+
+        Each round costs as much as three frames, so that one waits for as many frames as are then left.
+        """
+        association, trusted = self._begin(instant.t_ns).association, self._trusted(instant)
+        if len(association.missing(trusted.frames)) >= owed > 0:
+            association.add(trusted.frames)
 
     def advance(self, instant: Instant) -> tuple[RobotPose, ...]:
         """Follow the robots into this instant; the poses that no search can change any more."""
