@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include "cover.hpp"
 
+#include <algorithm>
 #include <cmath>
-#include <cstdio>
+#include <iterator>
 
 #include "gates.hpp"
 #include "ray.hpp"
-#include "surface.hpp"
 
 namespace roundel {
 
@@ -14,12 +14,11 @@ namespace {
 
 constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, where nothing covers them
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
-constexpr int kMostHidden = 18;   // sectors of 32, of either edge
 constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
-constexpr double kInk = 0.05, kSure = 3.5;             // of the contrast and of the noise: a level is another
-constexpr int kBlurred = 4;  // sectors of a run that are hidden by a cover's blurred edge alone
-constexpr double kLeastKnown = 12, kLeastNew = 16;       // pixels: smaller ones tell too little
-
+constexpr int kMostHidden = 18;                         // sectors of 32, of either edge
+constexpr double kLeastKnown = 12, kLeastNew = 16;      // pixels: smaller ones tell too little
+constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
+constexpr int kBlurred = 4;                 // sectors of a run that a cover's blurred edge alone may hide
 
 /// The sectors in which the ring shows a level that is neither ink nor paper.
 Sectors find_foreign(const ImageView& image, const Fit& fit, double noise) {
@@ -66,13 +65,14 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
     for (const double slack : kSlacks) {
         const Hidden hidden = find_hidden(image, fit.p, noise, slack * (fit.bright - fit.dark));
         if (is_hidden_too_much(hidden)) return std::nullopt;
-        if (hidden == start.hidden && slack == kSlacks[3]) break;
+        if (hidden == start.hidden && slack == *std::rbegin(kSlacks)) break;
         start = {fit.outer, fit.ratio, fit.dark, fit.bright, start.print, hidden};
         const auto rest = refine(image, start);
         if (!rest) return std::nullopt;
         fit = *rest;
     }
-    if (!is_as_modelled(fit, noise, kMisfit) || (!known && is_letter(image, fit, start.hidden, noise))) return std::nullopt;
+    if (!is_as_modelled(fit, noise, kMisfit) || (!known && is_letter(image, fit, start.hidden, noise)))
+        return std::nullopt;
     return fit;
 }
 

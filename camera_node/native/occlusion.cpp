@@ -10,9 +10,9 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2;      // pixels on either side of an edge
-constexpr int kPixels = 1500;    // that are looked at, about
-constexpr double kChance = 4;   // standard deviations
+constexpr double kBand = 2;    // pixels on either side of an edge
+constexpr int kPixels = 1500;  // that are looked at, about
+constexpr double kChance = 4;  // standard deviations
 constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
 
 /// Which edge a pixel belongs to, and which sector of it.
@@ -64,11 +64,11 @@ std::array<Misfit, 2> misfit_by_sector(const EdgePixels& pixels, const Parameter
     std::array<Misfit, 2> misfit;
     Gradient at;
     for (int begin = 0; begin < pixels.used; begin += kLanes) {
-        model.evaluate(pixels.x + begin, pixels.y + begin, 1, at);
+        model.evaluate(pixels.x + begin, pixels.y + begin, pixels.level + begin, 1, at);
         for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
             const auto [inner, sector] = compass.locate(pixels.x[begin + k], pixels.y[begin + k]);
-            const float said = std::clamp(at.level[0][k], 0.0f, 255.0f), r = pixels.level[begin + k] - said;
-            misfit[inner].add(sector, double(std::abs(at.ring[0][k])), double(r));
+            if (std::abs(at.residual[0][k]) < 256)  // others are clipped
+                misfit[inner].add(sector, double(std::abs(at.ring[0][k])), double(at.residual[0][k]));
         }
     }
     return misfit;

@@ -33,8 +33,8 @@ struct Hidden {
 /// Takes what is hidden out of the pixels.
 void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels);
 
-/// The sectors in which an edge is off the model `p` (in the image's frame) by more than the noise explains and
-/// `slack`, both in grey levels RMS; and those so near to them that what covers them may reach there too.
+/// The sectors in which an edge is off the model `p` (in the image's frame) by more than the noise explains
+/// and `slack`, both in grey levels RMS; and those so near to them that what covers them may reach there too.
 Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack);
 
 }  // namespace roundel
