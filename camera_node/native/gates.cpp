@@ -39,14 +39,6 @@ bool is_covered(const ImageView& image, const Fit& fit, double noise, bool known
     return (known || !letter) && surface.off <= kMostCovered * surface.seen;
 }
 
-/// Contrast, ratio and size within their limits, and levels that a camera can give.
-bool has_limits(const Fit& fit, const Settings& settings) {
-    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
-           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
-           fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
-           fit.outer.major <= settings.max_diameter;
-}
-
 /// The gates that end false positives.
 bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings, double noise, bool known) {
     if (!has_limits(fit, settings)) return false;
@@ -57,6 +49,13 @@ bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings
 }
 
 }  // namespace
+
+bool has_limits(const Fit& fit, const Settings& settings) {
+    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
+           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
+           fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
+           fit.outer.major <= settings.max_diameter;
+}
 
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
                                bool known) {

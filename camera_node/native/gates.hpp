@@ -8,6 +8,9 @@
 
 namespace roundel {
 
+/// Contrast, ratio and size within their limits, and levels that a camera can give.
+bool has_limits(const Fit& fit, const Settings& settings);
+
 /// The fit to the picture as it is or, where its edges are ragged (drawn, sharpened, badly printed), to the
 /// softened one; nothing where neither passes the gates that end false positives. They are wider for what is
 /// `known` from the last frame.

@@ -19,8 +19,9 @@ constexpr double kArrived = 0.1, kDone = 0.01;  // greatest moves of a step, pix
 constexpr double kMinBlur = 0.29, kStartBlur = 0.9;
 constexpr double kCardRatio = 9.0 / 7;
 constexpr double kLeastMotion = 0.1;  // of the minor axis: what moves less is still
+constexpr double kHopeless = 0.15;    // residuals over the contrast that no more steps will mend
 constexpr double kShortestFocal = 400;
-constexpr double kBeyond = 40;       // grey levels off the scale
+constexpr double kBeyond = 40;        // grey levels off the scale
 constexpr double kLeastSpread = 0.2;  // of the ground, grey levels
 constexpr double kMostSpread = 100;
 constexpr double kPatch = 64;  // pixels of the ground that are off together
@@ -63,7 +64,7 @@ class MovingFitter {
 
     bool solve() {
         return iterate(kCoarsePixels, kCoarseSpacing, kCoarseSteps, kArrived) &&
-               iterate(kFinePixels, kFineSpacing, kFineSteps, kDone);
+               noise_ < kHopeless * contrast() && iterate(kFinePixels, kFineSpacing, kFineSteps, kDone);
     }
     Fit fit() const;
 
@@ -106,10 +107,13 @@ class MovingFitter {
         double moved = std::max(std::abs(delta[kMotionX]), std::abs(delta[kMotionY])) / 2;
         for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[kStill + i]));
         const double longest = std::sqrt(size(start_)) / 4, share = std::min(1.0, longest / moved);
-        for (int i = 0; i < kMovingCount; ++i) p_[i] += (i < kStill || i >= kStill + kBlur ? share : 1) * delta[i];
+        for (int i = 0; i < kMovingCount; ++i)
+            p_[i] += (i < kStill || i >= kStill + kBlur ? share : 1) * delta[i];
         p_[kStill + kBlur] = std::max(p_[kStill + kBlur], kMinBlur);
         return moved;
     }
+
+    double contrast() const { return p_[kStill + kBright] - p_[kStill + kDark]; }
 
     static double size(const MovingParameters& p) {
         return p[kStill + kAxx] * p[kStill + kAyy] - square(p[kStill + kAxy]);
@@ -135,7 +139,13 @@ class MovingFitter {
 
 Fit MovingFitter::fit() const {
     const Parameters p = still(p_);
-    Fit fit = picture_of(p, pixels_.origin_x, pixels_.origin_y);
+    const CircleImage outer = circle_image(p, 1);
+    const Eigen axes = eigen(outer.shape);
+    Fit fit{};
+    fit.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
+                 2 * std::sqrt(axes.second), axes.angle};
+    fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
+    fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
     auto pose = factor_->inverse_tail<kPoseCount>();
     for (auto& row : pose)
         for (double& value : row) value *= square(noise_);
@@ -154,7 +164,7 @@ std::optional<Fit> refine_moving(const ImageView& image, const MovingStart& star
     if (!fitter.solve()) return std::nullopt;
     const Fit fit = fitter.fit();
     return std::hypot(fit.motion_x, fit.motion_y) > kLeastMotion * fit.outer.minor ? std::optional(fit)
-                                                                                  : std::nullopt;
+                                                                                   : std::nullopt;
 }
 
 }  // namespace roundel

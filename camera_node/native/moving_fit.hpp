@@ -15,8 +15,8 @@ struct MovingStart {
 };
 
 /// Fits a roundel that moves straight and evenly while it is exposed: `refine`'s model, averaged over the
-/// exposure, with two more unknowns. By Gauss-Newton, first on a part of the pixels. The ellipse that it gives
-/// is that of mid-exposure, and `dark` and `bright` are the levels of a still picture.
+/// exposure, with two more unknowns. By Gauss-Newton, first on a part of the pixels. The ellipse that it
+/// gives is that of mid-exposure, and `dark` and `bright` are the levels of a still picture.
 ///
 /// What lies under the moving card is seen through for a part of the exposure. Of a cluttered ground no more
 /// is known than how much it varies, so pixels count less the more of it they saw.

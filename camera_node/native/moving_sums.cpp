@@ -98,7 +98,8 @@ void select_moving(const ImageView& image, const MovingParameters& p, int limit,
     const Eigen axes = eigen(circle_image(still(p), 1).shape);
     const double a = std::sqrt(axes.first), b = std::sqrt(axes.second);
     const double reach = 1 + kMargin / b, x0 = p[kStill + kX], y0 = p[kStill + kY];
-    const double half_w = a * reach + std::abs(p[kMotionX]) / 2, half_h = a * reach + std::abs(p[kMotionY]) / 2;
+    const double half_w = a * reach + std::abs(p[kMotionX]) / 2,
+                 half_h = a * reach + std::abs(p[kMotionY]) / 2;
     const double area = reach * b * (std::numbers::pi * a * reach + 2 * std::hypot(p[kMotionX], p[kMotionY]));
     const int step = std::max(1, int(std::lround(std::sqrt(area / limit))));
     pixels.used = pixels.expected = 0;

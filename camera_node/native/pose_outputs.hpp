@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
-#include <cmath>
-
 #include "refine.hpp"
 #include "roundel_model.hpp"
 
 namespace roundel {
 
-/// By the model's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
-/// first order in g.
+/// By the model's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e,
+/// to first order in g.
 inline std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
     const double gx = p[kGx], gy = p[kGy];
     const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
@@ -30,17 +28,6 @@ inline PoseCovariance output_covariance(const Parameters& p,
         for (int b = 0; b < kPoseCount; ++b)
             for (int j = 0; j < kPoseCount; ++j) whole[a][b] += half[a][j] * T[b][j];
     return whole;
-}
-
-/// The fit's ellipse and offset in the image, of a model whose frame begins at (x, y); the rest is left out.
-inline Fit picture_of(const Parameters& p, int x, int y) {
-    const CircleImage outer = circle_image(p, 1);
-    const Eigen axes = eigen(outer.shape);
-    Fit fit{};
-    fit.outer = {outer.x + x, outer.y + y, 2 * std::sqrt(axes.first), 2 * std::sqrt(axes.second), axes.angle};
-    fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
-    fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
-    return fit;
 }
 
 }  // namespace roundel

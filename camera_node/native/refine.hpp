@@ -28,8 +28,8 @@ struct Fit {
     double dark, bright;   // grey levels
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
-    double agreeing_residual;  // over those that agree
-    double support;            // share of the ring's edges that is in the image and agrees
+    double agreeing_residual;           // over those that agree
+    double support;                     // share of the ring's edges that is in the image and agrees
     double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
     /// Of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
