@@ -47,14 +47,23 @@ class MovingModel {
         for (int n = 0; n < instants_; ++n) {
             const float t = reach_ * ((float(n) + 0.5f) * per_instants_ - 0.5f);
             for (int k = 0; k < count * kLanes; ++k) u[k] = x[k] - t * motion_x_, v[k] = y[k] - t * motion_y_;
-            model_.evaluate(u, v, count, now);
+            model_.evaluate(u, v, kNothing.data(), count, now);
             add(now, t, count, to);
         }
     }
 
   private:
+    /// The still model compares with what is seen, which is the mean over the exposure: it gets a level that
+    /// is within the scale, to be compared with here.
+    static constexpr float kLevel = 128;
+    static constexpr std::array<float, kChunk * kLanes> kNothing = [] {
+        std::array<float, kChunk * kLanes> levels{};
+        for (float& level : levels) level = kLevel;
+        return levels;
+    }();
+
     ROUNDEL_INLINE static void clear(int count, MovingGradient& to) {
-        for (int k = 0; k < count; ++k) to.level[k] = all(0);
+        for (int k = 0; k < count; ++k) to.level[k] = all(kLevel);
         for (auto& column : to.by)
             for (int k = 0; k < count; ++k) column[k] = all(0);
     }
@@ -62,7 +71,7 @@ class MovingModel {
     /// At time t, in exposures from the middle, the motion has moved the centre by t times itself.
     ROUNDEL_INLINE void add(const Gradient& now, float t, int count, MovingGradient& to) const {
         const float w = per_instants_, wt = w * t;
-        for (int k = 0; k < count; ++k) to.level[k] += w * now.level[k];
+        for (int k = 0; k < count; ++k) to.level[k] -= w * now.residual[k];
         for (int i = 0; i < kCount; ++i)
             for (int k = 0; k < count; ++k) to.by[kStill + i][k] += w * now.by[i][k];
         for (int k = 0; k < count; ++k) {
