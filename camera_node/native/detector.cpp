@@ -7,6 +7,7 @@
 
 #include "circles.hpp"
 #include "gates.hpp"
+#include "moving.hpp"
 #include "surface.hpp"
 
 namespace roundel {
@@ -33,7 +34,8 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
 
 void Detector::follow(const ImageView& image) {
     for (const auto& expected : tracks_.expect())
-        accept(image, fit_circles(image, expected.seed, settings_), expected.track);
+        if (!accept(image, fit_circles(image, expected.seed, settings_), expected.track))
+            keep(image, follow_moving(image, expected, settings_, noise_), expected.track);
 }
 
 /// The rows of the image that this frame's search looks at.
@@ -68,13 +70,19 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
     }
 }
 
-/// Fits, tests and keeps a roundel, unless it was found before.
-void Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
-    if (!start || found_.size() >= kMaxRoundels || claims_.cover(start->outer.x, start->outer.y)) return;
-    const auto fit = fit_roundel(image, *start, settings_, noise_, track >= 0);
-    if (!fit || is_bullseye(image, *fit)) return;
+/// Fits, tests and keeps a roundel, unless it was found before; whether it is there.
+bool Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
+    if (!start) return false;
+    if (claims_.cover(start->outer.x, start->outer.y)) return true;
+    return keep(image, fit_roundel(image, *start, settings_, noise_, track >= 0), track);
+}
+
+bool Detector::keep(const ImageView& image, const std::optional<Fit>& fit, int track) {
+    if (!fit || found_.size() >= kMaxRoundels || claims_.cover(fit->outer.x, fit->outer.y)) return false;
+    if (is_bullseye(image, *fit)) return false;
     claims_.add(fit->outer);
     found_.push_back({*fit, track});
+    return true;
 }
 
 void Detector::update_theta() {

@@ -26,7 +26,8 @@ class Detector {
     void follow(const ImageView& image);
     void search(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
-    void accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
     ImageView next_band(const ImageView& image, int& top);
     void update_theta();
 

@@ -7,6 +7,7 @@
 #include "cholesky.hpp"
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
+#include "pose_outputs.hpp"
 
 namespace roundel {
 
@@ -178,17 +179,6 @@ class Fitter {
     double scale_ = 255, noise_ = 0;
 };
 
-/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
-/// first order in g.
-std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
-    const double gx = p[kGx], gy = p[kGy];
-    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
-    std::array<Vector<kPoseCount>, kPoseCount> T{};
-    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
-    for (int k = 0; k < 5; ++k) T[k][k] += 1;
-    return T;
-}
-
 /// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
 void Fitter::learn_print(double ratio) {
     Parameters unit{};
@@ -205,15 +195,9 @@ PoseCovariance Fitter::covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
-    const auto T = outputs_by_pose(p);
-    PoseCovariance half{}, whole{};
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int i = 0; i < kPoseCount; ++i)
-            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int b = 0; b < kPoseCount; ++b)
-            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
-    return whole;
+    for (auto& row : inverse)
+        for (double& value : row) value *= square(noise_);
+    return output_covariance(p, inverse);
 }
 
 Fit Fitter::fit() const {
