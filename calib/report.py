@@ -173,7 +173,7 @@ def _remarks(report: WandReport) -> list[str]:
             f"{o.camera} {o.t_s:.3f} s marker {o.marker} ({o.off_px:.1f} px)" for o in report.outliers[:WORST]
         )
         lines.append(f"{len(report.outliers)} marker centres rejected as outliers; the worst: {worst}")
-    lines += [f"warning: camera '{name}' has no pose: {why}" for name, why in report.unplaced.items()]
+    lines += [f"warning: camera '{name}' has no place: {why}" for name, why in report.unplaced.items()]
     lines.append(
         "world: z up as the cameras are mounted (upright), origin under the middle of the wave, z = 0 at its lowest"
     )

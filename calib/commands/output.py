@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What all subcommands do with their result: write it, say where, and how it was made."""
 
+import os
 import shlex
 import sys
 from datetime import UTC, datetime
@@ -17,6 +18,8 @@ def check_folder(out: Path) -> None:
     """Raise ConfigError, before any work is done, where `out` can't be written."""
     if not out.parent.is_dir():
         raise ConfigError(f"{out.parent} is no folder; --out can't be written there")
+    if not os.access(out.parent, os.W_OK):
+        raise ConfigError(f"{out.parent} can't be written to; give --out a file in another folder")
     if out.is_dir():
         raise ConfigError(f"{out} is a folder; give --out a file such as {out / 'rig.yaml'}")
 
