@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 
 # Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
+# Of the best known direction of a knot's place, and of its velocity: what holds the others. GTSAM takes pivots for
+# singular that are 2^12 apart.
+HELD = 2.0**-22
 
 
 def solve(linear: Linearisation, damping: float) -> tuple[Array, Array]:
@@ -43,12 +46,15 @@ def camera_information(linear: Linearisation, state: State) -> Array:
 
 
 def _graph(linear: Linearisation, damping: float) -> Any:
-    """GTSAM's graph: keys are the K knots, then the cameras. The Hessian's diagonal is grown (Marquardt)."""
+    """GTSAM's graph: keys are the K knots, then the cameras. The Hessian's diagonal is grown (Marquardt), and where one
+    camera alone saw a knot, held along its ray."""
     import gtsam
 
     graph, (of_knots, of_cameras) = gtsam.GaussianFactorGraph(), linear.diagonal()
     _add_views(graph, linear)
-    _add_motion(graph, linear.chain, damping * of_knots)
+    parts = of_knots.reshape(len(of_knots), 2, -1)
+    held = (HELD * parts.max(axis=2, keepdims=True) * np.ones_like(parts)).reshape(of_knots.shape)
+    _add_motion(graph, linear.chain, damping * of_knots + held)
     _add_rig(graph, linear)
     for camera in linear.problem.cameras() if damping else ():
         grown = damping * of_cameras[camera]
