@@ -21,12 +21,13 @@ constexpr int kOverlap = 64;           // pixels that a searched band reaches in
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear();
+    found_.clear(), lost_.clear();
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
     follow(image);
     search(image);
+    follow_smeared(image);
     tracks_.update(found_);
     update_theta();
     return found_;
@@ -35,7 +36,20 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
 void Detector::follow(const ImageView& image) {
     for (const auto& expected : tracks_.expect())
         if (!accept(image, fit_circles(image, expected.seed, settings_), expected.track))
+            lost_.push_back(expected);
+}
+
+/// Those that were in the last frame, and are not to be seen sharp in this one.
+void Detector::follow_smeared(const ImageView& image) {
+    for (const auto& expected : lost_) {
+        const auto is_it = [&](const Roundel& r) {
+            const double apart =
+                std::hypot(r.fit.outer.x - double(expected.seed.x), r.fit.outer.y - double(expected.seed.y));
+            return r.track < 0 && apart < r.fit.outer.major;
+        };
+        if (std::none_of(found_.begin(), found_.end(), is_it))
             keep(image, follow_moving(image, expected, settings_, noise_), expected.track);
+    }
 }
 
 /// The rows of the image that this frame's search looks at.

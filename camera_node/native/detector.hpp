@@ -25,6 +25,7 @@ class Detector {
   private:
     void follow(const ImageView& image);
     void search(const ImageView& image);
+    void follow_smeared(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
     bool accept(const ImageView& image, const std::optional<Start>& start, int track);
     bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
@@ -37,6 +38,7 @@ class Detector {
     Tracks tracks_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
+    std::vector<Tracks::Expected> lost_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     std::mutex mutex_;

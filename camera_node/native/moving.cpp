@@ -4,17 +4,20 @@
 #include <cmath>
 
 #include "gates.hpp"
+#include "smear.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr double kMisfit = 0.02;                // of the contrast, RMS on the ring's edges
-constexpr double kLeastSeen = 0.7;              // share of the way that is in the image
-constexpr double kMostMotion = 1.2;             // of the major axis
-constexpr double kSureness = 0.05;              // of the minor axis: deviation of the centre, at the most
-constexpr double kLeastTracked = 0.1;           // of the minor axis: slower tracks are not smeared
-constexpr double kShares[] = {0.5, 0.25, 0.9};  // of the exposure in the time between frames
+constexpr double kMisfit = 0.02;     // of the contrast, RMS on the ring's edges
+constexpr double kLeastSeen = 0.7;   // share of the way that is in the image
+constexpr double kMostMotion = 1.2;  // of the major axis
+constexpr double kSureness = 0.05;   // of the minor axis: deviation of the centre, at the most
+constexpr double kLeastMinor = 12;   // pixels: smaller ones are not told from clutter
+constexpr double kReach = 0.75;      // minor axes that are searched around where it is expected, and
+constexpr double kChange = 0.5;      // so much of its way from frame to frame more,
+constexpr double kMostReach = 2.5;   // at the most
 
 bool is_moving_roundel(const Fit& fit, const Settings& settings, double noise) {
     const double misfit = std::hypot(1.2 * noise, kMisfit * (fit.bright - fit.dark));
@@ -40,13 +43,12 @@ std::optional<Fit> follow_moving(const ImageView& image, const Tracks::Expected&
     start.still.outer.x += expected.vx, start.still.outer.y += expected.vy;
     if (std::hypot(start.motion_x, start.motion_y) > 0)
         if (const auto fit = fit_moving(image, start, settings, noise)) return fit;
-    const double speed = std::hypot(expected.vx, expected.vy);
-    if (speed < kLeastTracked * last.outer.minor) return std::nullopt;
-    for (const double share : kShares) {
-        const double part = std::min(share, 0.8 * last.outer.major / speed);
-        start.motion_x = part * expected.vx, start.motion_y = part * expected.vy;
-        if (const auto fit = fit_moving(image, start, settings, noise)) return fit;
-    }
+    const double speed = std::hypot(expected.vx, expected.vy), minor = last.outer.minor;
+    if (minor < kLeastMinor) return std::nullopt;
+    const double reach = std::min(kReach * minor + kChange * speed, kMostReach * minor);
+    for (const MovingStart& place :
+         search_smeared(image, last, start.still.outer.x, start.still.outer.y, reach))
+        if (const auto fit = fit_moving(image, place, settings, noise)) return fit;
     return std::nullopt;
 }
 

@@ -13,8 +13,8 @@ namespace roundel {
 std::optional<Fit> fit_moving(const ImageView& image, const MovingStart& start, const Settings& settings,
                               double noise);
 
-/// A roundel of the last frame that is not to be seen sharp where it is expected: tried with the motion
-/// during the exposure that it had then, and with several along its way from frame to frame.
+/// A roundel of the last frame that is not to be seen sharp in this one: tried with the motion that it had
+/// then, and wherever around its expected place it looks smeared.
 std::optional<Fit> follow_moving(const ImageView& image, const Tracks::Expected& expected,
                                  const Settings& settings, double noise);
 
