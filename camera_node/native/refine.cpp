@@ -13,10 +13,13 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2.5;       // pixels on either side of an edge that are used, at the least
-constexpr double kBandBlurs = 2.5;  // blurs, likewise
+constexpr double kNarrow = 1.25,
+                 kNarrowBlurs = 1.5;             // pixels on either side of an edge, at the least; and blurs
+constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
+constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
+constexpr double kConverged = 0.4;         // standard deviations that may be left to go
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
@@ -66,13 +69,14 @@ class Fitter {
 
     bool solve() {
         // Perspective moves the inner edge and the card's from where the start has them.
-        const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select(kBand + unknown, kCoarsePixels)) return false;
+        const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
+        if (!select({wide, wide, true}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card();
         if (!iterate(2)) return false;
-        const double band = std::max(kBand, kBandBlurs * p[kBlur]);
-        if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
-        return iterate(1);
+        const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
+        const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
+                        card};
+        return select(band, EdgePixels::kMax) && iterate(1);
     }
 
     void learn_print(double ratio);
@@ -82,8 +86,8 @@ class Fitter {
   private:
     PoseCovariance covariance() const;
 
-    bool select(double band, int limit) {
-        step_ = select_pixels(image_, p, band, limit, pixels_);
+    bool select(const Band& band, int limit) {
+        select_pixels(image_, p, band, limit, pixels_);
         if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
     }
@@ -117,7 +121,7 @@ class Fitter {
             const double deviation = noise_ / std::sqrt(equations_.H[kX][kX] + equations_.H[kY][kY]);
             double left = moved;
             for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
-            if (left < 0.2 * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
+            if (left < kConverged * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
         }
         return true;
     }
@@ -175,7 +179,6 @@ class Fitter {
     Leftover left_;
     std::optional<Cholesky<kCount>> factor_;
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
-    int step_ = 1;
     double scale_ = 255, noise_ = 0;
 };
 
