@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from calib.trust import Trust
     from calib.waving import Progress
 
+WIDENED = 1.2  # below, it is not worth a line
 WORST = 5  # outliers that are listed one by one
 
 
@@ -51,7 +52,7 @@ class WandReport:
 
     `unplaced` holds the reason for each camera without a pose; `scale` is what residuals are over what the detector
     claimed; lengths are those that the cameras measure less the wand file's, None without two markers; `metric` is
-    False where nothing gives the scale.
+    False where nothing gives the scale; standard deviations are `widened` times what independent errors would give.
     """
 
     cameras: list[CameraReport]
@@ -62,6 +63,7 @@ class WandReport:
     length_std_mm: float | None
     outliers: list[Outlier]
     metric: bool
+    widened: float = 1.0
 
     @property
     def residual_px(self) -> float:
@@ -79,6 +81,7 @@ class WandReport:
             "metric": self.metric,
             "instants": self.instants,
             "residual_px": round(self.residual_px, 4),
+            "widened": round(self.widened, 2),
             "wand_length_error_mm": _figures(self.length_mean_mm, self.length_std_mm),
             "cameras": {
                 row.name: {
@@ -168,6 +171,11 @@ def show_progress(told: "Progress") -> Group:
 
 def _remarks(report: WandReport) -> list[str]:
     lines = [f"{report.instants} instants, residual {report.residual_px:.3f} px"]
+    if report.widened > WIDENED:
+        lines.append(
+            f"what neighbouring moments say is off alike (a lens or a clock that fits not quite): all errors below are "
+            f"taken {report.widened:.1f} times as large as noise alone would make them"
+        )
     if report.length_mean_mm is not None and report.length_std_mm is not None:
         lines.append(
             f"wand length as the cameras measure it: {report.length_mean_mm:+.2f} mm off in the mean, "
