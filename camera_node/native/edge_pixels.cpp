@@ -96,8 +96,7 @@ int select_pixels(const ImageView& image, const Parameters& p, double band, int 
     const int top = int(std::ceil(all.from[0].top())), bottom = int(std::floor(all.from[0].bottom()));
     const int step = std::max(1, std::min(int(std::ceil(all.area / limit)), (bottom - top) / kMinRows));
     for (int y = top; y <= bottom; y += step) append_row(image, y + pixels.origin_y, all, pixels);
-    pixels.count = (pixels.used + kLanes - 1) / kLanes * kLanes;
-    for (int k = pixels.used; k < pixels.count; ++k) pixels.x[k] = pixels.y[k] = 0, pixels.level[k] = -1;
+    pixels.fill_up();
     return step;
 }
 

@@ -15,6 +15,11 @@ struct EdgePixels {
     int used = 0;                    // pixels inside the image
     int expected = 0;                // and outside
     alignas(4 * kLanes) float x[kMax], y[kMax], level[kMax];
+    /// Ends the columns with whole lanes.
+    void fill_up() {
+        count = (used + kLanes - 1) / kLanes * kLanes;
+        for (int k = used; k < count; ++k) x[k] = y[k] = 0, level[k] = -1;
+    }
 };
 
 /// Fills `pixels` by what lies within `band` pixels of the three edges that `p` says, in every n-th row: n is

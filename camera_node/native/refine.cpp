@@ -57,7 +57,7 @@ Parameters prior_information(double major) {
 /// Gauss-Newton on the pixels near one roundel's edges.
 class Fitter {
   public:
-    Fitter(const ImageView& image, const Start& start) : image_(image) {
+    Fitter(const ImageView& image, const Start& start) : image_(image), hidden_(start.hidden) {
         pixels_.origin_x = int(std::lround(start.outer.x));
         pixels_.origin_y = int(std::lround(start.outer.y));
         p = start_ = begin(start, pixels_);
@@ -84,6 +84,7 @@ class Fitter {
 
     bool select(double band, int limit) {
         step_ = select_pixels(image_, p, band, limit, pixels_);
+        if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
@@ -166,6 +167,7 @@ class Fitter {
     }
 
     const ImageView& image_;
+    Hidden hidden_;
     EdgePixels pixels_;
     Parameters start_, prior_;
     Linearisation model_;
@@ -201,6 +203,8 @@ PoseCovariance Fitter::covariance() const {
 Fit Fitter::fit() const {
     const CircleImage outer = circle_image(p, 1);
     const Eigen axes = eigen(outer.shape);
+    Parameters in_image = p;
+    in_image[kX] += pixels_.origin_x, in_image[kY] += pixels_.origin_y;
     return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                       2 * std::sqrt(axes.second), axes.angle},
             .offset_x = p[kX] - outer.x,
@@ -211,8 +215,8 @@ Fit Fitter::fit() const {
             .bright = p[kBright],
             .blur = p[kBlur],
             .edge_residual = std::sqrt(left_.ring_rr / left_.ring),
-            .agreeing_residual = std::sqrt(left_.wrr / std::max(1.0, left_.w)),
-            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected};
+            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected,
+            .p = in_image};
 }
 
 }  // namespace
