@@ -21,7 +21,7 @@ constexpr double kCardRatio = 9.0 / 7;
 constexpr double kLeastMotion = 0.1;  // of the minor axis: what moves less is still
 constexpr double kHopeless = 0.15;    // residuals over the contrast that no more steps will mend
 constexpr double kShortestFocal = 400;
-constexpr double kBeyond = 40;        // grey levels off the scale
+constexpr double kBeyond = 100;       // grey levels off the scale
 constexpr double kLeastSpread = 0.2;  // of the ground, grey levels
 constexpr double kMostSpread = 100;
 constexpr double kPatch = 64;  // pixels of the ground that are off together
@@ -82,7 +82,7 @@ class MovingFitter {
             if (!is_sane()) return false;
             if (k > 0 && moved < enough) return true;
         }
-        return enough > kDone / 2;
+        return true;
     }
 
     /// The noise where no ground was seen, and how much the ground varies where it was.
@@ -124,7 +124,7 @@ class MovingFitter {
         const Parameters p = still(p_), s = still(start_);
         return std::hypot(p[kX] - s[kX], p[kY] - s[kY]) < 1 + 0.6 * radius && p[kAxx] > 0 &&
                area > square(0.6) && area < square(1.6) && p[kRatio] > 0.1 && p[kRatio] < 0.95 &&
-               p[kBlur] < 3 && p[kCard] > 1 && p[kDark] > -kBeyond - 60 && p[kBright] < 255 + kBeyond + 60 &&
+               p[kBlur] < 3 && p[kCard] > 1 && p[kDark] > -kBeyond && p[kBright] < 255 + kBeyond &&
                square(p[kGx]) + square(p[kGy]) < square(0.5 / p[kCard]) &&
                std::hypot(p_[kMotionX], p_[kMotionY]) < 4 * radius;
     }
@@ -145,6 +145,7 @@ Fit MovingFitter::fit() const {
     fit.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                  2 * std::sqrt(axes.second), axes.angle};
     fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
+    fit.p = p, fit.p[kX] += pixels_.origin_x, fit.p[kY] += pixels_.origin_y;
     fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
     auto pose = factor_->inverse_tail<kPoseCount>();
     for (auto& row : pose)

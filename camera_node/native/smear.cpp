@@ -17,10 +17,10 @@ constexpr int kInstants = 12;                // of the exposure
 constexpr int kDirections = 6;
 constexpr double kLengths[] = {0.35, 0.7};  // of the motion, diameters
 constexpr double kCard = 9.0 / 7;
-constexpr double kSteps = 7;      // to a minor axis
-constexpr int kMost = 3;          // places to be fitted
-constexpr double kUnlike = 0.25;  // of the contrast: RMS of what is no roundel
-constexpr double kApart = 0.3;    // of the minor axis, from one place to the next
+constexpr double kSteps = 7;     // to a minor axis
+constexpr int kMost = 3;         // places to be fitted
+constexpr double kUnlike = 0.3;  // of the contrast: RMS of what is no roundel
+constexpr double kApart = 0.3;   // of the minor axis, from one place to the next
 
 struct Point {
     double x, y;
