@@ -12,7 +12,8 @@ namespace roundel {
 
 namespace {
 
-constexpr int kLeast = 9;           // rays of each kind that must agree: what 30 % of a disc covered leaves
+constexpr int kLeast = 9;  // rays of each kind that must agree: what 30 % of a disc covered leaves
+constexpr int kLeastOfHalf = 14, kLeastCovered = 6;
 constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
 constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
@@ -23,13 +24,15 @@ struct Crossing {
     double x, y;
     bool outer;
     float ratio;  // of the ray's inner distance to its outer one; 0 where it has one only
+    int ray;
 };
 
 struct Crossings {
     std::array<Crossing, 2 * kRays> list;
     int count = 0;
-    void add(Direction direction, double at, bool outer, float ratio) {
-        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer, ratio};
+    void add(int ray, double at, bool outer, float ratio) {
+        const Direction direction = kDirections[size_t(ray)];
+        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer, ratio, ray};
     }
 };
 
@@ -48,19 +51,21 @@ Ratios ratios_near_middle(const Settings& settings) {
 /// nothing is there.
 constexpr std::array<int, kRays> kOrder{2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15, 0, 8, 4, 12};
 
+using Weights = std::array<double, 2 * kRays>;
+
 Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
     const float theta = float(seed.dark + seed.bright) / 2;
     Crossings crossings;
     int missed = 0;
     for (int k = 0; k < kRays && missed <= 2 + k / 3; ++k) {
-        const Direction direction = kDirections[size_t(kOrder[size_t(k)])];
-        Ray ray(image, seed.x, seed.y, direction);
+        const int number = kOrder[size_t(k)];
+        Ray ray(image, seed.x, seed.y, kDirections[size_t(number)]);
         const float inner = ray.turn(true, theta, seed.reach);
         const float outer = inner < 0 ? -1 : ray.turn(false, theta, inner / float(ratios.least) + 2);
         const bool both = outer >= 0 && double(inner) < ratios.most * double(outer) + 1;
         const float ratio = both ? inner / outer : 0;
-        if (inner >= 0) crossings.add(direction, double(inner), false, ratio);
-        if (both) crossings.add(direction, double(outer), true, ratio);
+        if (inner >= 0) crossings.add(number, double(inner), false, ratio);
+        if (both) crossings.add(number, double(outer), true, ratio);
         missed += !both;
     }
     return crossings;
@@ -79,7 +84,7 @@ struct Conics {
 };
 
 /// Linear least squares, each crossing with its weight.
-std::optional<Conics> solve(const Crossings& crossings, const std::array<double, 2 * kRays>& weights) {
+std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) {
     std::array<Vector<6>, 6> H{};
     Vector<6> g{};
     for (int k = 0; k < crossings.count; ++k) {
@@ -109,7 +114,7 @@ struct Frame {
 };
 
 /// Weights by distance from the ellipses; returns how many crossings agree, of the kind of which fewer do.
-int reweigh(const Crossings& crossings, const Conics& conics, std::array<double, 2 * kRays>& weights) {
+int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) {
     const Frame frame(conics);
     int agree[2] = {0, 0};
     for (int k = 0; k < crossings.count; ++k) {
@@ -124,28 +129,49 @@ int reweigh(const Crossings& crossings, const Conics& conics, std::array<double,
 }
 
 /// Weights to begin with: from near the middle, rays that nothing covers have about the same ratio.
-std::array<double, 2 * kRays> weigh(const Crossings& crossings) {
+Weights weigh(const Crossings& crossings) {
     std::array<float, 2 * kRays> ratios;
     int n = 0;
     for (int k = 0; k < crossings.count; ++k)
         if (const Crossing& p = crossings.list[size_t(k)]; p.outer) ratios[size_t(n++)] = p.ratio;
     std::nth_element(ratios.begin(), ratios.begin() + n / 2, ratios.begin() + n);
-    std::array<double, 2 * kRays> weights;
+    Weights weights;
     for (int k = 0; k < crossings.count; ++k)
         weights[size_t(k)] = redescend(double(crossings.list[size_t(k)].ratio - ratios[size_t(n / 2)]) / 0.1);
     return weights;
 }
 
-std::optional<Conics> fit(const Crossings& crossings) {
-    std::array<double, 2 * kRays> weights = weigh(crossings);
+/// Solves and weighs anew from some weights on, until ever more crossings agree and at last `least`.
+std::optional<Conics> settle(const Crossings& crossings, Weights weights, int least) {
     std::optional<Conics> conics;
     for (int k = 0, agree = 0; k < kReweights && 2 * agree < crossings.count; ++k) {
         conics = solve(crossings, weights);
         if (!conics || !Frame(*conics).is_valid()) return std::nullopt;
         agree = reweigh(crossings, *conics, weights);
-        if (agree < kLeast - kReweights + 1 + k) return std::nullopt;  // ever more must agree
+        if (agree < least - kReweights + 1 + k) return std::nullopt;
     }
     return conics;
+}
+
+/// Of the crossings on half of the rays, side by side, those with which most agree: something covers the
+/// rest.
+std::optional<Conics> settle_half(const Crossings& crossings) {
+    int most = 0;
+    Weights best{};
+    for (int first = 0; first < kRays; first += 2) {
+        Weights weights;
+        int n = 0;
+        for (int k = 0; k < crossings.count; ++k) {
+            const bool in = (crossings.list[size_t(k)].ray - first + kRays) % kRays < kRays / 2;
+            weights[size_t(k)] = in, n += in;
+        }
+        if (n < kLeastOfHalf) continue;
+        const auto conics = solve(crossings, weights);
+        if (!conics || !Frame(*conics).is_valid()) continue;
+        if (const int agree = reweigh(crossings, *conics, weights); agree > most)
+            most = agree, best = weights;
+    }
+    return most ? settle(crossings, best, kLeastCovered) : std::nullopt;
 }
 
 Ellipse outer_ellipse(const Conics& c, const Frame& frame) {
@@ -169,8 +195,10 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
     std::optional<Start> start;
     for (int k = 0; k < kCasts; ++k) {
         const Crossings crossings = cast(image, from, ratios);
-        if (crossings.count < 2 * kLeast) return std::nullopt;
-        const auto conics = fit(crossings);
+        if (crossings.count < 2 * kLeastCovered + 2) return std::nullopt;
+        auto conics =
+            crossings.count < 2 * kLeast ? std::nullopt : settle(crossings, weigh(crossings), kLeast);
+        if (!conics) conics = settle_half(crossings);
         if (!conics) return std::nullopt;
         const Frame frame(*conics);
         Ellipse outer = outer_ellipse(*conics, frame);

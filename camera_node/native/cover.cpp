@@ -5,7 +5,6 @@
 #include <cmath>
 #include <iterator>
 
-#include "gates.hpp"
 #include "ray.hpp"
 
 namespace roundel {
@@ -15,33 +14,68 @@ namespace {
 constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, where nothing covers them
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
 constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
-constexpr int kMostHidden = 18;                         // sectors of 32, of either edge
+constexpr int kMostHidden = 22, kMostOfBoth = 36;       // sectors of 32, of an edge and of both
 constexpr double kLeastKnown = 12, kLeastNew = 16;      // pixels: smaller ones tell too little
 constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
+constexpr double kInked = 0.12;             // likewise, of a thin stroke
+constexpr double kBright = 0.3;             // likewise, of a place in the ring that is no ink, and
+constexpr int kMostOpen = 2;                // as many sectors where nothing seems to cover it
 constexpr int kBlurred = 4;                 // sectors of a run that a cover's blurred edge alone may hide
 
+/// Whether the noise and so much of the contrast explain what is left on the ring's edges.
+bool is_below(const Fit& fit, double noise, double misfit) {
+    return fit.edge_residual < std::hypot(1.2 * noise, misfit * (fit.bright - fit.dark));
+}
+
+/// Sectors by what they show, over ink (0) and paper (1), at some radii.
+class View {
+  public:
+    View(const ImageView& image, const Fit& fit) : image_(image), fit_(fit) {}
+    template <typename Test>
+    Sectors find(double radius, const Test& test) const {
+        Sectors found = 0;
+        for (int s = 0; s < kSectors; ++s) {
+            const auto [x, y] = point_in_sector(fit_.p, s, radius);
+            const float level = sample(image_, x, y);
+            found |= Sectors(level >= 0 && test((double(level) - fit_.dark) / (fit_.bright - fit_.dark)))
+                     << s;
+        }
+        return found;
+    }
+
+  private:
+    const ImageView& image_;
+    const Fit& fit_;
+};
+
 /// The sectors in which the ring shows a level that is neither ink nor paper.
-Sectors find_foreign(const ImageView& image, const Fit& fit, double noise) {
-    const double contrast = fit.bright - fit.dark, limit = std::max(kInk, kSure * noise / contrast);
+Sectors find_foreign(const View& view, const Fit& fit, double noise) {
+    const double limit = std::max(kInk, kSure * noise / (fit.bright - fit.dark));
     const double ring = (1 - fit.ratio) * fit.outer.minor / 2;
     Sectors foreign = 0;
-    for (const double share : {0.3, 0.5, 0.7}) {
-        if (std::min(share, 1 - share) * ring < 2 * fit.blur) continue;
-        for (int s = 0; s < kSectors; ++s) {
-            const auto [x, y] = point_in_sector(fit.p, s, fit.ratio + share * (1 - fit.ratio));
-            const float level = sample(image, x, y);
-            const double ink = (double(level) - fit.dark) / contrast;
-            const bool other = level >= 0 && std::abs(ink) > limit && std::abs(ink - 1) > limit;
-            foreign |= Sectors(other) << s;
-        }
-    }
+    for (const double share : {0.3, 0.5, 0.7})
+        if (std::min(share, 1 - share) * ring > 2 * fit.blur)
+            foreign |= view.find(fit.ratio + share * (1 - fit.ratio), [&](double level) {
+                return std::abs(level) > limit && std::abs(level - 1) > limit;
+            });
     return foreign;
 }
 
-/// Whether nothing but ink and paper meets the eye in a place where the ring is covered: so do letters look.
+/// Whether nothing but ink and paper meets the eye in a place where the ring is covered: so do letters look,
+/// which have ink in the hole or just outside where their ring is whole.
 bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, double noise) {
-    const Sectors foreign = find_foreign(image, fit, noise);
-    for (Sectors left = hidden.outer | hidden.inner; left;) {
+    const View view(image, fit);
+    const Sectors foreign = find_foreign(view, fit, noise), covered = hidden.outer | hidden.inner;
+    Sectors bright = 0;
+    for (const double share : {0.25, 0.5, 0.75})
+        bright |=
+            view.find(fit.ratio + share * (1 - fit.ratio), [](double level) { return level > kBright; });
+    if (count_sectors(bright & ~covered) > kMostOpen) return true;
+    Sectors inked = 0;
+    for (const double radius : {0.8 * fit.ratio, 1.12, 1.2})
+        inked |= view.find(radius, [](double level) { return std::abs(level) < kInked; });
+    if (inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
+    for (Sectors left = covered; left;) {
         const Sectors run = any_run(left);
         if (2 * count_sectors(run & foreign) < count_sectors(run) - kBlurred) return true;
         left &= ~run;
@@ -50,14 +84,13 @@ bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, dou
 }
 
 bool is_hidden_too_much(const Hidden& hidden) {
-    return count_sectors(hidden.outer) > kMostHidden || count_sectors(hidden.inner) > kMostHidden;
+    const int outer = count_sectors(hidden.outer), inner = count_sectors(hidden.inner);
+    return std::max(outer, inner) > kMostHidden || outer + inner > kMostOfBoth;
 }
 
 }  // namespace
 
-bool is_plain(const Fit& fit, double noise) {
-    return fit.edge_residual < std::hypot(1.2 * noise, kPlain * (fit.bright - fit.dark));
-}
+bool is_plain(const Fit& fit, double noise) { return is_below(fit, noise, kPlain); }
 
 std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known) {
     if (whole.outer.major < (known ? kLeastKnown : kLeastNew)) return std::nullopt;
@@ -71,7 +104,7 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
         if (!rest) return std::nullopt;
         fit = *rest;
     }
-    if (!is_as_modelled(fit, noise, kMisfit) || (!known && is_letter(image, fit, start.hidden, noise)))
+    if (!is_below(fit, noise, kMisfit) || (!known && is_letter(image, fit, start.hidden, noise)))
         return std::nullopt;
     return fit;
 }

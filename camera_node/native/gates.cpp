@@ -17,22 +17,34 @@ constexpr double kMisfit = 0.045;        // of the contrast, RMS on the ring's e
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
 constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones are alike all around
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged may be letters
-constexpr double kMostCovered = 0.35;    // share of the inside
+constexpr double kMostOff = 0.2;  // share of ring and hole that is not as dark or bright as it should be
 
-/// The gates that end false positives.
-bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings, double noise) {
-    if (!has_limits(fit, settings) || !is_as_modelled(fit, noise, kMisfit)) return false;
-    // The fit looks only near the edges, so it takes several thin rings for a thick one.
-    const Surface surface = inspect(image, fit);
-    return surface.off <= kMostCovered * surface.seen;
-}
-
-}  // namespace
-
+/// Whether the ring's edges are as the model says, but for noise and for what print and lens do to them:
+/// `misfit` of the contrast, and more where large ones are drawn or cut by hand.
 bool is_as_modelled(const Fit& fit, double noise, double misfit) {
     const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, 2.5);
     return fit.edge_residual < std::hypot(1.2 * noise, least * (fit.bright - fit.dark));
 }
+
+/// Whether ring and hole are as dark and bright as they should be. The fit looks only near the edges, so it
+/// takes several thin rings for a thick one.
+bool has_surface(const ImageView& image, const Fit& fit) {
+    const Surface surface = inspect(image, fit);
+    return surface.off <= kMostOff * surface.seen;
+}
+
+/// The gates that end false positives.
+bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, double noise, double misfit) {
+    return has_limits(fit, settings) && is_as_modelled(fit, noise, misfit) && has_surface(image, fit);
+}
+
+/// Whether a fit that failed looks as if only its edges were ragged.
+bool may_be_ragged(const Fit& fit, const Settings& settings) {
+    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
+           fit.bright - fit.dark >= settings.min_contrast / 2 && fit.support >= kRaggedSupport;
+}
+
+}  // namespace
 
 bool has_limits(const Fit& fit, const Settings& settings) {
     return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
@@ -46,16 +58,15 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     start.print = settings.nearest_ratio(start.ratio);
     const auto fit = refine(image, start);
     if (!fit) return std::nullopt;
-    const bool found = is_roundel(image, *fit, settings, noise);
-    if (found && is_plain(*fit, noise)) return fit;
-    const auto rest = fit_rest(image, start, *fit, noise, known || found);
+    const bool whole = is_whole(image, *fit, settings, noise, kMisfit);
+    if (whole && is_plain(*fit, noise)) return fit;
+    const auto rest = fit_rest(image, start, *fit, noise, known || whole);
     if (rest && has_limits(*rest, settings)) return rest;
-    if (found) return fit;
-    if (fit->support < kRaggedSupport) return std::nullopt;
+    if (whole) return fit;
+    if (!may_be_ragged(*fit, settings)) return std::nullopt;
     const auto soft = refine_softened(image, start);
     const double ragged = start.outer.major < kTellable ? kMisfit : kRaggedMisfit;
-    const bool fits = soft && has_limits(*soft, settings) && is_as_modelled(*soft, noise * 6 / 16, ragged);
-    return fits ? soft : std::nullopt;
+    return soft && is_whole(image, *soft, settings, noise * 6 / 16, ragged) ? soft : std::nullopt;
 }
 
 }  // namespace roundel

@@ -17,15 +17,13 @@ Surface inspect(const ImageView& image, const Fit& fit) {
         for (const float value : levels_on(image, e, scale)) {
             if (value < 0) continue;
             const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
-            const bool off = std::abs(share - (dark ? 0 : 1)) > 0.3;
-            ++surface.seen, surface.off += off, surface.ring_off += off && dark;
+            ++surface.seen, surface.off += std::abs(share - (dark ? 0 : 1)) > 0.3;
         }
     };
     for (const double share : {0.25, 0.5, 0.75})
         if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
     for (const double share : {0.2, 0.5, 0.8})
         if ((1 - share) * hole > edge) test(share * fit.ratio, false);
-    test(1 + 2.2 * edge / e.minor, false);  // just outside
     return surface;
 }
 

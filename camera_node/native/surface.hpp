@@ -5,10 +5,10 @@
 
 namespace roundel {
 
-/// Of samples in the ring, which is dark, and in the hole and just outside, which are bright: how many are
-/// seen, how many are off by a third of the contrast, and how many of these are in the ring.
+/// Of samples in the ring, which is dark, and in the hole, which is bright: how many are seen, and how many
+/// are off by a third of the contrast.
 struct Surface {
-    int seen = 0, off = 0, ring_off = 0;
+    int seen = 0, off = 0;
 };
 Surface inspect(const ImageView& image, const Fit& fit);
 

@@ -9,6 +9,9 @@ import pytest
 
 from camera_node.detector import Detector
 from camera_node.roundels import Roundel
+from tests.benchmarks.detector.negatives import print_letters, rings
+from tests.benchmarks.detector.recall import covered, recall
+from tests.benchmarks.detector.table import Run
 from tests.camera_node.rendering import Array, Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])
@@ -80,3 +83,18 @@ def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
     squared = np.array([step.squared for step in steps if step.error is not None])
     assert squared.mean() < 2 * 1.25 + 4 * 2 / np.sqrt(len(squared))
     assert squared.max() < 9**2
+
+
+@pytest.mark.parametrize(
+    ("share", "from_rim", "least"), [(0.2, True, 0.73), (0.2, False, 0.55), (0.3, True, 0.37)]
+)
+def test_a_covered_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
+    """What the benchmark measures, less four sigmas of 90."""
+    chance = 4 * np.sqrt(least * (1 - least) / 90)
+    assert recall(Run("chords", Detector, False), 3, covered(share, from_rim)) > least - chance
+
+
+def test_letters_and_other_rings_are_no_covered_roundels():
+    """Qs and 8s are rings of the print's own ratio, with ink over them; six pages hold 400 such letters."""
+    pages = [*print_letters(6), *rings(6)]
+    assert sum(len(Detector().detect(page)) for page in pages) == 0
