@@ -10,7 +10,7 @@ from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
 from calib.linearisation import Linearisation
-from calib.plausibility import check_agreement, check_lenses, check_sizes
+from calib.plausibility import check_agreement, check_lenses, check_sizes, check_spacing
 from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
@@ -67,6 +67,7 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)
+        check_spacing(wave.wand, adjusted, observations)
     return Solution(adjusted, observations)
 
 

@@ -19,10 +19,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
-from camera_node.pose import Pose
+from calib.camera import Camera, pixel_jacobians
+from camera_node.pose import Pose, rotation_from_vector
 from fusion.instants import Frame
-from fusion.state import exp_so3, skew
 
 Array = NDArray[np.float64]
 AGREE_PX = 2.0  # between where a roundel is expected and detected, while a camera stands
@@ -226,7 +225,7 @@ def _fit(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Arra
         step = np.linalg.solve(H, np.einsum("n,nai,na->i", w, A, b))
         T = T.copy()
         T[:3, 3] += T[:3, :3] @ step[3:]
-        T[:3, :3] = T[:3, :3] @ exp_so3(step[None, :3])[0]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
     A, b = _linearise(camera, T, points, measured)
     w = 1 / (1 + np.sum(b**2, 1))
     H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
@@ -236,7 +235,6 @@ def _fit(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Arra
 def _linearise(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array]:
     """A (K, 2, 6) and b (K, 2) of A xi = b, the points that can be seen."""
     p = (points - T[:3, 3]) @ T[:3, :3]
-    uv, J = camera.project_with_jacobian(p)
-    by_pose = np.concatenate([skew(p), np.tile(-np.eye(3), (len(p), 1, 1))], 2)
+    uv, _, J_pose, _ = pixel_jacobians(camera, p)
     known = np.isfinite(uv).all(1)
-    return (J @ by_pose)[known], (measured - uv)[known]
+    return J_pose[known], (measured - uv)[known]

@@ -137,8 +137,7 @@ int select_pixels(const ImageView& image, const Parameters& p, const Band& band,
     const int rows = int(wide.bottom() - wide.top());
     const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
     append_rows(image, narrow, wide, step, pixels);
-    pixels.count = (pixels.used + kLanes - 1) / kLanes * kLanes;
-    for (int k = pixels.used; k < pixels.count; ++k) pixels.x[k] = pixels.y[k] = 0, pixels.level[k] = -1;
+    pixels.fill_up();
     return step;
 }
 

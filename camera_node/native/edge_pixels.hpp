@@ -15,6 +15,11 @@ struct EdgePixels {
     int used = 0;                    // pixels inside the image
     int expected = 0;                // and outside
     alignas(4 * kLanes) float x[kMax + kLanes], y[kMax + kLanes], level[kMax + kLanes];
+    /// Ends the columns with whole lanes.
+    void fill_up() {
+        count = (used + kLanes - 1) / kLanes * kLanes;
+        for (int k = used; k < count; ++k) x[k] = y[k] = 0, level[k] = -1;
+    }
 };
 
 /// Which pixels, by their distance from the nearest edge: those within `narrow` in every row, and in every

@@ -67,15 +67,13 @@ ROUNDEL_CLONES void add_up(const Gradient* chunks, int lanes, float per_cut, Gra
 }
 
 struct Sums {
-    Lanes w, wrr, ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
+    Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
 };
 
 ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut, Sums& sums) {
     const Lanes t = r * per_cut, root = root_weight(t), w = root * root, rr = r * r;
     const Lanes squared = at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k];
     const Lanes ring = at.residual[k] < kAbsent ? at.ring[k] * at.ring[k] : all(0), m = w * squared;
-    sums.w += w;
-    sums.wrr += w * rr;
     sums.ring += ring;
     sums.agreeing += w * ring;
     sums.ring_rr += ring * rr;
@@ -153,9 +151,7 @@ Leftover Linearisation::after(const Parameters& delta, double scale) const {
     for (int i = 0; i < kCount; ++i) step[i] = float(delta[i]);
     Sums s{};
     add_leftover(chunks_, count_, step, float(1 / (kTukey * scale)), s);
-    return {.w = double(sum(s.w)),
-            .wrr = double(sum(s.wrr)),
-            .ring = double(sum(s.ring)),
+    return {.ring = double(sum(s.ring)),
             .agreeing = double(sum(s.agreeing)),
             .ring_rr = double(sum(s.ring_rr)),
             .m = double(sum(s.m)),

@@ -13,7 +13,6 @@ struct NormalEquations {
 
 /// Sums over residuals r - J delta, which a step of delta leaves to first order.
 struct Leftover {
-    double w, wrr;          // weights, and weighed squares
     double ring, agreeing;  // squared slopes of the ring's edges, and weighed
     double ring_rr;         // squared residuals times these slopes
     /// Sums of w m and w m^2, m being the squared slope of the level: what a pixel tells of the edges. And of

@@ -7,6 +7,7 @@
 #include "cholesky.hpp"
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
+#include "pose_outputs.hpp"
 
 namespace roundel {
 
@@ -59,7 +60,7 @@ Parameters prior_information(double major) {
 /// Gauss-Newton on the pixels near one roundel's edges.
 class Fitter {
   public:
-    Fitter(const ImageView& image, const Start& start) : image_(image) {
+    Fitter(const ImageView& image, const Start& start) : image_(image), hidden_(start.hidden) {
         pixels_.origin_x = int(std::lround(start.outer.x));
         pixels_.origin_y = int(std::lround(start.outer.y));
         p = start_ = begin(start, pixels_);
@@ -87,6 +88,7 @@ class Fitter {
 
     bool select(const Band& band, int limit) {
         select_pixels(image_, p, band, limit, pixels_);
+        if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
@@ -169,6 +171,7 @@ class Fitter {
     }
 
     const ImageView& image_;
+    Hidden hidden_;
     EdgePixels pixels_;
     Parameters start_, prior_;
     Linearisation model_;
@@ -178,17 +181,6 @@ class Fitter {
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
     double scale_ = 255, noise_ = 0;
 };
-
-/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
-/// first order in g.
-std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
-    const double gx = p[kGx], gy = p[kGy];
-    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
-    std::array<Vector<kPoseCount>, kPoseCount> T{};
-    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
-    for (int k = 0; k < 5; ++k) T[k][k] += 1;
-    return T;
-}
 
 /// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
 void Fitter::learn_print(double ratio) {
@@ -206,20 +198,16 @@ PoseCovariance Fitter::covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
-    const auto T = outputs_by_pose(p);
-    PoseCovariance half{}, whole{};
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int i = 0; i < kPoseCount; ++i)
-            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int b = 0; b < kPoseCount; ++b)
-            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
-    return whole;
+    for (auto& row : inverse)
+        for (double& value : row) value *= square(noise_);
+    return output_covariance(p, inverse);
 }
 
 Fit Fitter::fit() const {
     const CircleImage outer = circle_image(p, 1);
     const Eigen axes = eigen(outer.shape);
+    Parameters in_image = p;
+    in_image[kX] += pixels_.origin_x, in_image[kY] += pixels_.origin_y;
     return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                       2 * std::sqrt(axes.second), axes.angle},
             .offset_x = p[kX] - outer.x,
@@ -230,8 +218,8 @@ Fit Fitter::fit() const {
             .bright = p[kBright],
             .blur = p[kBlur],
             .edge_residual = std::sqrt(left_.ring_rr / left_.ring),
-            .agreeing_residual = std::sqrt(left_.wrr / std::max(1.0, left_.w)),
-            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected};
+            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected,
+            .p = in_image};
 }
 
 }  // namespace
