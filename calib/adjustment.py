@@ -40,6 +40,8 @@ class Adjusted:
         information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
             translation; its null space is the choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
+        dependence: by what covariances, beside `scale`, are widened because errors of neighbouring moments are alike
+            (`calib.dependence`).
     """
 
     problem: Problem
@@ -49,6 +51,7 @@ class Adjusted:
     scale: float
     information: Array
     iterations: int
+    dependence: float = 1.0
 
     def joint_covariance(self) -> Array:
         """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,

@@ -122,6 +122,7 @@ def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_outliers(told.names, seen, adjusted),
         metric=told.metric,
+        widened=adjusted.dependence**0.5,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted, adjust, find_robustly
+from calib.dependence import widen
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
 from calib.linearisation import Linearisation
@@ -68,7 +69,7 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     if metric:
         check_sizes(wave.wand, adjusted, observations)
         check_spacing(wave.wand, adjusted, observations)
-    return Solution(adjusted, observations)
+    return Solution(widen(adjusted, observations), observations)
 
 
 def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:

@@ -63,6 +63,11 @@ class CameraTrust:
     figures: dict[str, float]
 
     @property
+    def missing(self) -> NDArray[np.bool_]:
+        """(rows, columns) useful cells through which the wand was not waved."""
+        return self.useful & ~self.coverage.used
+
+    @property
     def strain(self) -> float:
         """What the camera's covariance moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
         return self.figures["pose_px"] / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))

@@ -6,15 +6,31 @@ import queue
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import zenoh
 
 from camera_node.messages import encode
+from camera_node.network import open_client, open_router
 from camera_node.requests import respond
+from fusion.config import ArenaConfig
+from fusion.shards import Shard
 
 QUEUE = 2000  # messages: seconds of a large arena
 Task = Callable[[], object]
+
+
+def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
+    """The arena's router, or of another shard a connection to it.
+
+    Raises:
+        NetworkError: an endpoint is taken.
+    """
+    zenoh_config = Path(config.zenoh) if config.zenoh else None
+    if shard.leads:
+        return open_router(config.listen, zenoh_config)
+    return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config)
 
 
 class Link:

@@ -13,20 +13,18 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
-import yaml
+import numpy as np
 import zenoh
 
 from calib.camera import Camera
-from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig
-from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
-from camera_node.network import open_client, open_router
+from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.requests import encode_reply, parse_request, payload_of
-from fusion.calibration import Calibration
+from fusion.calibration import Calibration, parse_rig
 from fusion.config import ArenaConfig
 from fusion.health import Health
-from fusion.instants import Frame, Instant, Instants
-from fusion.link import Link
+from fusion.instants import Instant, Instants
+from fusion.intake import FAR_NS, Intake
+from fusion.link import Link, open_session
 from fusion.messages import Latency, RobotPose, Robots, RobotsRequest, State, robots_key, undo_key
 from fusion.report import Move, latency_of
 from fusion.robots import changed, load_robots
@@ -34,8 +32,8 @@ from fusion.shards import Shard
 from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
-FAR_NS = 5_000_000_000  # a capture time so far from now is a fault
 TICK_S = 0.005  # how finely the end of a wait is met
+BACK_NS = 1_000_000_000  # by which this machine's clock may be set back without anything being begun anew
 
 
 class Server:
@@ -52,16 +50,18 @@ class Server:
         self.shard = Shard.parse(config.shard)
         self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
+        self._intake = Intake(self.keys, self.health)
         kept = Path(config.kept_rig) if config.kept_rig else None
         self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
         self._tracker: Tracker | None = None
+        self._now_ns = 0
         self._start()
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
-            self.session = stack.enter_context(self._open())
+            self.session = stack.enter_context(open_session(self.config, self.shard))
             self.link = Link(self.session, self.health.count, stack)
             self._declare()
             self._closing = stack.pop_all()
@@ -83,13 +83,25 @@ class Server:
         with _collecting_between_instants() as collect:
             while not self._stopped.is_set():
                 more = self.link.work(TICK_S)
-                now_ns = time.time_ns()
+                now_ns = self._tell_time()
                 for instant in self._instants.take(now_ns):
                     self._fuse(instant)
                 if not more:
                     self._anticipate()
                 if self._tell_status(now_ns):
                     collect()
+
+    def _tell_time(self) -> int:
+        """Now. Once the clock was set back, what was followed lies in the future: everything begins anew."""
+        now_ns = time.time_ns()
+        if now_ns < self._now_ns - BACK_NS:
+            log.warning(
+                "this machine's clock was set back by %.0f s; robots are found anew",
+                (self._now_ns - now_ns) * 1e-9,
+            )
+            self._start()
+        self._now_ns = now_ns
+        return now_ns
 
     def _declare(self) -> None:
         keys, link = self.keys, self.link
@@ -104,59 +116,26 @@ class Server:
             link.answer_later(undo_key(keys.arena), self._undo)
             link.show_alive(keys.fusion_alive)
 
-    def _open(self) -> zenoh.Session:
-        """The arena's router, or of another shard a connection to it."""
-        zenoh_config = Path(self.config.zenoh) if self.config.zenoh else None
-        if self.shard.leads:
-            return open_router(self.config.listen, zenoh_config)
-        return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in self.config.listen], zenoh_config)
-
     # What arrives.
 
     def _take_detections(self, data: bytes, key: str, received_ns: int) -> None:
-        try:
-            message = decode(data, Detections)
-            if key != self.keys.detections(message.camera):
-                raise MessageError("of another camera than its key")
-        except MessageError:
-            self.health.count("detections that are no message")
-            return
-        if abs(message.t_ns - received_ns) > FAR_NS:
-            self.health.count("implausible time")
-            return
-        if self.health.arrived(message.camera, message.t_ns, received_ns):
-            self._add(message, received_ns)
-
-    def _add(self, message: Detections, received_ns: int) -> None:
-        if self._tracker is None:
-            return
-        camera = self._cameras().get(message.camera)
-        if camera is None:
-            self.health.count("unknown camera")
-        elif (message.width, message.height) != (camera.width, camera.height):
-            self.health.count("wrong image size")
-        else:
-            frame = Frame.of(message, camera, received_ns)
-            self.health.noted(message.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
+        frame = self._intake.receive(data, key, received_ns, self._cameras())
+        if frame is not None:
+            self.health.noted(frame.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            rig = msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
-        except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+            rig = parse_rig(data)
+        except MessageError as error:
             self.health.count("rig that is no rig")
-            log.warning(
-                "a published rig is refused, the old one stays: %s", " ".join(str(error).split())[:200]
-            )
-
+            log.warning("a published rig is refused, the old one stays: %s", error)
             return
-        old = self.calibration.rig
-        if rig == old:  # our own, or one that came twice
+        if rig == self.calibration.rig:  # our own, or one that came twice
             return
-        self.calibration.replace(rig)
-        moved = [name for name in rig.cameras if old and rig.cameras[name] != old.cameras.get(name)]
-        if old and len(moved) == 1 and rig.placed().keys() == old.placed().keys() and self._tracker:
-            self._tracker.place(moved[0], rig.cameras[moved[0]])  # robots stay as they are
-            self._tracker.watch.trust(moved[0])
+        moved = self.calibration.replace(rig)
+        if moved is not None and self._tracker is not None:
+            self._tracker.place(moved, rig.cameras[moved])  # robots stay as they are
+            self._tracker.watch.trust(moved)
         else:
             self._start()
 
@@ -167,7 +146,9 @@ class Server:
         except MessageError:
             self.health.count("poses that are no message")
             return
-        if self._tracker is not None and not self.shard.owns(pose.robot):
+        if abs(pose.t_ns - received_ns) > FAR_NS:
+            self.health.count("implausible time")
+        elif self._tracker is not None and not self.shard.owns(pose.robot):
             self._tracker.follow(pose)
 
     def _start(self) -> None:
@@ -189,11 +170,7 @@ class Server:
 
     def _answer_rig(self, query: zenoh.Query) -> None:
         if self.calibration.rig is not None:
-            query.reply(self.keys.rig, encode(self._rig_message()))
-
-    def _rig_message(self) -> RigMessage:
-        assert self.calibration.rig is not None
-        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.calibration.rig))
+            query.reply(self.keys.rig, encode(self.calibration.message()))
 
     def _undo(self, _: zenoh.Query) -> bytes:
         """Take the last correction back; that camera is not doubted again until another rig comes."""
@@ -202,7 +179,7 @@ class Server:
         if self._tracker is not None:
             self._tracker.place(name, camera)
             self._tracker.watch.hold(name)
-        message = self._rig_message()
+        message = self.calibration.message()
         self.link.publish(self.keys.rig, message)
         return encode(message)
 
@@ -239,16 +216,24 @@ class Server:
     def _fuse(self, instant: Instant) -> None:
         if self._tracker is None:
             return
+        try:
+            self._follow(self._tracker, instant)
+        except (np.linalg.LinAlgError, RuntimeError):  # NumPy's and GTSAM's, of a system that has no solution
+            self.health.count("instant that could not be solved")
+            log.exception("an instant could not be solved; robots are found anew")
+            self._start()
+
+    def _follow(self, tracker: Tracker, instant: Instant) -> None:
         begun_ns = time.time_ns()
-        first = self._tracker.advance(instant)
+        first = tracker.advance(instant)
         latency = latency_of(instant, begun_ns, time.time_ns())
         self._tell_poses(first, latency)
-        fused = self._tracker.complete()
+        fused = tracker.complete()
         told = {pose.robot for pose in first}
         self._tell_poses([pose for pose in fused.poses if pose.robot not in told], latency)
         if self.shard.leads:
             self.link.publish(self.keys.markers, fused.markers)
-        for move in self._tracker.inspect():
+        for move in tracker.inspect():
             self._tell(move)
         states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
         self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
@@ -266,7 +251,7 @@ class Server:
             )
             return
         self.calibration.correct(move.name, move.camera)  # only the leading shard gets here
-        self.link.publish(self.keys.rig, self._rig_message())
+        self.link.publish(self.keys.rig, self.calibration.message())
         log.warning(
             "camera %s is placed anew and used again; a query on %s takes that back",
             move.name,

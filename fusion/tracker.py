@@ -253,7 +253,9 @@ class Tracker:
     def follow(self, pose: RobotPose) -> None:
         """Another shard's robot is there: its detections are its own, and not for ours."""
         k = self._row.get(pose.robot)
-        if k is not None and not self.owned[k] and pose.t_ns > self._seen_ns[k]:
+        if k is None or self.owned[k] or not np.isfinite(pose.covariance_matrix).all():
+            return
+        if pose.t_ns > self._seen_ns[k]:
             self._others[k] = pose
             self._seen_ns[k] = pose.t_ns
 

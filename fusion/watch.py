@@ -219,17 +219,22 @@ def _fit(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Arra
     The tangent is rotation, then translation, in the camera's frame.
     """
     for _ in range(8):
-        A, b = _linearise(camera, T, points, measured)
-        w = 1 / (1 + np.sum(b**2, 1))
-        H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(H, np.einsum("n,nai,na->i", w, A, b))
+        H, right, _ = _normal_equations(camera, T, points, measured)
+        step = np.linalg.solve(H, right)
         T = T.copy()
         T[:3, 3] += T[:3, :3] @ step[3:]
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
+    H, _, rms = _normal_equations(camera, T, points, measured)
+    return T, rms, np.asarray(np.linalg.inv(H), float)
+
+
+def _normal_equations(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array, float]:
+    """(6, 6) information and (6,) right side, weighed by Cauchy; and the median distance, pixels."""
     A, b = _linearise(camera, T, points, measured)
-    w = 1 / (1 + np.sum(b**2, 1))
-    H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
-    return T, float(np.sqrt(np.median(np.sum(b**2, 1)))), np.asarray(np.linalg.inv(H), float)
+    square = np.sum(b**2, 1)
+    weighed = A / (1 + square)[:, None, None]
+    H = np.einsum("nai,naj->ij", weighed, A) + 1e-9 * np.eye(6)
+    return H, np.einsum("nai,na->i", weighed, b), float(np.sqrt(np.median(square)))
 
 
 def _linearise(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array]:

@@ -56,7 +56,7 @@ class Intrinsics:
             lenses[views.camera] = lens = views.solve(self.model)
             report(views.camera, lens, console)
             if self.maps:
-                picture = draw_residuals(views.camera, lens.views, lens.adjusted)
+                picture = draw_residuals(views.camera, lens.camera, lens.seen(), lens.residuals())
                 save_map(self.maps / f"{views.camera}.png", picture)
         told = {**provenance(), "board": self.board}
         write_rig(merge(rig, lenses, told), self.out, console)

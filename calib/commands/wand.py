@@ -11,10 +11,10 @@ from rich.live import Live
 from zenoh import Session
 
 from calib.commands.connection import Connection, Server
-from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.live import Heard
-from calib.report import clocks_as_dict, print_report, show_progress
+from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.waving import wave
 from camera_node.body import Body
@@ -47,6 +47,8 @@ class Wand:
     """Place this camera alone, anew, by a short wave; the rig's others stay where they are."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels: where errors are foretold."""
+    maps: Path | None = None
+    """A folder for pictures: each camera's residuals and where to wave next, and the errors to expect."""
     server: Server = field(default_factory=Connection)
 
     def execute(self, console: Console) -> None:
@@ -72,8 +74,10 @@ class Wand:
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
+        if self.maps is not None:
+            save_maps(self.maps, result, trust, console)
         told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
-        told |= _of_lenses(rig)
+        told |= {**lenses_as_dict(result), **_of_lenses(rig)}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed

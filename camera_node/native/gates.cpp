@@ -19,14 +19,6 @@ constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged may be letters
 constexpr double kMostCovered = 0.35;    // share of the inside
 
-/// Contrast, ratio and size within their limits, and levels that a camera can give.
-bool has_limits(const Fit& fit, const Settings& settings) {
-    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
-           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
-           fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
-           fit.outer.major <= settings.max_diameter;
-}
-
 /// The gates that end false positives.
 bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings, double noise) {
     if (!has_limits(fit, settings) || !is_as_modelled(fit, noise, kMisfit)) return false;
@@ -40,6 +32,13 @@ bool is_roundel(const ImageView& image, const Fit& fit, const Settings& settings
 bool is_as_modelled(const Fit& fit, double noise, double misfit) {
     const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, 2.5);
     return fit.edge_residual < std::hypot(1.2 * noise, least * (fit.bright - fit.dark));
+}
+
+bool has_limits(const Fit& fit, const Settings& settings) {
+    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
+           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
+           fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
+           fit.outer.major <= settings.max_diameter;
 }
 
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,

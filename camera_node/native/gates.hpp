@@ -8,6 +8,9 @@
 
 namespace roundel {
 
+/// Contrast, ratio and size within their limits, and levels that a camera can give.
+bool has_limits(const Fit& fit, const Settings& settings);
+
 /// Whether the ring's edges are as the model says, but for noise and for what print and lens do to them:
 /// `misfit` of the contrast, and more where large ones are drawn or cut by hand.
 bool is_as_modelled(const Fit& fit, double noise, double misfit);

@@ -115,7 +115,7 @@ def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, wa
     observations = ("--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
     before = (tmp_path / "rig.yaml").read_text()
-    wrote = ("--out", tmp_path / "checked.yaml", "--map", tmp_path / "map.png")
+    wrote = ("--out", tmp_path / "checked.yaml", "--maps", tmp_path / "maps")
     done = calib(
         "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *wrote
     )
@@ -126,7 +126,9 @@ def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, wa
     check = load_rig(tmp_path / "checked.yaml").calibration["check"]
     assert check["halves"]["agree"]
     assert check["expected_mm"]["median"] < 2
-    assert cv2.imread(str(tmp_path / "map.png")) is not None
+    names = {f"{name}.png" for name in (*waved.truth.cameras, "expected")}
+    assert {path.name for path in (tmp_path / "maps").iterdir()} == names
+    assert all(cv2.imread(str(tmp_path / "maps" / name)) is not None for name in names)
 
 
 def test_only_one_camera_is_placed_anew(tmp_path: Path, waved: Arena):

@@ -118,6 +118,28 @@ def test_what_is_no_detection_is_counted_and_skipped(tmp_path):
         until(lambda: status.next().faults == expected)
 
 
+def test_an_instant_without_a_solution_costs_the_robots_but_not_the_server(tmp_path):
+    with serving(config(tmp_path)) as (server, client):
+        send(server, live(ARENA.messages(12)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        assert server._tracker is not None
+        tracker = server._tracker
+        server.link.put(lambda: tracker.states.P.fill(np.nan))
+        status = client.status(DEADLINE_S)
+        send(server, live(ARENA.messages(12), ago_ns=5 * 10**8))
+        until(lambda: status.next().faults == {"instant that could not be solved": 1})
+        send(server, live(ARENA.messages(12), ago_ns=4 * 10**8))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+
+
+def test_a_clock_that_is_set_back_begins_everything_anew(tmp_path, caplog):
+    with serving(config(tmp_path)) as (server, _):
+        before = server._tracker
+        server.link.put(lambda: setattr(server, "_now_ns", time.time_ns() + 3600 * 10**9))
+        until(lambda: server._tracker is not before)
+    assert "clock was set back" in caplog.text
+
+
 def test_a_calibration_that_arrives_is_applied_and_a_bad_one_is_not(tmp_path):
     with serving(config(tmp_path, with_rig=False)) as (server, client):
         assert client.rig(DEADLINE_S) is None
