@@ -138,7 +138,7 @@ def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[
         linearisation.relinearise(state, *weights)
         while True:
             try:
-                trial = linearisation.problem.to_scale(state.moved(*solve(linearisation, damping)))
+                trial = linearisation.problem.moved(state, *solve(linearisation, damping))
                 moved = linearisation.errors(trial)
                 if (after := moved.cost(scale, slack)) <= before:
                     break

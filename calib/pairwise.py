@@ -74,6 +74,7 @@ class Pairs:
         self.tracks: list[list[Track]] = tracks_of(seen, len(lenses), len(wand.markers))
         self.gap_s = min(INTERPOLATED * period_s, SLOWEST_S) if period_s else SLOWEST_S
         self.period_s = period_s
+        self._related: dict[tuple[int, int], TwoView | None] = {}
         self.range = ranges(lenses, seen, wand.diameter_m)
 
     def shared(self) -> NDArray[np.intp]:
@@ -86,6 +87,11 @@ class Pairs:
 
     def relate(self, a: int, b: int) -> TwoView | None:
         """Where two cameras stand to each other; None where it can't be told."""
+        if (a, b) not in self._related:
+            self._related[a, b] = self._relate(a, b)
+        return self._related[a, b]
+
+    def _relate(self, a: int, b: int) -> TwoView | None:
         seen, rows = self.seen, self.rows[a]
         near = self._near(rows, b)
         shift_s = find_shift(self.tracks[b], seen.label[near], seen.t_s[near], seen.xy[near], self.gap_s)

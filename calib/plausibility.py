@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
-from calib.errors import CalibrationError
+from calib.errors import CalibrationError, CameraFault
 from calib.lengths import distances, free_markers
 from calib.linearisation import Linearisation
 from calib.problem import LENS, Observations
@@ -19,7 +19,7 @@ from camera_node.lens import Lens
 Array = NDArray[np.float64]
 
 FOCAL, CENTRE = 0.05, 0.04  # of the focal length and of the image: what no lens that was calibrated is off by
-AGREE = 0.6  # of a camera's sightings must fit the rig: gross errors are rarer
+AGREE = 0.5  # of a camera's sightings must fit the rig
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
 SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
 FEW = 8  # moments at which a distance is measured
@@ -28,27 +28,28 @@ SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
 
 
 def check_lenses(names: Sequence[str], lenses: Sequence[Lens], freed: Adjusted) -> None:
-    """Raise CalibrationError where lenses that were adjusted are other cameras', or far from those that were given."""
+    """Raise CameraFault where lenses that were adjusted are other cameras', or far from those that were given."""
     found = [freed.state.lens(k, lens) for k, lens in enumerate(lenses)]
     cov = freed.covariance(LENS)
     for a, b in combinations(range(len(names)), 2):
         crossed = _apart(found[a], lenses[b], cov[a, :, a]), _apart(found[b], lenses[a], cov[b, :, b])
         straight = _apart(found[a], lenses[a], cov[a, :, a]), _apart(found[b], lenses[b], cov[b, :, b])
         if max(crossed) < SAME < min(straight):
-            raise CalibrationError(
-                f"cameras '{names[a]}' and '{names[b]}' seem to have each other's names: what each saw fits the "
-                "other's intrinsics; swap them in the rig file or in the recording"
-            )
+            told = "what it saw fits the intrinsics of '{}', and the other way round: swap the two in the rig file"
+            raise CameraFault({names[a]: told.format(names[b]), names[b]: told.format(names[a])})
+    reasons = {}
     for name, given, lens in zip(names, lenses, found, strict=True):
         size = np.array([lens.width, lens.height])
         shift = np.abs([lens.cx - given.cx, lens.cy - given.cy])
         if abs(np.log(lens.fx / given.fx)) > FOCAL or (shift > CENTRE * size).any():
-            raise CalibrationError(
-                f"camera '{name}' has the wrong intrinsics: what it saw fits f = {lens.fx:.0f} px and a centre at "
+            reasons[name] = (
+                f"wrong intrinsics: what it saw fits f = {lens.fx:.0f} px and a centre at "
                 f"({lens.cx:.0f}, {lens.cy:.0f}), its file says {given.fx:.0f} px and "
                 f"({given.cx:.0f}, {given.cy:.0f}); is its name right? "
                 f"else run python -m calib intrinsics --camera {name}"
             )
+    if reasons:
+        raise CameraFault(reasons)
 
 
 def _apart(found: Lens, given: Lens, cov: Array) -> float:
@@ -60,14 +61,16 @@ def _apart(found: Lens, given: Lens, cov: Array) -> float:
 
 
 def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> None:
-    """Raise CalibrationError where much of what a camera saw fits nothing that the others saw."""
+    """Raise CameraFault where much of what a camera saw fits nothing that the others saw: the worst one, as one that
+    is wrong makes others look wrong."""
     share = np.array([adjusted.used[seen.camera == k].mean() for k in range(len(names))])
     if share.min() < AGREE:
         name = names[int(share.argmin())]
-        raise CalibrationError(
-            f"only {share.min():.0%} of what camera '{name}' saw fits what the others saw: are its name and its "
-            f"intrinsics its own? else did it move? run python -m calib intrinsics --camera {name}, or leave it out"
+        told = (
+            f"only {share.min():.0%} of what it saw fits what the others saw: are its name and its intrinsics its "
+            f"own? else did it move? run python -m calib intrinsics --camera {name}, or leave it out"
         )
+        raise CameraFault({name: told}, certain=False)
 
 
 def check_motion(wave: Sightings, names: Sequence[str], lenses: Sequence[Lens]) -> None:

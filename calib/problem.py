@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
+SHAKES = 4  # rounds in which lengths that depend on each other are set
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
 
 
@@ -121,7 +122,28 @@ class Problem:
         """The cameras that are sought."""
         return tuple(range(len(self.lenses))) if self.sought is None else self.sought
 
-    def to_scale(self, state: State) -> State:
+    def moved(self, state: State, by: Array, along: Array) -> State:
+        """`State.moved` along the curve on which lengths change as they do along the tangent (a retraction): a turn
+        would lengthen a stiff wand, and a shift the distance that carries the scale, by the square of the step."""
+        trial = state.moved(by, along)
+        return self._to_scale(replace(trial, motion=self._unstretched(state.motion, trial.motion)))
+
+    def _unstretched(self, before: Array, after: Array) -> Array:
+        """The motion with the basis's lengths that its step has to first order (SHAKE: Ryckaert et al. 1977)."""
+        after = after.copy()
+        ends, moved = before[:, 0][:, self.wand.pairs], after[:, 0][:, self.wand.pairs]
+        gap, step = ends[:, :, 0] - ends[:, :, 1], moved[:, :, 0] - moved[:, :, 1]
+        length = np.linalg.norm(gap, axis=2)
+        wanted = np.maximum((gap * step).sum(axis=2) / length, length / 2)
+        for _ in range(SHAKES if len(self.wand.pairs) > 1 else 1):
+            for e, (i, j) in enumerate(self.wand.pairs):
+                gap = after[:, 0, i] - after[:, 0, j]
+                excess = (1 - wanted[:, e, None] / np.linalg.norm(gap, axis=1, keepdims=True)) / 2 * gap
+                after[:, 0, i] -= excess
+                after[:, 0, j] += excess
+        return after
+
+    def _to_scale(self, state: State) -> State:
         """The state with the fixed distance as it is: nothing that cameras see tells a world from a larger one."""
         if self.fixed_distance is None:
             return state

@@ -43,8 +43,8 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
         metric: whether the start has the world's scale.
 
     Raises:
-        CalibrationError: the wand's lengths fit nothing that was seen, or not its roundels' sizes; or a camera's lens
-            is not the one that was given.
+        CalibrationError: the wand's lengths fit nothing that was seen, or not its roundels' sizes.
+        CameraFault: a camera's lens is not the one that was given, or what it saw contradicts the others.
     """
     if not metric:
         cameras = cameras.copy()
@@ -77,7 +77,7 @@ def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjus
     that were given; else as it is.
 
     Raises:
-        CalibrationError: a lens is another camera's, or far from what was given.
+        CameraFault: a lens is another camera's, or far from what was given.
     """
     if any(lens.model != "pinhole" for lens in wave.lenses):
         return few

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.diagnosis import find_faults
-from calib.errors import CalibrationError
+from calib.errors import CalibrationError, CameraFault
 from calib.labelling import label
 from calib.outcome import Calibration, Told, conclude
 from calib.pairwise import MIN_INSTANTS, Pairs
 from calib.plausibility import check_motion
 from calib.rig import Rig
 from calib.sightings import Frames, Sightings, frame_counts, gather
-from calib.solution import solve
+from calib.solution import Solution, solve
 from calib.start import Start, explain_unplaced, find_start
 from calib.wave import Wave
 from camera_node.body import Body
@@ -51,32 +51,48 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
         the rig with the poses and time offsets of all cameras that could be placed, and the report.
 
     Raises:
-        CalibrationError: the recording or the wand can't place two cameras; the message says why.
+        CalibrationError: the recording or the wand can't place two cameras, or cameras contradict each other and no
+            majority agrees; the message says why.
     """
     check_recording(rig, messages)
     recording = read(rig, wand, messages)
-    counts = frame_counts(recording.seen, len(recording.names))
     if not len(recording.seen):
         raise CalibrationError(_unseen(recording))
     check_motion(recording.seen, recording.names, recording.lenses)
     pairs = Pairs(recording.seen, recording.lenses, wand, recording.frames.period_s())
-    start = find_start(pairs, range(len(recording.names)))
-    unplaced = explain_unplaced(recording.names, list(start.poses), counts, pairs.shared(), start)
-    faults = find_faults(recording.names, recording.frames, pairs, sorted(start.poses))
-    unplaced |= faults
-    unplaced |= {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
-    if len(start.poses) < 2:
-        raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced, faults))
-    placed = sorted(start.poses)
-    solution = solve(gather_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric)
-    told = Told(
-        [recording.names[k] for k in placed],
-        [counts[k] for k in placed],
-        [recording.left_out[k] for k in placed],
-        unplaced,
-        start.metric,
-    )
-    return conclude(rig, solution, told)
+    told, solution = _solve_majority(recording, pairs, wand)
+    absent = {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
+    return conclude(rig, solution, replace(told, unplaced=told.unplaced | absent))
+
+
+def _solve_majority(recording: Recording, pairs: Pairs, wand: Body) -> tuple[Told, Solution]:
+    """The solution of the cameras that agree; those that contradict them are left out, and told.
+
+    Raises:
+        CalibrationError: fewer than two can be placed, or no more than half of those agree.
+    """
+    names, counts = recording.names, frame_counts(recording.seen, len(recording.names))
+    wrong: dict[str, str] = {}
+    sure: dict[str, str] = {}
+    while True:
+        start = find_start(pairs, [k for k, name in enumerate(names) if name not in wrong])
+        placed = sorted(start.poses)
+        faults = find_faults(names, recording.frames, pairs, placed)
+        unplaced = explain_unplaced(names, placed, counts, pairs.shared(), start) | wrong | faults | sure
+        if len(placed) < 2:
+            raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced, wrong | faults))
+        left_out = [recording.left_out[k] for k in placed]
+        told = Told([names[k] for k in placed], [counts[k] for k in placed], left_out, unplaced, start.metric)
+        try:
+            solution = solve(
+                gather_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric
+            )
+            return told, solution
+        except CameraFault as fault:
+            wrong |= fault.reasons
+            sure |= fault.reasons if fault.certain else {}
+            if len(placed) - len(fault.reasons) <= len(wrong):
+                raise CalibrationError(f"no majority of the cameras agrees: {CameraFault(wrong)}") from None
 
 
 def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
