@@ -3,10 +3,10 @@
 
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera import with_distortion
 from calib.trajectory import AffineWand
 from camera_node.lens import Lens
 from camera_node.pose import adjoint, invert, rotation_from_vector
@@ -85,16 +85,10 @@ class State:
         scale, cx, cy, k1 = self.lenses[camera].tolist()
         if not any((scale, cx, cy, k1)):
             return lens
-        rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
-        factor = float(np.exp(scale))
-        return msgspec.structs.replace(
-            lens,
-            fx=lens.fx * factor,
-            fy=lens.fy * factor,
-            cx=lens.cx + cx,
-            cy=lens.cy + cy,
-            distortion=(rest[0] + k1, *rest[1:]),
-        )
+        parameters = with_distortion(lens).parameters
+        parameters[:2] *= np.exp(scale)
+        parameters[2:5] += cx, cy, k1
+        return lens.with_parameters(parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +120,16 @@ class Problem:
     def cameras(self) -> tuple[int, ...]:
         """The cameras that are sought."""
         return tuple(range(len(self.lenses))) if self.sought is None else self.sought
+
+    def to_scale(self, state: State) -> State:
+        """The state with the fixed distance as it is: nothing that cameras see tells a world from a larger one."""
+        if self.fixed_distance is None:
+            return state
+        a, b, distance = self.fixed_distance
+        factor = distance / float(np.linalg.norm(state.cameras[a, :3, 3] - state.cameras[b, :3, 3]))
+        cameras = state.cameras.copy()
+        cameras[:, :3, 3] *= factor
+        return replace(state, cameras=cameras, motion=factor * state.motion)
 
     def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
         """The same with other parameters sought."""

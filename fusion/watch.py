@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
-from camera_node.pose import Pose, rotation_from_vector, skew
+from calib.camera import Camera, pixel_jacobians
+from camera_node.pose import Pose, rotation_from_vector
 from fusion.instants import Frame
 
 Array = NDArray[np.float64]
@@ -240,7 +240,6 @@ def _normal_equations(camera: Camera, T: Array, points: Array, measured: Array) 
 def _linearise(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array]:
     """A (K, 2, 6) and b (K, 2) of A xi = b, the points that can be seen."""
     p = (points - T[:3, 3]) @ T[:3, :3]
-    uv, J = camera.project_with_jacobian(p)
-    by_pose = np.concatenate([skew(p), np.tile(-np.eye(3), (len(p), 1, 1))], 2)
+    uv, _, J_pose, _ = pixel_jacobians(camera, p)
     known = np.isfinite(uv).all(1)
-    return (J @ by_pose)[known], (measured - uv)[known]
+    return J_pose[known], (measured - uv)[known]

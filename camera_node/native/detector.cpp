@@ -7,6 +7,7 @@
 
 #include "circles.hpp"
 #include "gates.hpp"
+#include "moving.hpp"
 #include "surface.hpp"
 
 namespace roundel {
@@ -20,12 +21,13 @@ constexpr int kOverlap = 64;           // pixels that a searched band reaches in
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear();
+    found_.clear(), lost_.clear();
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
     follow(image);
     search(image);
+    follow_smeared(image);
     tracks_.update(found_);
     update_theta();
     return found_;
@@ -33,7 +35,21 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
 
 void Detector::follow(const ImageView& image) {
     for (const auto& expected : tracks_.expect())
-        accept(image, fit_circles(image, expected.seed, settings_), expected.track);
+        if (!accept(image, fit_circles(image, expected.seed, settings_), expected.track))
+            lost_.push_back(expected);
+}
+
+/// Those that were in the last frame, and are not to be seen sharp in this one.
+void Detector::follow_smeared(const ImageView& image) {
+    for (const auto& expected : lost_) {
+        const auto is_it = [&](const Roundel& r) {
+            const double apart =
+                std::hypot(r.fit.outer.x - double(expected.seed.x), r.fit.outer.y - double(expected.seed.y));
+            return r.track < 0 && apart < r.fit.outer.major;
+        };
+        if (std::none_of(found_.begin(), found_.end(), is_it))
+            keep(image, follow_moving(image, expected, settings_, noise_), expected.track);
+    }
 }
 
 /// The rows of the image that this frame's search looks at.
@@ -68,13 +84,19 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
     }
 }
 
-/// Fits, tests and keeps a roundel, unless it was found before.
-void Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
-    if (!start || found_.size() >= kMaxRoundels || claims_.cover(start->outer.x, start->outer.y)) return;
-    const auto fit = fit_roundel(image, *start, settings_, noise_, track >= 0);
-    if (!fit || is_bullseye(image, *fit)) return;
+/// Fits, tests and keeps a roundel, unless it was found before; whether it is there.
+bool Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
+    if (!start) return false;
+    if (claims_.cover(start->outer.x, start->outer.y)) return true;
+    return keep(image, fit_roundel(image, *start, settings_, noise_, track >= 0), track);
+}
+
+bool Detector::keep(const ImageView& image, const std::optional<Fit>& fit, int track) {
+    if (!fit || found_.size() >= kMaxRoundels || claims_.cover(fit->outer.x, fit->outer.y)) return false;
+    if (is_bullseye(image, *fit)) return false;
     claims_.add(fit->outer);
     found_.push_back({*fit, track});
+    return true;
 }
 
 void Detector::update_theta() {

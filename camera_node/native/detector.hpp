@@ -25,8 +25,10 @@ class Detector {
   private:
     void follow(const ImageView& image);
     void search(const ImageView& image);
+    void follow_smeared(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
-    void accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
     ImageView next_band(const ImageView& image, int& top);
     void update_theta();
 
@@ -36,6 +38,7 @@ class Detector {
     Tracks tracks_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
+    std::vector<Tracks::Expected> lost_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     std::mutex mutex_;

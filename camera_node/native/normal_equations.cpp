@@ -11,115 +11,154 @@ namespace {
 
 constexpr int kColumns = kCount + 1;  // the gradient and the residual
 constexpr int kHigh = 2, kWide = 4;   // products of so many columns stay in registers
-
-struct Sums {
-    Lanes gram[kColumns][kColumns];
-    Lanes w, ring, ring_rr, agreeing, m, mm, mrr, mwrr, mpsi;
-};
+constexpr int kSample = 24;           // lanes
+constexpr int kHalvings = 10;         // of 256 grey levels
 
 using Columns = Lanes[kColumns][kChunk];
+using Gram = Lanes[kColumns][kColumns];
 
 /// Products of columns i .. i + m with columns j .. j + n.
 template <int i, int j, int m, int n>
-ROUNDEL_INLINE void multiply(const Columns& columns, int count, Sums& sums) {
+ROUNDEL_INLINE void multiply(const Columns& columns, int count, Gram& gram) {
     Lanes s[m][n];
     for (int a = 0; a < m; ++a)
-        for (int b = 0; b < n; ++b) s[a][b] = sums.gram[i + a][j + b];
+        for (int b = 0; b < n; ++b) s[a][b] = gram[i + a][j + b];
     for (int k = 0; k < count; ++k)
         for (int a = 0; a < m; ++a)
             for (int b = 0; b < n; ++b) s[a][b] += columns[i + a][k] * columns[j + b][k];
     for (int a = 0; a < m; ++a)
-        for (int b = 0; b < n; ++b) sums.gram[i + a][j + b] = s[a][b];
+        for (int b = 0; b < n; ++b) gram[i + a][j + b] = s[a][b];
 }
 
 /// All products of the columns, tile by tile, the upper triangle only.
 template <int i, int j>
-ROUNDEL_INLINE void multiply_all(const Columns& columns, int count, Sums& sums) {
+ROUNDEL_INLINE void multiply_all(const Columns& columns, int count, Gram& gram) {
     constexpr int m = std::min(kHigh, kColumns - i), n = std::min(kWide, kColumns - j);
-    multiply<i, j, m, n>(columns, count, sums);
+    multiply<i, j, m, n>(columns, count, gram);
     if constexpr (j + n < kColumns)
-        multiply_all<i, j + n>(columns, count, sums);
+        multiply_all<i, j + n>(columns, count, gram);
     else if constexpr (i + m < kColumns)
-        multiply_all<i + m, i + m>(columns, count, sums);
+        multiply_all<i + m, i + m>(columns, count, gram);
 }
 
-/// Gives each column of eight pixels the root of their weight.
-ROUNDEL_INLINE void weigh(const Gradient& model, const Lanes& level, float per_cut, int k, Columns& columns,
-                          Sums& sums) {
-    const Lanes r = level - model.level[k], t = r * per_cut, left = 1.0f - t * t;
-    // What is clipped tells no more than that the level is beyond the scale.
-    const Bits clipped = ((level > 254.5f) & (model.level[k] > 255.0f)) |
-                         ((level < 0.5f) & (level >= 0.0f) & (model.level[k] < 0.0f));
-    const Bits counts = (left > 0.0f) & (level >= 0.0f) & ~clipped;
-    const Lanes root = counts ? left : all(0), w = root * root;
-    const Lanes& bx = model.by[kX][k];
-    const Lanes& by = model.by[kY][k];
-    const Lanes ring = level >= 0.0f ? model.ring[k] * model.ring[k] : all(0), m = w * (bx * bx + by * by);
-    for (int i = 0; i < kCount; ++i) columns[i][k] = root * model.by[i][k];
-    columns[kCount][k] = root * r;
-    sums.w += w;
-    sums.ring += ring;
-    sums.ring_rr += ring * r * r;
-    sums.agreeing += w * ring;
-    sums.m += m;
-    sums.mm += m * (bx * bx + by * by);
-    sums.mrr += m * r * r;
-    sums.mwrr += m * w * r * r;
-    sums.mpsi += root > 0.0f ? m / root * (1.0f - 5.0f * t * t) : all(0);
+/// The root of Tukey's weight of residuals that are `t` cuts.
+ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
+    const Lanes left = 1.0f - t * t;
+    return left > 0.0f ? left : all(0);
 }
 
-ROUNDEL_CLONES void add_up(const EdgePixels& pixels, const Model& model, float per_cut, Sums& sums) {
-    Gradient gradient;
+ROUNDEL_CLONES void evaluate_all(const EdgePixels& pixels, const Model& model, Gradient* chunks) {
+    for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes)
+        model.evaluate(pixels.x + begin, pixels.y + begin, pixels.level + begin,
+                       std::min(kChunk, (pixels.count - begin) / kLanes), *chunks++);
+}
+
+ROUNDEL_CLONES void add_up(const Gradient* chunks, int lanes, float per_cut, Gram& gram) {
     Columns columns;
-    for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
-        const int count = std::min(kChunk, (pixels.count - begin) / kLanes);
-        model.evaluate(pixels.x + begin, pixels.y + begin, count, gradient);
-        for (int k = 0; k < count; ++k)
-            weigh(gradient, load(pixels.level + begin + k * kLanes), per_cut, k, columns, sums);
-        multiply_all<0, 0>(columns, count, sums);
+    for (; lanes > 0; lanes -= kChunk, ++chunks) {
+        const int count = std::min(kChunk, lanes);
+        for (int k = 0; k < count; ++k) {
+            const Lanes root = root_weight(chunks->residual[k] * per_cut);
+            for (int i = 0; i < kCount; ++i) columns[i][k] = root * chunks->by[i][k];
+            columns[kCount][k] = root * chunks->residual[k];
+        }
+        multiply_all<0, 0>(columns, count, gram);
     }
 }
 
-ROUNDEL_CLONES int add_residuals(const EdgePixels& pixels, const Model& model, int step, float* residuals,
-                                 float* slopes) {
-    Gradient gradient;
+struct Sums {
+    Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
+};
+
+ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut, Sums& sums) {
+    const Lanes t = r * per_cut, root = root_weight(t), w = root * root, rr = r * r;
+    const Lanes squared = at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k];
+    const Lanes ring = at.residual[k] < kAbsent ? at.ring[k] * at.ring[k] : all(0), m = w * squared;
+    sums.ring += ring;
+    sums.agreeing += w * ring;
+    sums.ring_rr += ring * rr;
+    sums.m += m;
+    sums.mm += m * squared;
+    sums.mrr += m * rr;
+    sums.mwrr += m * w * rr;
+    sums.mpsi += squared * root * (1.0f - 5.0f * t * t);
+}
+
+ROUNDEL_CLONES void add_leftover(const Gradient* chunks, int lanes, const float* delta, float per_cut,
+                                 Sums& sums) {
+    for (; lanes > 0; lanes -= kChunk, ++chunks)
+        for (int k = 0; k < std::min(kChunk, lanes); ++k) {
+            Lanes r = chunks->residual[k];
+            for (int i = 0; i < kCount; ++i) r -= delta[i] * chunks->by[i][k];
+            add_residuals(r, *chunks, k, per_cut, sums);
+        }
+}
+
+ROUNDEL_INLINE int count_below(const Lanes* values, int n, float limit) {
+    Bits below{};
+    for (int k = 0; k < n; ++k) below -= values[k] < limit;
+    int count = 0;
+    for (int i = 0; i < kLanes; ++i) count += below[i];
+    return count;
+}
+
+/// As Linearisation::median_residual, by halving an interval.
+ROUNDEL_CLONES float median_of(const Gradient* chunks, int lanes) {
+    Lanes residuals[kSample], slopes[kSample], most{};
+    const int step = (lanes + kSample - 1) / kSample;
     int n = 0;
-    for (int begin = 0; begin + kLanes <= pixels.used; begin += step * kLanes, n += kLanes) {
-        model.evaluate(pixels.x + begin, pixels.y + begin, 1, gradient);
-        const Lanes r = magnitude(load(pixels.level + begin) - gradient.level[0]);
-        const Lanes slope = magnitude(gradient.ring[0]);
-        __builtin_memcpy(residuals + n, &r, sizeof r);
-        __builtin_memcpy(slopes + n, &slope, sizeof slope);
+    for (int k = 0; k < lanes; k += step, ++n) {
+        const Gradient& at = chunks[k / kChunk];
+        residuals[n] = magnitude(at.residual[k % kChunk]), slopes[n] = magnitude(at.ring[k % kChunk]);
+        const Lanes slope = residuals[n] < kAbsent ? slopes[n] : all(0);
+        most = slope > most ? slope : most;
     }
-    return n;
+    float steep = 1e-3f;
+    for (int i = 0; i < kLanes; ++i) steep = std::max(steep, most[i] / 2);
+    for (int k = 0; k < n; ++k) residuals[k] = slopes[k] > steep ? residuals[k] : all(kAbsent);
+    const int count = count_below(residuals, n, kAbsent);
+    if (count < kLanes) return -1;
+    float low = 0, high = 256;
+    for (int k = 0; k < kHalvings; ++k) {
+        const float middle = (low + high) / 2;
+        (2 * count_below(residuals, n, middle) > count ? high : low) = middle;
+    }
+    return high;
 }
 
 }  // namespace
 
-NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double scale) {
-    Sums sums{};
-    add_up(pixels, Model(p), float(1 / (kTukey * scale)), sums);
+void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
+    count_ = pixels.count / kLanes;
+    evaluate_all(pixels, Model(p), chunks_);
+}
+
+double Linearisation::median_residual() const { return double(median_of(chunks_, count_)); }
+
+NormalEquations Linearisation::accumulate(double scale) const {
+    Gram gram{};
+    add_up(chunks_, count_, float(1 / (kTukey * scale)), gram);
     NormalEquations e;
     for (int i = 0; i < kCount; ++i) {
-        for (int j = 0; j <= i; ++j) e.H[i][j] = sum(sums.gram[j][i]);
-        e.g[i] = sum(sums.gram[i][kCount]);
+        for (int j = 0; j <= i; ++j) e.H[i][j] = double(sum(gram[j][i]));
+        e.g[i] = double(sum(gram[i][kCount]));
     }
-    e.wrr = sum(sums.gram[kCount][kCount]), e.w = sum(sums.w);
-    e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr), e.agreeing = sum(sums.agreeing);
-    e.m = sum(sums.m), e.mm = sum(sums.mm);
-    e.mrr = sum(sums.mrr), e.mwrr = sum(sums.mwrr), e.mpsi = sum(sums.mpsi);
     return e;
 }
 
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals) {
-    float slopes[kSample + kLanes];
-    const int step = (pixels.count + kSample - 1) / kSample;
-    const int n = add_residuals(pixels, Model(p), step, residuals, slopes);
-    const float steep = n > 0 ? *std::max_element(slopes, slopes + n) / 2 : 0;
-    int kept = 0;
-    for (int k = 0; k < n; ++k)
-        if (slopes[k] > steep) residuals[kept++] = residuals[k];
-    return kept;
+Leftover Linearisation::after(const Parameters& delta, double scale) const {
+    float step[kCount];
+    for (int i = 0; i < kCount; ++i) step[i] = float(delta[i]);
+    Sums s{};
+    add_leftover(chunks_, count_, step, float(1 / (kTukey * scale)), s);
+    return {.ring = double(sum(s.ring)),
+            .agreeing = double(sum(s.agreeing)),
+            .ring_rr = double(sum(s.ring_rr)),
+            .m = double(sum(s.m)),
+            .mm = double(sum(s.mm)),
+            .mrr = double(sum(s.mrr)),
+            .mwrr = double(sum(s.mwrr)),
+            .mpsi = double(sum(s.mpsi))};
 }
 
 }  // namespace roundel

@@ -5,11 +5,14 @@
 
 namespace roundel {
 
-/// Sums over pixels at one point of the parameters, w being Tukey's weights and r the residuals.
+/// Of weighted least squares, J being the derivatives of the levels, r the residuals and W Tukey's weights.
 struct NormalEquations {
     Matrix H;      // J^T W J, the lower triangle
     Parameters g;  // J^T W r
-    double w, wrr;
+};
+
+/// Sums over residuals r - J delta, which a step of delta leaves to first order.
+struct Leftover {
     double ring, agreeing;  // squared slopes of the ring's edges, and weighed
     double ring_rr;         // squared residuals times these slopes
     /// Sums of w m and w m^2, m being the squared slope of the level: what a pixel tells of the edges. And of
@@ -20,12 +23,21 @@ struct NormalEquations {
 /// Tukey's biweight: (1 - (r / c)^2)^2 within c = 6 scales, and nothing beyond.
 constexpr float kTukey = 6;
 
-NormalEquations accumulate(const EdgePixels& pixels, const Parameters& p, double scale);
+/// The model's levels near one point of the parameters: linear in a step from there, at every pixel.
+class Linearisation {
+  public:
+    void evaluate(const EdgePixels& pixels, const Parameters& p);
 
-constexpr int kSample = 192;
+    /// The median absolute residual where the ring's edges are steep, of a sample; negative where there are
+    /// fewer than eight.
+    double median_residual() const;
+    NormalEquations accumulate(double scale) const;
+    Leftover after(const Parameters& delta, double scale) const;
 
-/// Absolute residuals where the ring's edges are steep, of about kSample pixels spread over all; gives their
-/// number. There is room for kSample and eight.
-int sample_residuals(const EdgePixels& pixels, const Parameters& p, float* residuals);
+  private:
+    static constexpr int kChunks = EdgePixels::kMax / (kChunk * kLanes) + 1;
+    int count_ = 0;  // lanes, of all chunks
+    Gradient chunks_[kChunks];
+};
 
 }  // namespace roundel

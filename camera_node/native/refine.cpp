@@ -7,15 +7,19 @@
 #include "cholesky.hpp"
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
+#include "pose_outputs.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2.5;       // pixels on either side of an edge that are used, at the least
-constexpr double kBandBlurs = 2.5;  // blurs, likewise
+constexpr double kNarrow = 1.25,
+                 kNarrowBlurs = 1.5;             // pixels on either side of an edge, at the least; and blurs
+constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
+constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
+constexpr double kConverged = 0.4;         // standard deviations that may be left to go
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
@@ -56,7 +60,7 @@ Parameters prior_information(double major) {
 /// Gauss-Newton on the pixels near one roundel's edges.
 class Fitter {
   public:
-    Fitter(const ImageView& image, const Start& start) : image_(image) {
+    Fitter(const ImageView& image, const Start& start) : image_(image), hidden_(start.hidden) {
         pixels_.origin_x = int(std::lround(start.outer.x));
         pixels_.origin_y = int(std::lround(start.outer.y));
         p = start_ = begin(start, pixels_);
@@ -65,13 +69,14 @@ class Fitter {
 
     bool solve() {
         // Perspective moves the inner edge and the card's from where the start has them.
-        const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select(kBand + unknown, kCoarsePixels)) return false;
+        const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
+        if (!select({wide, wide, true}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card();
         if (!iterate(2)) return false;
-        const double band = std::max(kBand, kBandBlurs * p[kBlur]);
-        if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
-        return iterate(1);
+        const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
+        const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
+                        card};
+        return select(band, EdgePixels::kMax) && iterate(1);
     }
 
     void learn_print(double ratio);
@@ -81,8 +86,9 @@ class Fitter {
   private:
     PoseCovariance covariance() const;
 
-    bool select(double band, int limit) {
-        step_ = select_pixels(image_, p, band, limit, pixels_);
+    bool select(const Band& band, int limit) {
+        select_pixels(image_, p, band, limit, pixels_);
+        if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
@@ -100,76 +106,58 @@ class Fitter {
         return n > 0 ? double(sum / n) : p[kBright];
     }
 
-    /// The median of the residuals of a sample of the ring's edges (1.48 of it is a standard deviation).
-    double edge_scale() const {
-        float residuals[kSample + kLanes];
-        const int n = sample_residuals(pixels_, p, residuals);
-        if (n < kLanes) return (p[kBright] - p[kDark]) / 4;
-        std::nth_element(residuals, residuals + n / 2, residuals + n);
-        return std::max(kNoiseFloor, 1.48 * residuals[n / 2]);
-    }
-
     /// Steps until what is left, of the order of one's square over the blur, will be small against the
     /// standard deviation `ahead` steps later.
     bool iterate(int ahead) {
         for (int k = 0; k < kMaxSteps; ++k) {
+            model_.evaluate(pixels_, p);
             const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * edge_scale());
-            sums_ = accumulate(pixels_, p, used);
-            add_prior();
-            factor_.emplace(sums_.H);
+            equations_ = model_.accumulate(used);
+            add_prior(used);
+            factor_.emplace(equations_.H);
             if (!factor_->positive()) return false;
-            const double moved = advance();
+            const double moved = advance(used);
             if (!is_sane()) return false;
-            const double deviation = noise_ / std::sqrt(sums_.H[kX][kX] + sums_.H[kY][kY]);
+            const double deviation = noise_ / std::sqrt(equations_.H[kX][kX] + equations_.H[kY][kY]);
             double left = moved;
             for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
-            if (left < 0.2 * deviation && (ahead > 1 || (is_noise_known_ && scale_ > 0.7 * used)))
-                return true;
+            if (left < kConverged * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
         }
         return true;
     }
 
-    void add_prior() {
-        const double noise = std::max(kNoiseFloor, std::sqrt(sums_.mrr / sums_.m));
+    /// Of the residuals at the ring's edges (1.48 of their median is a standard deviation).
+    double edge_scale() const {
+        const double median = model_.median_residual();
+        return median < 0 ? (p[kBright] - p[kDark]) / 4 : std::max(kNoiseFloor, 1.48 * median);
+    }
+
+    void add_prior(double noise) {
         for (int i = 0; i < kCount; ++i) {
             const double information = noise * noise * prior_[i];
-            sums_.H[i][i] += information;
-            sums_.g[i] += information * (start_[i] - p[i]);
+            equations_.H[i][i] += information;
+            equations_.g[i] += information * (start_[i] - p[i]);
         }
     }
 
-    /// Takes a step, foretells the residuals after it, and gives its greatest move in pixels.
-    double advance() {
-        const Parameters delta = factor_->solve(sums_.g);
+    /// Takes a step, and gives its greatest move in pixels.
+    double advance(double scale) {
+        const Parameters delta = factor_->solve(equations_.g);
         for (int i = 0; i < kCount; ++i) p[i] += delta[i];
         p[kBlur] = std::max(p[kBlur], kMinBlur);
-        update_noise(delta);
+        left_ = model_.after(delta, scale);
+        update_noise();
         double moved = std::abs(delta[kBlur]);
         for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
         return moved;
     }
 
-    /// What residuals on the edges are left after a step. It takes delta^T H delta off the sum of squares;
-    /// what belongs to the levels and to the blur is elsewhere. `freedom` is the share that the unknowns do
-    /// not follow.
-    void update_noise(const Parameters& delta) {
-        double all = 0, edges = 0;
-        for (int i = 0; i < kCount; ++i)
-            for (int j = 0; j < kCount; ++j) {
-                const double part = delta[i] * sums_.H[std::max(i, j)][std::min(i, j)] * delta[j];
-                all += part, edges += i > kBlur && j > kBlur ? part : 0;
-            }
-        const double left = sums_.mm / sums_.m * edges;
-        const double freedom = std::max(0.1, 1 - kEdgeUnknowns * sums_.mm / square(sums_.m));
-        const double slope = std::max(0.5, sums_.mpsi / sums_.m);
-        // After a long step what is left is too small a difference to be trusted.
-        is_noise_known_ = left < sums_.mwrr / 4;
-        const double mrr = std::max(sums_.mrr / 4, sums_.mrr - left);
-        const double mwrr = std::max(sums_.mwrr / 4, sums_.mwrr - left);
-        edge_residual_ = std::sqrt(std::max(sums_.ring_rr / 4, sums_.ring_rr - left) / sums_.ring);
-        scale_ = std::max(kNoiseFloor, kScale * std::sqrt(mrr / (sums_.m * freedom)));
-        noise_ = std::max(kNoiseFloor, std::sqrt(mwrr / (sums_.m * freedom)) / slope);
-        agreeing_ = std::sqrt(std::max(0.0, sums_.wrr - all) / std::max(1.0, sums_.w));
+    /// Of residuals on the edges; `freedom` is the share of them that the unknowns do not follow.
+    void update_noise() {
+        const double freedom = std::max(0.1, 1 - kEdgeUnknowns * left_.mm / square(left_.m));
+        const double slope = std::max(0.5, left_.mpsi / left_.m);
+        scale_ = std::max(kNoiseFloor, kScale * std::sqrt(left_.mrr / (left_.m * freedom)));
+        noise_ = std::max(kNoiseFloor, std::sqrt(left_.mwrr / (left_.m * freedom)) / slope);
     }
 
     bool is_sane() const {
@@ -183,26 +171,16 @@ class Fitter {
     }
 
     const ImageView& image_;
+    Hidden hidden_;
     EdgePixels pixels_;
     Parameters start_, prior_;
-    NormalEquations sums_;
+    Linearisation model_;
+    NormalEquations equations_;
+    Leftover left_;
     std::optional<Cholesky<kCount>> factor_;
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
-    int step_ = 1;
-    bool is_noise_known_ = false;
-    double scale_ = 255, noise_ = 0, agreeing_ = 0, edge_residual_ = 0;
+    double scale_ = 255, noise_ = 0;
 };
-
-/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
-/// first order in g.
-std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
-    const double gx = p[kGx], gy = p[kGy];
-    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
-    std::array<Vector<kPoseCount>, kPoseCount> T{};
-    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
-    for (int k = 0; k < 5; ++k) T[k][k] += 1;
-    return T;
-}
 
 /// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
 void Fitter::learn_print(double ratio) {
@@ -220,20 +198,16 @@ PoseCovariance Fitter::covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
-    const auto T = outputs_by_pose(p);
-    PoseCovariance half{}, whole{};
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int i = 0; i < kPoseCount; ++i)
-            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int b = 0; b < kPoseCount; ++b)
-            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
-    return whole;
+    for (auto& row : inverse)
+        for (double& value : row) value *= square(noise_);
+    return output_covariance(p, inverse);
 }
 
 Fit Fitter::fit() const {
     const CircleImage outer = circle_image(p, 1);
     const Eigen axes = eigen(outer.shape);
+    Parameters in_image = p;
+    in_image[kX] += pixels_.origin_x, in_image[kY] += pixels_.origin_y;
     return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
                       2 * std::sqrt(axes.second), axes.angle},
             .offset_x = p[kX] - outer.x,
@@ -243,9 +217,9 @@ Fit Fitter::fit() const {
             .dark = p[kDark],
             .bright = p[kBright],
             .blur = p[kBlur],
-            .edge_residual = edge_residual_,
-            .agreeing_residual = agreeing_,
-            .support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected};
+            .edge_residual = std::sqrt(left_.ring_rr / left_.ring),
+            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected,
+            .p = in_image};
 }
 
 }  // namespace

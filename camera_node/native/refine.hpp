@@ -5,6 +5,7 @@
 
 #include "ellipse.hpp"
 #include "image.hpp"
+#include "occlusion.hpp"
 
 namespace roundel {
 
@@ -13,6 +14,7 @@ struct Start {
     Ellipse outer;
     double ratio, dark, bright;
     double print = 0;  // ratio that the print in use was made with; 0 where it is not known
+    Hidden hidden{};   // what is covered, and left out of the fit
 };
 
 /// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
@@ -28,8 +30,10 @@ struct Fit {
     double dark, bright;   // grey levels
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
-    double agreeing_residual;  // over those that agree
-    double support;            // share of the ring's edges that is in the image and agrees
+    double support;        // share of the ring's edges that is in the image and agrees
+    Parameters p;          // as the model has them, in the image's frame
+    double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
+    double noise = 0;                   // of what the fit of a moving one leaves, grey levels
     /// Of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
     Symmetric offset_covariance() const { return {C[5][5], C[5][6], C[6][6]}; }

@@ -37,10 +37,12 @@ inline CircleImage circle_image(const Parameters& p, double r) {
 constexpr int kChunk =
     31;  // lanes at a time: columns fit the first cache, and odd, so that they share no bank
 
-/// The grey level that the parameters say, its gradient by them, and what the ring's two edges have in its
-/// change with the distance, of a chunk of pixels.
+constexpr float kAbsent = 1e9f;  // a residual that does not count
+
+/// Of a chunk of pixels: the gradient of the grey levels by the parameters, what the ring's two edges have in
+/// their change with the distance, and the residuals.
 struct Gradient {
-    Lanes by[kCount][kChunk], level[kChunk], ring[kChunk];
+    Lanes by[kCount][kChunk], ring[kChunk], residual[kChunk];
 };
 
 /// What the parameters say of pixels' grey levels.
@@ -64,15 +66,19 @@ class Model {
         half_flat_ = float(1.5 * p[kBlur]);
     }
 
-    /// `x` and `y` are `count` lanes of pixels in the frame of the parameters.
-    ROUNDEL_INLINE void evaluate(const float* x, const float* y, int count, Gradient& to) const {
+    /// `x` and `y` are `count` lanes of pixels in the frame of the parameters, `seen` their grey levels.
+    ROUNDEL_INLINE void evaluate(const float* x, const float* y, const float* seen, int count,
+                                 Gradient& to) const {
         Geometry at;
         for (int k = 0; k < count; ++k) locate(load(x + k * kLanes), load(y + k * kLanes), k, at);
         Edge outer, inner, card;
         blur_edge(at, 1, count, outer);
         blur_edge(at, ratio_, count, inner);
         blur_edge(at, card_, count, card);
-        for (int k = 0; k < count; ++k) differentiate(at, outer, inner, card, k, to);
+        for (int k = 0; k < count; ++k) {
+            const Lanes level = differentiate(at, outer, inner, card, k, to);
+            to.residual[k] = compare(load(seen + k * kLanes), level);
+        }
     }
 
   private:
@@ -109,8 +115,10 @@ class Model {
     ROUNDEL_INLINE void blur_edge(const Geometry& at, float r, int count, Edge& to) const {
         const float per_r = 1 / r;
         for (int k = 0; k < count; ++k) {
-            const Lanes over = at.f[k] - r, distance = over * at.stretch[k] * (1.0f + over * at.bow[k]);
-            const Lanes bend = at.bend[k] * per_r, narrow = 1.0f / (1.0f + bend * bend);
+            const Lanes over = at.f[k] - r, bow = over * at.bow[k];
+            const Lanes distance = over * at.stretch[k] * (1.0f + (bow > -0.5f ? bow : all(-0.5f)));
+            const Lanes bend = at.bend[k] * per_r, bb = bend * bend < 0.5f ? bend * bend : all(0.5f);
+            const Lanes narrow = 1.0f - bb * (1.0f - bb);
             const Lanes shift = blur_ * bend * (1.0f + bend * at.flat[k] * per_r);
             const Normal normal = normal_tail((distance + shift) * per_blur_ * narrow);
             to.inside[k] = normal.tail, to.slope[k] = -peak_ * normal.density * narrow;
@@ -118,8 +126,9 @@ class Model {
         }
     }
 
-    ROUNDEL_INLINE void differentiate(const Geometry& at, const Edge& outer, const Edge& inner,
-                                      const Edge& card, int k, Gradient& to) const {
+    /// Gives the grey level.
+    ROUNDEL_INLINE Lanes differentiate(const Geometry& at, const Edge& outer, const Edge& inner,
+                                       const Edge& card, int k, Gradient& to) const {
         const Lanes by_inner = -fall_ * inner.slope[k], by_card = -drop_ * card.slope[k];
         const Lanes ring = fall_ * outer.slope[k] + by_inner;
         const Lanes by = ring + by_card;  // the level by the distance outwards
@@ -133,7 +142,14 @@ class Model {
         to.by[kAxx][k] = by_x * qx, to.by[kAxy][k] = by_x * qy + by_y * qx, to.by[kAyy][k] = by_y * qy;
         to.by[kGx][k] = tip * qx, to.by[kGy][k] = tip * qy;
         to.ring[k] = ring;
-        to.level[k] = bright_ + fall_ * dark + drop_ * ground;
+        return bright_ + fall_ * dark + drop_ * ground;
+    }
+
+    /// The residual. What is clipped tells no more than that the level is beyond the scale, and does not
+    /// count.
+    ROUNDEL_INLINE static Lanes compare(const Lanes& seen, const Lanes& level) {
+        const Bits clipped = ((seen > 254.5f) & (level > 255.0f)) | ((seen < 0.5f) & (level < 0.0f));
+        return (seen < 0.0f) | clipped ? all(kAbsent) : seen - level;
     }
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;

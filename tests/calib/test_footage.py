@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures come out of folders, videos and running cameras, each with a name."""
 
-import socket
 import threading
 from functools import partial
 from pathlib import Path
@@ -17,13 +16,6 @@ from camera_node.network import open_client, open_router
 from camera_node.requests import encode_jpeg, parse_quality, respond
 
 IMAGE = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def test_folders_and_videos_are_found_and_read(tmp_path: Path):

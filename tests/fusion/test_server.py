@@ -2,7 +2,6 @@
 """The live server and its client over Zenoh on loopback."""
 
 import asyncio
-import socket
 import subprocess
 import sys
 import threading
@@ -23,17 +22,12 @@ from fusion.client import Arena as Client
 from fusion.config import ArenaConfig
 from fusion.server import Server
 from fusion.tracker import Limits
+from tests.conftest import free_port
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
@@ -44,7 +38,7 @@ def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
     rig = str(folder / "rig.yaml") if with_rig else None
     return ArenaConfig(
         arena="test",
-        listen=(free_endpoint(),),
+        listen=(f"tcp/127.0.0.1:{free_port()}",),
         rig=rig,
         robots=str(folder / "robots.yaml"),
         limits=Limits(lateness_ms=5000),  # frames are sent in one burst: every instant waits to be complete

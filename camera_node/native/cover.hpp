@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <optional>
+
+#include "image.hpp"
+#include "refine.hpp"
+
+namespace roundel {
+
+/// Whether noise alone explains what a fit leaves over: nothing covers anything.
+bool is_plain(const Fit& fit, double noise);
+
+/// The fit to what is left of a roundel that something covers in part. Sectors of either edge that are off
+/// the fit `whole` are left out and the rest is fitted anew, ever more strictly, until what is left is as the
+/// model says; a biased fit does not come through, and the covariance is that of the rest.
+///
+/// A roundel that is `known` may look like a letter; a new one may not.
+std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known);
+
+}  // namespace roundel

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <bit>
+#include <cstdint>
+
+#include "edge_pixels.hpp"
+#include "image.hpp"
+
+namespace roundel {
+
+/// A set of the 32 sectors of a disc, one a bit, counted by the direction in the disc's own plane.
+using Sectors = uint32_t;
+constexpr int kSectors = 32;
+
+inline int count_sectors(Sectors sectors) { return std::popcount(sectors); }
+/// One of the runs of neighbouring sectors in a set that is not empty; the last sector is the first one's
+/// neighbour.
+Sectors any_run(Sectors sectors);
+
+/// Pixel that lies in the middle of a sector at `r` outer radii, by the model `p` in the image's frame.
+struct Pixel {
+    float x, y;
+};
+Pixel point_in_sector(const Parameters& p, int sector, double r);
+
+/// Where a roundel's edges are covered: the outer one (with all that lies outside) and the inner one.
+struct Hidden {
+    Sectors outer = 0, inner = 0;
+    bool operator==(const Hidden&) const = default;
+    bool any() const { return outer || inner; }
+};
+
+/// Takes what is hidden out of the pixels.
+void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels);
+
+/// The sectors in which an edge is off the model `p` (in the image's frame) by more than the noise explains
+/// and `slack`, both in grey levels RMS; and those so near to them that what covers them may reach there too.
+Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack);
+
+}  // namespace roundel
