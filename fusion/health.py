@@ -7,6 +7,7 @@ import resource
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -106,7 +107,12 @@ class Health:
                 camera.squared_px += use.squared_px
 
     def status(
-        self, now_ns: int, calibrated: set[str], late: dict[str, int], aside: set[str]
+        self,
+        now_ns: int,
+        calibrated: set[str],
+        late: dict[str, int],
+        aside: set[str],
+        misfits: Callable[[], dict[str, float]] = dict,
     ) -> FusionStatus | None:
         """The status of the last second, or None before it is over."""
         if 0 <= now_ns - self._since_ns < PERIOD_NS:
@@ -129,6 +135,7 @@ class Health:
             cameras=cameras,
             robots=dict(self._robots),
             faults=faults,
+            misfits=misfits(),
         )
         self._since_ns, self._cpu_s, self._instants = now_ns, cpu_s, 0
         self._latencies.clear()

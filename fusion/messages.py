@@ -133,6 +133,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, State]
     faults: dict[str, int]
+    misfits: dict[str, float] = {}  # RMS, pixels, of robots whose markers do not stand as declared
 
 
 def robots_key(arena: str) -> str:

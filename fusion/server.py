@@ -200,8 +200,9 @@ class Server:
     # What is told.
 
     def _tell_status(self, now_ns: int) -> bool:
-        aside = self._tracker.watch.bumped if self._tracker else set()
-        status = self.health.status(now_ns, set(self._cameras()), self._instants.late, aside)
+        tracker, late = self._tracker, self._instants.late
+        aside, misfits = (tracker.watch.bumped, tracker.shapes.misfits) if tracker else (set(), dict)
+        status = self.health.status(now_ns, set(self._cameras()), late, aside, misfits)
         if status is not None:
             own = "" if self.shard.leads else f"/{self.shard.index}"
             self.link.publish(self.keys.fusion_status + own, status)

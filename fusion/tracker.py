@@ -18,6 +18,7 @@ from fusion.optics import Optics
 from fusion.report import Fused, Move, look, report, tell_poses
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
+from fusion.shapes import Shapes
 from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
 from fusion.state import POSITION, States, exp_so3
@@ -81,6 +82,7 @@ class Tracker:
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
         self.search = Search(self)
         self.watch = Watch()
+        self.shapes = Shapes(self.names, single)
         self._inspection = Inspection(self)
         self._last: tuple[Instant, Sightings, Matches] | None = None
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
@@ -114,7 +116,9 @@ class Tracker:
         matches = self._update(begun.prediction, sightings, matches)
         self._note(instant.t_ns, matches)
         rows = np.flatnonzero(begun.followed & ~(self.estimator.single & self._misses_bodies(begun.followed)))
-        self._told = tell_poses(self, instant.t_ns, look(self, sightings, matches), rows.tolist())
+        seen = look(self, sightings, matches)
+        self.shapes.note(seen.residual_px)
+        self._told = tell_poses(self, instant.t_ns, seen, rows.tolist())
         self._last = instant, sightings, matches
         return tuple(self._told.values())
 

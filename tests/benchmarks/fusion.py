@@ -93,7 +93,8 @@ def _capacities(thorough: bool) -> Iterator[Row]:
         )
         yield (
             f"{name}: core (quiet), robots tracked, memory",
-            f"{got.cpu:.0%} ({got.quiet_ms * load.hz / 1e3:.0%}), {got.tracked:.1%}, {got.grown_mb_min:.2f} MB a minute",
+            f"{got.cpu:.0%} ({got.quiet_ms * load.hz / 1e3:.0%}), {got.tracked:.1%}, "
+            f"{got.grown_mb_min:.2f} MB a minute",
             "100%, 99%, 0.1" if thorough else "100%, 99%",
             _verdict(got.cpu < 1 and got.tracked > 0.99 and not (thorough and got.grown_mb_min > 0.1)),
         )

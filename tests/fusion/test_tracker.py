@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Properties of tracking: exact without noise, honest with it, nobody swapped, nothing guessed."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -118,13 +116,10 @@ def test_covariance_is_honest_from_the_first_instant_on(cameras):
         )
         frames = [f for f in arena.frames(26) if cameras == 4 or f.camera in ("cam0", "cam2")]
         poses = [pose for fused in fuse(arena, frames, TIGHT) for pose in fused.poses]
-        first = [
-            b
-            for a, b in pairwise([None, *poses])
-            if b.state == "tracked" and (a is None or a.state == "lost")
-        ]
-        assert len(first) == 2
-        for pose in first:
+        before = ["lost", *(pose.state for pose in poses)]
+        found = [p for was, p in zip(before, poses, strict=False) if was == "lost" != p.state]
+        assert len(found) == 2
+        for pose in found:
             e, P = errors(arena, [pose])[0], pose.covariance_matrix[:6, :6]
             squares.append(e @ np.linalg.solve(P, e))
     assert np.mean(squares) == pytest.approx(6, abs=4 * np.sqrt(12 / 20))

@@ -58,6 +58,28 @@ def test_a_bumped_camera_is_named_within_a_second_and_healed(turn_deg, shift_m):
         assert np.linalg.norm(errors(before, mine)[:, 3:], axis=1).max() < 2e-3
 
 
+def around(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """R and p of a robot that wanders through the arena, turning."""
+    return rotation_from_vector([0, 0, t]), np.array([0.7 * np.sin(0.7 * t), 0.6 * np.cos(0.5 * t), 0.2])
+
+
+@pytest.mark.parametrize(("off_m", "said"), [(0.02, True), (0.0, False)])
+def test_a_marker_that_was_moved_is_said_of_its_robot_and_of_no_camera(off_m, said, caplog):
+    """The only robot before four cameras: 2 cm are 3 px, of which a fit of three markers leaves half."""
+    (x, y, z), *others = TRIANGLE.markers
+    glued = msgspec.structs.replace(TRIANGLE, markers=((x, y + off_m, z), *others))
+    arena = Arena({"a": glued}, {"a": around}, sigma_px=0.1)
+    tracker, instants, moves = Tracker(arena.cameras, {"a": TRIANGLE}), Instants(PERIOD_NS), []
+    for frame in arena.frames(80):
+        instants.add(frame)
+        for instant in instants.take(frame.t_ns):
+            tracker.fuse(instant)
+            moves += tracker.inspect()
+    assert moves == []
+    assert (list(tracker.shapes.misfits()) == ["a"]) == said
+    assert ("robot a: its markers miss" in caplog.text) == said
+
+
 def test_a_camera_that_stands_is_left_alone_though_others_see_more(run_arena):
     """False detections, a hidden marker and a camera that sees nothing for a while are no bump."""
     arena = Arena(
