@@ -21,12 +21,16 @@ class Detector {
     std::vector<Roundel> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
+    /// How many places of the last frame were left for the next ones, which begin with them.
+    int postponed() const { return postponed_; }
+    /// Carries on another's tracks and theta, under settings of its own.
+    void take_over(Detector& from);
 
   private:
     void follow(const ImageView& image);
     void search(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
-    void accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool accept(const ImageView& image, const std::optional<Start>& start, int track);
     ImageView next_band(const ImageView& image, int& top);
     void update_theta();
 
@@ -38,6 +42,8 @@ class Detector {
     std::vector<Roundel> found_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
+    double begin_at_ = 0;     // share of the places to look at, where a frame had too many
+    int postponed_ = 0;
     std::mutex mutex_;
 };
 
