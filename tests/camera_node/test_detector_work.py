@@ -17,7 +17,7 @@ def frame(*discs: Disc, seed: int = 1) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
 @pytest.mark.parametrize("begin", range(4))
 def test_a_share_of_each_frame_finds_all_that_is_new(share: float, begin: int):
-    """Wherever it comes up and whenever in the round, it is found within 1 / share frames, and no round skips a part."""
+    """Wherever it comes up and whenever in the round, it is found within 1 / share frames, and no round skips any."""
     plain, rounds = frame(), round(1 / share)
     for v in (16.0, 40.0, 60.0, 80.0, 104.0):
         detector, shown = Detector(search_share=share), frame(Disc((80, v), 24))
