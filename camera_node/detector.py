@@ -27,7 +27,8 @@ class Detector:
         min_diameter_px, max_diameter_px: of the outer ellipse's major axis.
         min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
         search_share: of each frame's rows that is searched for new roundels; those that were in the last frame are
-            looked for where they are expected, whatever this is. Less costs less, and finds what is new later.
+            looked for where they are expected, whatever this is. Less costs less, and finds what is new within
+            1 / share frames (if it is larger than 64 px and two frames share it, perhaps later).
         mask: polygons (N, 2) of raw pixels; a roundel whose centre lies in one is left out.
 
     Attributes:
@@ -73,6 +74,7 @@ class Detector:
             search_share,
             detector == "paper",
         )
+        self._name: Literal["chords", "paper"] = detector
         self._offsets = np.empty((0, 5))
         self.settings: dict[str, Any] = {
             "inner_ratios": tuple(inner_ratios),
@@ -88,6 +90,24 @@ class Detector:
     def threshold(self) -> float:
         """The paper's theta, grey levels."""
         return self._core.theta
+
+    @property
+    def postponed(self) -> int:
+        """Places of the last frame that may hold a roundel and were left for the next frame, which begins there.
+
+        Not 0 only where a picture has hundreds of ring-like places that are not tracked: a frame's work is bounded.
+        """
+        return self._core.postponed
+
+    def adjusted(self, **changes: Any) -> "Detector":
+        """One with other settings, by the names of the constructor, that carries on this one's tracks.
+
+        Raises:
+            ConfigError: a setting is out of its range.
+        """
+        other = Detector(**{"detector": self._name, **self.settings, **changes})
+        other._core.take_over(self._core)
+        return other
 
     def disc_offsets(self) -> tuple[Array, Array]:
         """Of the last frame's roundels, in their order: where the discs' own centres project, from `uv`.

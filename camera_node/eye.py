@@ -34,8 +34,8 @@ class Eye:
 
     def __init__(self, source: Source, detector: dict[str, Any]) -> None:
         """Raises ConfigError where `detector`, the keyword arguments of `Detector`, are out of range."""
-        self._source, self._arguments = source, dict(detector)
-        self._detector = Detector(**self._arguments)
+        self._source = source
+        self._detector = Detector(**detector)
         self._changing = threading.Lock()
 
     @property
@@ -67,11 +67,7 @@ class Eye:
                 self._source, Adjustable
             ):
                 raise ConfigError("this source has no exposure or gain that could be set")
-            self._rebuild({name: given[name] for name in OF_THE_DETECTOR if name in given})
+            if changes := {name: given[name] for name in OF_THE_DETECTOR if name in given}:
+                self._detector = self._detector.adjusted(**changes)
             if isinstance(self._source, Adjustable):
                 self._source.adjust(**exposure)
-
-    def _rebuild(self, changes: dict[str, Any]) -> None:
-        if changes:
-            arguments = {**self._arguments, **changes}
-            self._detector, self._arguments = Detector(**arguments), arguments

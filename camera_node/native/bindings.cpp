@@ -57,5 +57,7 @@ NB_MODULE(_core, m) {
                 return table(roundels);
             },
             nb::arg("image").noconvert())
-        .def_prop_ro("theta", &roundel::Detector::theta);
+        .def("take_over", &roundel::Detector::take_over, nb::arg("other"))
+        .def_prop_ro("theta", &roundel::Detector::theta)
+        .def_prop_ro("postponed", &roundel::Detector::postponed);
 }

@@ -14,6 +14,7 @@ namespace {
 constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, where nothing covers them
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
 constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
+constexpr double kShows = 0.06;  // likewise: where a cover would show on a fit that passes all other gates
 constexpr int kMostHidden = 22, kMostOfBoth = 36;       // sectors of 32, of an edge and of both
 constexpr double kLeastKnown = 12, kLeastNew = 16;      // pixels: smaller ones tell too little
 constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
@@ -90,7 +91,10 @@ bool is_hidden_too_much(const Hidden& hidden) {
 
 }  // namespace
 
-bool is_plain(const Fit& fit, double noise) { return is_below(fit, noise, kPlain); }
+bool shows_cover(const ImageView& image, const Fit& fit, double noise) {
+    return !is_below(fit, noise, kPlain) &&
+           find_hidden(image, fit.p, noise, kShows * (fit.bright - fit.dark)).any();
+}
 
 std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known) {
     if (whole.outer.major < (known ? kLeastKnown : kLeastNew)) return std::nullopt;
@@ -98,7 +102,7 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
     for (const double slack : kSlacks) {
         const Hidden hidden = find_hidden(image, fit.p, noise, slack * (fit.bright - fit.dark));
         if (is_hidden_too_much(hidden)) return std::nullopt;
-        if (hidden == start.hidden && slack == *std::rbegin(kSlacks)) break;
+        if (hidden == start.hidden) continue;
         start = {fit.outer, fit.ratio, fit.dark, fit.bright, start.print, hidden};
         const auto rest = refine(image, start);
         if (!rest) return std::nullopt;

@@ -7,8 +7,9 @@
 
 namespace roundel {
 
-/// Whether noise alone explains what a fit leaves over: nothing covers anything.
-bool is_plain(const Fit& fit, double noise);
+/// Whether what a fit leaves over gathers in some sectors, as where something covers a part; print, paper and
+/// lens spread it.
+bool shows_cover(const ImageView& image, const Fit& fit, double noise);
 
 /// The fit to what is left of a roundel that something covers in part. Sectors of either edge that are off
 /// the fit `whole` are left out and the rest is fitted anew, ever more strictly, until what is left is as the

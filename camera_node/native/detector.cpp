@@ -16,12 +16,15 @@ namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
+constexpr int kMaxFits = 512;          // to new places of a frame
+constexpr double kNoiseSpan = 8.5;     // standard deviations
 
 }  // namespace
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     found_.clear(), lost_.clear();
+    postponed_ = fits_ = 0;
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
@@ -55,19 +58,21 @@ void Detector::follow_smeared(const ImageView& image) {
 /// The rows of the image that this frame's search looks at.
 ImageView Detector::next_band(const ImageView& image, int& top) {
     if (settings_.search_share >= 1) return image;
+    if (searched_to_ > 1 - 1e-9) searched_to_ = 0;
     top = std::max(0, int(searched_to_ * image.height) - kOverlap);
-    searched_to_ = searched_to_ >= 1 ? settings_.search_share : searched_to_ + settings_.search_share;
-    if (top >= image.height - 3) top = 0;
-    const int bottom = std::min(image.height, int(std::ceil(searched_to_ * image.height)));
-    return image.window(0, top, image.width, std::max(bottom - top, 3));
+    searched_to_ = std::min(1.0, searched_to_ + settings_.search_share);
+    const int bottom = std::clamp(int(std::ceil(searched_to_ * image.height)), 3, image.height);
+    top = std::min(top, bottom - 3);
+    return image.window(0, top, image.width, bottom - top);
 }
 
 void Detector::search(const ImageView& image) {
     int top = 0;
     const ImageView band = next_band(image, top);
     const auto theta = uint8_t(std::lround(std::clamp(theta_.value(), 1.0, 255.0)));
-    const ThresholdMap threshold =
-        local_threshold(band, settings_.min_contrast, settings_.by_paper ? theta : 0);
+    // Of ten thousand pixels that only noise tells apart, the extremes lie eight deviations from each other.
+    const double contrast = std::clamp(kNoiseSpan * noise_, settings_.min_contrast, 255.0);
+    const ThresholdMap threshold = local_threshold(band, contrast, settings_.by_paper ? theta : 0);
     if (!settings_.by_paper) return search_chords(image, band, threshold, top);
     for (Start start : find_by_segments(band, threshold, settings_)) {
         start.outer.y += top;
@@ -75,19 +80,28 @@ void Detector::search(const ImageView& image) {
     }
 }
 
+/// Where there are more places than fits are allowed, the next frame begins with those that were left.
 void Detector::search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold,
                              int top) {
-    for (Seed seed : chords_.run(band, threshold)) {
+    const std::vector<Seed>& seeds = chords_.run(band, threshold);
+    const size_t n = seeds.size(), first = size_t(begin_at_ * double(n));
+    const int most = fits_ + kMaxFits;
+    size_t looked_at = 0;
+    for (; looked_at < n && fits_ < most; ++looked_at) {
+        Seed seed = seeds[(first + looked_at) % n];
         seed.y += float(top);
         if (claims_.cover_quickly(double(seed.x), double(seed.y))) continue;
         accept(image, fit_circles(image, seed, settings_), -1);
     }
+    postponed_ = int(n - looked_at);
+    begin_at_ = postponed_ ? double((first + looked_at) % n) / double(n) : 0;
 }
 
 /// Fits, tests and keeps a roundel, unless it was found before; whether it is there.
 bool Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
     if (!start) return false;
     if (claims_.cover(start->outer.x, start->outer.y)) return true;
+    ++fits_;
     return keep(image, fit_roundel(image, *start, settings_, noise_, track >= 0), track);
 }
 
@@ -97,6 +111,12 @@ bool Detector::keep(const ImageView& image, const std::optional<Fit>& fit, int t
     claims_.add(fit->outer);
     found_.push_back({*fit, track});
     return true;
+}
+
+void Detector::take_over(Detector& from) {
+    if (&from == this) return;
+    const std::scoped_lock lock(mutex_, from.mutex_);
+    tracks_ = from.tracks_, theta_ = from.theta_;
 }
 
 void Detector::update_theta() {

@@ -21,6 +21,10 @@ class Detector {
     std::vector<Roundel> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
+    /// How many places of the last frame were left for the next ones, which begin with them.
+    int postponed() const { return postponed_; }
+    /// Carries on another's tracks and theta, under settings of its own.
+    void take_over(Detector& from);
 
   private:
     void follow(const ImageView& image);
@@ -41,6 +45,8 @@ class Detector {
     std::vector<Tracks::Expected> lost_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
+    double begin_at_ = 0;     // share of the places to look at, where a frame had too many
+    int postponed_ = 0, fits_ = 0;
     std::mutex mutex_;
 };
 

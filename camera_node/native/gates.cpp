@@ -59,7 +59,7 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     const auto fit = refine(image, start);
     if (!fit) return std::nullopt;
     const bool whole = is_whole(image, *fit, settings, noise, kMisfit);
-    if (whole && is_plain(*fit, noise)) return fit;
+    if (whole && !shows_cover(image, *fit, noise)) return fit;
     const auto rest = fit_rest(image, start, *fit, noise, known || whole);
     if (rest && has_limits(*rest, settings)) return rest;
     if (whole) return fit;

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How much of a frame is looked at: shares of it, a bound on the work, and settings that change between frames."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera_node.detector import Detector
+from camera_node.errors import ConfigError
+from tests.camera_node.rendering import Disc, expose, render
+
+
+def frame(*discs: Disc, seed: int = 1) -> NDArray[np.uint8]:
+    return expose(render(list(discs), bright=200), 2, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
+@pytest.mark.parametrize("begin", range(4))
+def test_a_share_of_each_frame_finds_all_that_is_new(share: float, begin: int):
+    """Wherever it comes up and whenever in the round, it is found within 1 / share frames, and no round skips any."""
+    plain, rounds = frame(), round(1 / share)
+    for v in (16.0, 40.0, 60.0, 80.0, 104.0):
+        detector, shown = Detector(search_share=share), frame(Disc((80, v), 24))
+        for _ in range(rounds + begin):
+            detector.detect(plain)
+        assert any(len(detector.detect(shown)) for _ in range(rounds))
+
+
+def test_what_is_tracked_is_found_in_every_frame():
+    detector, discs = Detector(search_share=0.1), [Disc((40, 20), 20), Disc((120, 100), 20)]
+    shown = frame(*discs)
+    while len(detector.detect(shown)) < 2:
+        pass
+    assert [len(detector.detect(frame(*discs, seed=k))) for k in range(20)] == [2] * 20
+
+
+@pytest.fixture(scope="module")
+def crowd() -> NDArray[np.uint8]:
+    """2,700 roundels of 12 px, 20 px apart."""
+    tile = render([Disc((9.5, 9.5), 12)], (20, 20), bright=210, ground=210, blur=0.6)
+    return expose(np.tile(tile, (45, 60)), 1, np.random.default_rng(1))
+
+
+def test_a_frame_costs_a_bounded_number_of_fits_and_none_starves(crowd: NDArray[np.uint8]):
+    """512 new places a frame: six frames are needed for all, and then nothing is left over."""
+    detector = Detector()
+    counts = [len(detector.detect(crowd)) for _ in range(7)]
+    assert counts[0] <= 512
+    assert detector.postponed == 0
+    assert counts[-1] > 0.99 * 2700
+    assert np.diff(counts).max() <= 512
+    assert all(np.diff(counts[:4]) > 256)
+
+
+def test_what_is_put_off_is_counted(crowd: NDArray[np.uint8]):
+    detector = Detector()
+    detector.detect(frame(Disc((80, 60), 24)))
+    assert detector.postponed == 0
+    detector.detect(crowd)
+    assert detector.postponed > 1000
+
+
+def test_new_settings_keep_the_tracks():
+    discs = [Disc((40, 60), 20), Disc((120, 60), 30)]
+    detector = Detector()
+    before = detector.detect(frame(*discs))
+    changed = detector.adjusted(min_contrast=40.0)
+    after = changed.detect(frame(*discs, seed=2))
+    assert changed.settings == {**detector.settings, "min_contrast": 40.0}
+    assert dict(zip(before.track.tolist(), np.rint(before.uv[:, 0]), strict=True)) == dict(
+        zip(after.track.tolist(), np.rint(after.uv[:, 0]), strict=True)
+    )
+    new = changed.adjusted(max_diameter_px=25.0).detect(frame(*discs, Disc((80, 100), 20), seed=3))
+    assert set(new.track.tolist()) - set(before.track.tolist()) == {2}
+
+
+def test_a_wrong_change_is_refused():
+    with pytest.raises(ConfigError, match="min_contrast"):
+        Detector().adjusted(min_contrast=0.0)
