@@ -40,6 +40,8 @@ class Adjusted:
         information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
             translation; its null space is the choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
+        dependence: by what covariances, beside `scale`, are widened because errors of neighbouring moments are alike
+            (`calib.dependence`).
     """
 
     problem: Problem
@@ -49,6 +51,7 @@ class Adjusted:
     scale: float
     information: Array
     iterations: int
+    dependence: float = 1.0
 
     def joint_covariance(self) -> Array:
         """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
@@ -88,9 +91,9 @@ def adjust(problem: Problem, observations: Observations, start: State) -> Adjust
     used, broken = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
     for _ in range(5):
         every.weigh(state)
-        norms, strain = np.linalg.norm(every.whitened(state), axis=1), every.strain(state)
-        keep = norms < REJECT * max(_spread(norms[used] if used.any() else norms), 1.0)
-        torn = strain > BREAK
+        errors = every.errors(state)
+        keep = errors.seen < REJECT * max(_spread(errors.seen[used] if used.any() else errors.seen), 1.0)
+        torn = errors.strain > BREAK
         if (keep == used).all() and (torn == broken).all():
             break
         used, broken = keep, torn
@@ -118,29 +121,33 @@ def _variance_factor(linearisation: Linearisation, state: State) -> float:
     equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
     free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6
     return float(
-        np.sqrt(2 * linearisation.cost(state, np.inf, np.inf) / max(equations - free, equations / 10))
+        np.sqrt(2 * linearisation.errors(state).cost(np.inf, np.inf) / max(equations - free, equations / 10))
     )
 
 
 def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[State, int]:
     """Levenberg-Marquardt; with `robust`, Cauchy's weights at the scale of the current residuals."""
     damping, slack = (1e-4, CAUCHY) if robust else (1e-6, np.inf)
+    errors = linearisation.errors(state)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        norms, strain = np.linalg.norm(linearisation.whitened(state), axis=1), linearisation.strain(state)
-        scale = CAUCHY * max(_spread(norms), 1.0) if robust else np.inf
-        before = linearisation.cost(state, scale, slack)
-        linearisation.relinearise(state, 1 / (1 + (norms / scale) ** 2), 1 / (1 + (strain / slack) ** 2))
+        scale = CAUCHY * max(_spread(errors.seen), 1.0) if robust else np.inf
+        before = errors.cost(scale, slack)
+        weights = (
+            1 / (1 + (part / limit) ** 2) for part, limit in ((errors.seen, scale), (errors.strain, slack))
+        )
+        linearisation.relinearise(state, *weights)
         while True:
             try:
-                trial = state.moved(*solve(linearisation, damping))
-                if (after := linearisation.cost(trial, scale, slack)) <= before:
+                trial = linearisation.problem.to_scale(state.moved(*solve(linearisation, damping)))
+                moved = linearisation.errors(trial)
+                if (after := moved.cost(scale, slack)) <= before:
                     break
-            except RuntimeError:  # GTSAM's word for a system too near to singular
+            except (RuntimeError, ValueError):  # GTSAM's word for nearly singular, and a lens that none is
                 pass
             damping *= 10
             if damping > 1e6:
                 return state, iteration
-        state, damping = trial, max(damping / 10, MIN_DAMPING)
+        state, errors, damping = trial, moved, max(damping / 10, MIN_DAMPING)
         if before - after < (ROUGHLY if robust else NOTHING) * before + TINY:
             return state, iteration
     return state, MAX_ITERATIONS

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.alignment import rigid_motions
 from calib.errors import CalibrationError
 from calib.rig import Rig
-from camera_node.pose import invert
+from camera_node.pose import adjoint, invert
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def _test(a: Placed, b: Placed) -> tuple[float, int, float]:
     from scipy.stats import chi2 as distribution
 
     off = _differences(a, b, _common(a, b)).ravel()
-    gauge = np.vstack([_world_motion(T) for T in a.cameras])
+    gauge = np.vstack([adjoint(invert(T)) for T in a.cameras])  # the world turned and shifted
     rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
     covariance = rest.T @ (a.covariance + b.covariance) @ rest
     values, vectors = np.linalg.eigh(covariance)
@@ -160,10 +160,3 @@ def _differences(a: Placed, b: Placed, T_a_b: Array) -> Array:
         D = invert(here) @ T_a_b @ there
         out.append(np.concatenate([cv2.Rodrigues(D[:3, :3])[0].ravel(), D[:3, 3]]))
     return np.array(out)
-
-
-def _world_motion(T: Array) -> Array:
-    """(6, 6) how a camera moves in its own frame when the world turns and shifts."""
-    R, p = T[:3, :3], T[:3, 3]
-    cross = np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
-    return np.block([[R.T, np.zeros((3, 3))], [-R.T @ cross, R.T]])

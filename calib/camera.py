@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera: a lens that stands somewhere."""
+"""A camera: a lens that stands somewhere, and how pixels change with either."""
+
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.lens import Lens
-from camera_node.pose import Pose, invert
+from camera_node.pose import Pose, invert, skew
 
 Array = NDArray[np.float64]
+AnyLens = TypeVar("AnyLens", bound=Lens)
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -46,3 +49,26 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 def transform(T: Array, points: ArrayLike) -> Array:
     """Points (N, 3) moved by the rigid motion T (4, 4)."""
     return np.asarray(points, float).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+
+
+def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array, Array]:
+    """Pixels of points (N, 3), camera frame, and how they change.
+
+    Returns:
+        uv: (N, 2) raw pixels.
+        J_point: (N, 2, 3) by the point, in the camera's frame.
+        J_pose: (N, 2, 6) by a turn w and a shift t of the camera in its own frame, which move points there by
+            p x w - t.
+        J_lens: (N, 2, 4) by the log of the focal lengths, cx, cy and k1.
+        All NaN for points not before the camera.
+    """
+    lens, points = with_distortion(lens), np.asarray(points, float).reshape(-1, 3)
+    uv, J_point, by_lens = lens.project_with_jacobians(points)
+    J_pose = np.concatenate([J_point @ skew(points), -J_point], axis=2)
+    focal = by_lens[:, :, :1] * lens.fx + by_lens[:, :, 1:2] * lens.fy
+    return uv, J_point, J_pose, np.concatenate([focal, by_lens[:, :, 2:5]], axis=2)
+
+
+def with_distortion(lens: AnyLens) -> AnyLens:
+    """The same lens with its distortion numbers written out: zeros where it has none."""
+    return lens if lens.distortion else lens.with_parameters([*lens.parameters, 0.0, 0.0, 0.0, 0.0])

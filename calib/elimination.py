@@ -13,7 +13,9 @@ Array = NDArray[np.float64]
 
 # Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
-OF_KNOTS = (0, 1, 3, 4, 6)  # G11, G12, g1, G22, g2 of a factor on two knots and a camera
+# Of the best known direction of a knot's place, and of its velocity: what holds the others. GTSAM takes pivots for
+# singular that are 2^12 apart.
+HELD = 2.0**-22
 
 
 def solve(linear: Linearisation, damping: float) -> tuple[Array, Array]:
@@ -44,32 +46,61 @@ def camera_information(linear: Linearisation, state: State) -> Array:
 
 
 def _graph(linear: Linearisation, damping: float) -> Any:
-    """GTSAM's graph: keys are the K knots, then the cameras."""
+    """GTSAM's graph: keys are the K knots, then the cameras. The Hessian's diagonal is grown (Marquardt), and where one
+    camera alone saw a knot, held along its ray."""
     import gtsam
 
-    factor, hessian = cast(Any, gtsam.JacobianFactor), cast(Any, gtsam.HessianFactor)
-    half, d = 6 * len(linear.problem.wand.basis), len(linear.problem.free)
-    count, graph = len(linear.problem.knot_s), gtsam.GaussianFactorGraph()
-    a, b, c = slice(0, half), slice(half, 2 * half), slice(2 * half, 2 * half + d)
-    links, cameras = np.divmod(linear.views, len(linear.problem.lenses))
-    parts = _split(_damped(linear.blocks, damping), [a, b, c])
-    sought = set(linear.problem.cameras())
-    for k, camera, *upper in zip(links.tolist(), cameras.tolist(), *parts, strict=True):
-        if camera in sought:
-            graph.push_back(hessian(k, k + 1, count + camera, *upper, 0.0))
-        else:
-            graph.push_back(hessian(k, k + 1, *(upper[j] for j in OF_KNOTS), 0.0))
-    for k, upper in enumerate(zip(*_split(_damped(linear.chain, damping), [a, b]), strict=True)):
-        graph.push_back(hessian(k, k + 1, *upper, 0.0))
-    for keys, J, error in linear.rig:
-        if not sought.issuperset(keys):
-            continue
-        unit = gtsam.noiseModel.Unit.Create(len(error))
-        blocks: list[Any] = [
-            part for key, block in zip(keys, J, strict=True) for part in (count + key, block)
-        ]
-        graph.push_back(factor(*blocks, error, unit))
+    graph, (of_knots, of_cameras) = gtsam.GaussianFactorGraph(), linear.diagonal()
+    _add_views(graph, linear)
+    parts = of_knots.reshape(len(of_knots), 2, -1)
+    held = (HELD * parts.max(axis=2, keepdims=True) * np.ones_like(parts)).reshape(of_knots.shape)
+    _add_motion(graph, linear.chain, damping * of_knots + held)
+    _add_rig(graph, linear)
+    for camera in linear.problem.cameras() if damping else ():
+        grown = damping * of_cameras[camera]
+        graph.push_back(gtsam.HessianFactor(len(of_knots) + camera, np.diag(grown), 0 * grown, 0.0))
     return graph
+
+
+def _add_views(graph: Any, linear: Linearisation) -> None:
+    """One factor a camera and interval; a camera that is not sought is known."""
+    import gtsam
+
+    half, count, rows = 6 * len(linear.problem.wand.basis), len(linear.problem.knot_s), linear.rows
+    J1, J2, J3, b = rows[:, :half], rows[:, half : 2 * half], rows[:, 2 * half : -1], rows[:, -1]
+    links, cameras = np.divmod(linear.views, len(linear.problem.lenses))
+    factor = cast(Any, gtsam.JacobianFactor)
+    sought, ends = set(linear.problem.cameras()), linear.ends.tolist()
+    units = {n: gtsam.noiseModel.Unit.Create(n) for n in set(np.diff(linear.ends).tolist())}
+    for k, camera, i, j in zip(links.tolist(), cameras.tolist(), ends, ends[1:], strict=False):
+        of_camera = (count + camera, J3[i:j]) if camera in sought else ()
+        graph.push_back(factor(k, J1[i:j], k + 1, J2[i:j], *of_camera, b[i:j], units[j - i]))
+
+
+def _add_motion(graph: Any, chain: Array, grown: Array) -> None:
+    """What is known of the motion, (L, m, m) augmented Hessians of neighbouring knots, and what their diagonals grow
+    by: knot k stands in link k, the last one in the last link."""
+    import gtsam
+
+    half, chain = grown.shape[1], chain.copy()
+    diagonal = np.einsum("lii->li", chain)
+    diagonal[:, :half] += grown[:-1]
+    diagonal[-1, half:-1] += grown[-1]
+    for k, H in enumerate(chain):
+        G11, G12, g1 = H[:half, :half], H[:half, half:-1], H[:half, -1]
+        graph.push_back(gtsam.HessianFactor(k, k + 1, G11, G12, g1, H[half:-1, half:-1], H[half:-1, -1], 0.0))
+
+
+def _add_rig(graph: Any, linear: Linearisation) -> None:
+    """What is known of the cameras."""
+    import gtsam
+
+    count, sought = len(linear.problem.knot_s), set(linear.problem.cameras())
+    for keys, J, error in linear.rig:
+        if sought.issuperset(keys):
+            blocks = [part for key, block in zip(keys, J, strict=True) for part in (count + key, block)]
+            unit = gtsam.noiseModel.Unit.Create(len(error))
+            graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, error, unit))
 
 
 def _ordering(problem: Problem, knots: bool, cameras: bool) -> Any:
@@ -81,21 +112,3 @@ def _ordering(problem: Problem, knots: bool, cameras: bool) -> Any:
     for camera in problem.cameras() if cameras else ():
         ordering.push_back(count + camera)
     return ordering
-
-
-def _split(blocks: Array, parts: list[slice]) -> list[Array]:
-    """The upper triangle of augmented Hessians (n, m, m) as GTSAM takes it, block by block, by columns as Eigen has
-    them: G11, G12, .., g1, G22, .., g2, .."""
-    found = []
-    for k, rows in enumerate(parts):
-        for columns in parts[k:]:
-            found.append(np.swapaxes(np.ascontiguousarray(np.swapaxes(blocks[:, rows, columns], 1, 2)), 1, 2))
-        found.append(np.ascontiguousarray(blocks[:, rows, -1]))
-    return found
-
-
-def _damped(blocks: Array, damping: float) -> Array:
-    """The Hessians with their diagonals grown (Marquardt), all but the right-hand side's."""
-    grown, diagonal = blocks.copy(), np.arange(blocks.shape[1] - 1)
-    grown[:, diagonal, diagonal] *= 1 + damping
-    return grown

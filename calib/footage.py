@@ -12,9 +12,8 @@ import zenoh
 from camera_node.errors import CameraError
 from camera_node.messages import Keys
 from camera_node.pixels import Grey, grey
-from camera_node.source import read_grey
+from camera_node.source import IMAGES, read_grey
 
-IMAGES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
 MAX_FRAMES = 600  # of a video that are looked at, evenly spread: a lens needs 60 good ones
 REPLY_S = 2.0  # for a camera to answer with a picture

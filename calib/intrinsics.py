@@ -58,6 +58,14 @@ class CalibratedLens:
         """RMS reprojection error."""
         return self.adjusted.rms_px
 
+    def seen(self) -> Array:
+        """(n, 2) the corners of the used views, raw pixels."""
+        return np.concatenate([view.pixels for view in self.views]).astype(float)
+
+    def residuals(self) -> Array:
+        """(n, 2) these less where the lens expects them."""
+        return np.concatenate(self.adjusted.residuals)
+
     def warnings(self) -> list[str]:
         """What a person should do better next time."""
         told = []

@@ -2,18 +2,17 @@
 """The least squares problem of a wand's bundle adjustment, linearised in numpy.
 
 Every observation depends on one camera and on the two knots around its time. All are linearised in one batch; those
-of one camera between two knots become one augmented Hessian on (knot, next knot, camera).
+of one camera between two knots are the rows of one factor on (knot, next knot, camera).
 """
 
 from dataclasses import dataclass, field
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.problem import LENS, PER_CAMERA, POSE, Observations, Problem, State, skew
+from calib.camera import pixel_jacobians
+from calib.problem import PER_CAMERA, POSE, Observations, Problem, State
 from calib.trajectory import hermite_rate, interpolate, locate, whitened_motion
-from camera_node.lens import Lens
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,9 +26,31 @@ FIXED = 1e-6  # to which a distance that carries the scale is kept
 PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """How far a state is from what is measured and known, in sigmas.
+
+    Attributes:
+        seen: (n,) of the observations.
+        strain: (L,) of the motion from constant velocity over each interval, root mean square of `size` numbers.
+        rest: sum of squares of all else.
+    """
+
+    seen: Array
+    strain: Array
+    size: int
+    rest: float
+
+    def cost(self, scale: float, slack: float) -> float:
+        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`, those of the motion's
+        smoothness at `slack`; either may be infinite."""
+        smooth = self.size * cauchy(self.strain**2, slack)
+        return 0.5 * float(cauchy(self.seen**2, scale) + smooth + self.rest)
+
+
 @dataclass(slots=True)
 class Linearisation:
-    """The problem with its observations; `relinearise` makes the Hessians around a state."""
+    """The problem with its observations; `relinearise` makes the linear system around a state."""
 
     problem: Problem
     observations: Observations
@@ -39,24 +60,20 @@ class Linearisation:
     smooth: Array = field(init=False)  # (L, 2, 4) whitened constant velocity between knots; 0 across gaps
     root: Array = field(init=False)  # (n, 2, 2) whitens residuals
     views: Index = field(init=False)  # (V,) link times C plus camera, ascending
-    blocks: Array = field(
+    rows: Array = field(
         init=False
-    )  # (V, m, m) their augmented Hessians: knot, next knot, camera, right-hand side
-    chain: Array = field(init=False)  # (L, m', m') those of what is known of the motion
+    )  # (2n, m) by view: whitened derivatives by knot, next knot and camera, and errors
+    ends: Index = field(init=False)  # (V + 1,) where in `rows` each view begins, and the last one ends
+    chain: Array = field(init=False)  # (L, m', m') augmented Hessians of what is known of the motion
     rig: list[Term] = field(init=False)  # of what is known of the cameras
 
     def __post_init__(self) -> None:
         dt = np.diff(self.problem.knot_s)
         self.smooth = np.zeros((len(dt), 2, 4))
-        for k in np.flatnonzero((dt <= self.problem.gap_s) & (dt > 0)):
-            self.smooth[k] = whitened_motion(dt[k], self.problem.density)
+        near = (dt <= self.problem.gap_s) & (dt > 0)
+        self.smooth[near] = whitened_motion(dt[near], self.problem.density)
         if self.broken is not None:
             self.smooth[self.broken] = 0.0
-
-    def strain(self, state: State) -> Array:
-        """(L,) how far the motion is from constant velocity over each interval, in sigmas of one coordinate."""
-        smooth = self._motion_terms(state)[0]
-        return np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / (6 * len(self.problem.wand.basis)))
 
     def linked(self) -> int:
         """The number of intervals between knots that are no gaps."""
@@ -101,14 +118,13 @@ class Linearisation:
         """Residuals in units of their standard deviation (n, 2); 1e4 behind the camera."""
         return np.nan_to_num(np.einsum("nij,nj->ni", self.root, self.residuals(state)), nan=1e4)
 
-    def cost(self, state: State, scale: float, slack: float) -> float:
-        """Half of the summed squares, those of observations under Cauchy's kernel at `scale`, those of the motion's
-        smoothness at `slack`; either may be infinite."""
-        seen = (self.whitened(state) ** 2).sum(axis=1)
-        _, lengths, speed = self._motion_terms(state)
+    def errors(self, state: State) -> "Errors":
+        """Everything that is measured or known, against a state."""
+        smooth, lengths, speed = self._motion_terms(state)
         size = 6 * len(self.problem.wand.basis)
+        strain = np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / size)
         rest = sum((term**2).sum() for term in (lengths, speed, *(t[2] for t in self._rig_terms(state))))
-        return 0.5 * float(cauchy(seen, scale) + size * cauchy(self.strain(state) ** 2, slack) + rest)
+        return Errors(np.linalg.norm(self.whitened(state), axis=1), strain, size, float(rest))
 
     def _motion_terms(self, state: State) -> tuple[Array, Array, Array]:
         """Whitened: constant velocity (L, 2, B, 3), lengths (K, E), speed (K, B, 3)."""
@@ -150,18 +166,17 @@ class Linearisation:
         for c, given in enumerate(self.problem.lenses):
             rows, T, lens = np.flatnonzero(seen.camera == c), state.cameras[c], state.lens(c, given)
             local = (points[rows] - T[:3, 3]) @ T[:3, :3]
-            uv, J = lens.project_with_jacobian(local)
-            J, error[rows] = np.nan_to_num(J), np.nan_to_num(seen.uv[rows] - uv)
+            uv, *parts = pixel_jacobians(lens, local)
+            J, J_pose, J_lens = (np.nan_to_num(part) for part in parts)
+            error[rows] = np.nan_to_num(seen.uv[rows] - uv)
             J_point[rows] = J @ T[:3, :3].T
-            J_camera[rows, :, :6] = np.concatenate([J @ skew(local), -J], axis=2)
+            J_camera[rows, :, :6], J_camera[rows, :, 8:] = J_pose, J_lens
             J_camera[rows, :, 6] = np.einsum("nij,nj->ni", J_point[rows], velocity[rows])
             J_camera[rows, :, 7] = J_camera[rows, :, 6] * since[rows, None]
-            if set(LENS) & set(free):
-                J_camera[rows, :, 8:] = np.nan_to_num(_by_lens(lens, local, uv))
         return error, J_camera[:, :, free], J_point
 
     def relinearise(self, state: State, weight: Array, link_weight: Array) -> None:
-        """Make the Hessians around `state`, observations weighted by `weight` (n,), smoothness by `link_weight`."""
+        """Make the system around `state`, observations weighted by `weight` (n,), smoothness by `link_weight`."""
         link, h, _, _ = self._place(state)
         error, J_camera, J_point = self._jacobians(state)
         root = np.sqrt(weight)[:, None, None] * self.root
@@ -170,16 +185,26 @@ class Linearisation:
         error = np.einsum("nij,nj->ni", root, error)[:, :, None]
         rows = np.concatenate([J_knots, root @ J_camera, error], axis=2)
         view = link * len(self.problem.lenses) + self.observations.camera
-        self.views, group, size = np.unique(view, return_inverse=True, return_counts=True)
-        order = np.argsort(group, kind="stable")
-        slot = np.empty(len(group), np.intp)
-        slot[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
-        A = np.zeros((len(size), size.max(), *rows.shape[1:]))
-        A[group, slot] = rows
-        A = A.reshape(len(A), -1, rows.shape[2])
-        self.blocks = np.swapaxes(A, 1, 2) @ A
+        self.views, first = np.unique(np.sort(view), return_index=True)
+        self.ends = 2 * np.append(first, len(view))
+        self.rows = rows[np.argsort(view, kind="stable")].reshape(-1, rows.shape[2])
         self._hold_motion(state, link_weight)
         self.rig = self._rig_terms(state)
+
+    def diagonal(self) -> tuple[Array, Array]:
+        """(K, 6 B) and (C, d) of the Hessian: of the knots and of the cameras."""
+        half, cameras = 6 * len(self.problem.wand.basis), len(self.problem.lenses)
+        squares = np.add.reduceat(self.rows**2, self.ends[:-1])
+        link, camera = np.divmod(self.views, cameras)
+        of_knots = np.zeros((len(self.problem.knot_s), half))
+        of_cameras = np.zeros((cameras, len(self.problem.free)))
+        np.add.at(of_knots, link, squares[:, :half])
+        np.add.at(of_knots, link + 1, squares[:, half : 2 * half])
+        np.add.at(of_cameras, camera, squares[:, 2 * half : -1])
+        held = np.einsum("lii->li", self.chain)
+        of_knots[:-1] += held[:, :half]
+        of_knots[1:] += held[:, half:-1]
+        return of_knots, of_cameras
 
     def _hold_motion(self, state: State, weight: Array) -> None:
         """Hessians of what is known of the motion: knot k stands in link k, the last in the last link."""
@@ -210,20 +235,3 @@ class Linearisation:
 def cauchy(squares: Array, scale: float) -> float:
     """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
     return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
-
-
-def _by_lens(lens: Lens, local: Array, uv: Array) -> Array:
-    """(n, 2, 4) derivative of pixels by the log of the focal lengths, cx, cy and k1."""
-    step = 1e-5
-    rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
-    bent = msgspec.structs.replace(lens, distortion=(rest[0] + step, *rest[1:])).project(local)
-    one = np.ones(len(uv))
-    return np.stack(
-        [
-            uv - [lens.cx, lens.cy],
-            np.column_stack([one, 0 * one]),
-            np.column_stack([0 * one, one]),
-            (bent - uv) / step,
-        ],
-        axis=2,
-    )

@@ -1,63 +1,116 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A wand waved before live cameras: collect detections, put the rig."""
+"""Live cameras: collect what they see, put the rig."""
 
 import queue
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
 
 import zenoh
 from rich.progress import BarColumn, Progress, TextColumn
 
+from calib.coverage import Coverage
 from calib.errors import CalibrationError
 from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig
 from camera_node.messages import Detections, Keys, MessageError, decode, encode
 
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
+LOOK_EVERY_S = 0.2
 
 
-def collect(
-    session: zenoh.Session, arena: str, seconds: float, doing: str = "wave the wand"
-) -> tuple[list[Detections], int]:
-    """Detections of all cameras of an arena for a while, with a line of progress; and the number of bad messages.
+@dataclass(slots=True)
+class Heard:
+    """What came so far: messages; by camera the frames with roundels and where in its image they were; and how many
+    messages were none."""
+
+    messages: list[Detections] = field(default_factory=list)
+    frames: Counter[str] = field(default_factory=Counter)
+    coverage: dict[str, Coverage] = field(default_factory=dict)
+    bad: int = 0
+
+    def take(self, data: bytes) -> None:
+        """Count and keep a message, or count what is none."""
+        try:
+            message = decode(data, Detections)
+        except MessageError:
+            self.bad += 1
+            return
+        self.messages.append(message)
+        if not len(message):
+            return
+        self.frames[message.camera] += 1
+        seen = Coverage.of(message.unpack().uv, message.width, message.height)
+        before = self.coverage.get(message.camera)
+        self.coverage[message.camera] = before + seen if before else seen
+
+
+def listen(
+    session: zenoh.Session, arena: str, seconds: float, look: Callable[[Heard, float], str]
+) -> tuple[Heard, str]:
+    """Hear all cameras of an arena for a while.
+
+    Args:
+        session, arena: where cameras publish.
+        seconds: how long at the most.
+        look: called a few times a second, from this thread, with what came and the seconds that passed; ends it by
+            the reason that it returns, and goes on where that is empty.
+
+    Returns:
+        what came, and why it ended.
 
     Raises:
         CalibrationError: nothing came.
     """
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    subscriber = session.declare_subscriber(
-        Keys(arena).detections(), lambda sample: arrived.put(sample.payload.to_bytes())
-    )
-    messages, bad = [], 0
-    seen: Counter[str] = Counter()
+    key = Keys(arena).detections()
+    subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
+    try:
+        heard, why = _follow(arrived, seconds, look)
+    finally:
+        subscriber.undeclare()
+    if not heard.messages:
+        raise CalibrationError(
+            f"no detections on {key} in {seconds:g} s ({heard.bad} bad messages); are the server and the cameras "
+            "running, and --connect and --arena right?"
+        )
+    return heard, why
+
+
+def _follow(
+    arrived: queue.SimpleQueue[bytes], seconds: float, look: Callable[[Heard, float], str]
+) -> tuple[Heard, str]:
+    heard, begun, looked = Heard(), time.monotonic(), 0.0
+    while (passed := time.monotonic() - begun) < seconds:
+        with suppress(queue.Empty):
+            heard.take(arrived.get(timeout=min(seconds - passed, LOOK_EVERY_S)))
+        if passed - looked < LOOK_EVERY_S:
+            continue
+        looked = passed
+        if why := look(heard, passed):
+            return heard, why
+    return heard, f"{seconds:g} s are over"
+
+
+def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> Heard:
+    """What all cameras of an arena see for a while, with a line of progress.
+
+    Raises:
+        CalibrationError: nothing came.
+    """
     columns = (TextColumn(doing), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, transient=True) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            try:
-                message = decode(arrived.get(timeout=min(left, 0.2)), Detections)
-                messages.append(message)
-                seen[message.camera] += len(message) > 0
-            except queue.Empty:
-                pass
-            except MessageError:
-                bad += 1
-            told = ", ".join(f"{name} {n}" for name, n in sorted(seen.items()))
-            progress.update(task, completed=seconds - left, description=told or "waiting for cameras")
-    subscriber.undeclare()
-    if not messages:
-        raise CalibrationError(nothing_came(Keys(arena).detections(), seconds, bad))
-    return messages, bad
 
+        def show(heard: Heard, passed: float) -> str:
+            told = ", ".join(f"{name} {n}" for name, n in sorted(heard.frames.items()))
+            progress.update(task, completed=passed, description=told or "waiting for cameras")
+            return ""
 
-def nothing_came(key: str, seconds: float, bad: int) -> str:
-    """What to say where cameras are silent."""
-    return (
-        f"no detections on {key} in {seconds:g} s ({bad} bad messages); are the server and the cameras running, and "
-        "--connect and --arena right?"
-    )
+        return listen(session, arena, seconds, show)[0]
 
 
 def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:

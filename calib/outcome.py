@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
+from calib.lengths import measure_lengths
 from calib.problem import DRIFT, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
 from calib.rig import Rig
@@ -121,6 +122,7 @@ def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_outliers(told.names, seen, adjusted),
         metric=told.metric,
+        widened=adjusted.dependence**0.5,
     )
 
 
@@ -147,29 +149,3 @@ def _outliers(names: list[str], seen: Observations, adjusted: Adjusted) -> list[
         Outlier(names[seen.camera[row]], float(seen.t_s[row]), int(seen.label[row]), float(far[row]))
         for row in rows[np.argsort(-far[rows])]
     ]
-
-
-def measure_lengths(adjusted: Adjusted, seen: Observations) -> Array:
-    """What the cameras alone say of the wand's lengths, less what they are; metres.
-
-    Every marker of an instant moves, in one Gauss-Newton step that knows no length, to where its observations want it.
-    """
-    state, problem = adjusted.state, adjusted.problem
-    markers = np.einsum("mb,kbx->kmx", problem.wand.weights, state.motion[:, 0])
-    A, b = np.zeros((*markers.shape, 3)), np.zeros(markers.shape)
-    views = np.zeros((*markers.shape[:2], len(problem.lenses)))
-    for c, lens in enumerate(problem.lenses):
-        rows, T = np.flatnonzero((seen.camera == c) & adjusted.used), state.cameras[c]
-        k, m = seen.knot[rows], seen.label[rows]
-        local = (markers[k, m] - T[:3, 3]) @ T[:3, :3]
-        J = np.nan_to_num(state.lens(c, lens).project_with_jacobian(local)[1]) @ T[:3, :3].T
-        weight = np.linalg.inv(seen.cov[rows])
-        np.add.at(A, (k, m), np.swapaxes(J, 1, 2) @ weight @ J)
-        np.add.at(b, (k, m), np.einsum("nji,njk,nk->ni", J, weight, np.nan_to_num(adjusted.residuals[rows])))
-        views[k, m, c] = 1
-    fixed = views.sum(axis=2) >= 2
-    free = np.full(markers.shape, np.nan)
-    free[fixed] = markers[fixed] + np.linalg.solve(A[fixed], b[fixed][:, :, None])[:, :, 0]
-    ends = free[:, problem.wand.basis][:, problem.wand.pairs]
-    errors = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2) - problem.wand.lengths
-    return errors[np.isfinite(errors)]

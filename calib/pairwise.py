@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import transform
-from calib.shifts import Common, common_sightings, find_shift
+from calib.shifts import EVIDENCE, FITTED, Common, common_sightings, find_shift
 from calib.sightings import Sightings, ranges
 from calib.tracks import Track, tracks_of
 from camera_node.body import Body
@@ -24,10 +24,11 @@ Index = NDArray[np.intp]
 
 MIN_INSTANTS = 8  # that two cameras must share
 SAMPLE = 1500  # sightings that the essential matrix is fitted to
-GATE_PX = 3.0
+GATE_PX = 5.0
 INTERPOLATED = 2.5  # frame periods over which a marker's place is interpolated
 SLOWEST_S = 0.5  # and never longer
 MAX_SPREAD = 0.15  # of the logarithm of lengths and sizes: a geometry that makes them differ by more is none
+AGREEING = 0.3  # of the sightings that both have, at the least, are right: one in two of either camera
 MIN_SHARE = 0.5  # of the sightings that both have: a geometry that fewer agree to is none
 
 
@@ -51,6 +52,17 @@ class TwoView:
     share: float
     metric: bool
     depth: dict[int, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """T_a_b with a translation of length 1, the sightings `good` (n,) that agree to it, and a quantile of how far all
+    are from the epipolar constraint."""
+
+    common: Common
+    T: Array
+    good: NDArray[np.bool_]
+    misfit: float
 
 
 class Pairs:
@@ -77,13 +89,12 @@ class Pairs:
         seen, rows = self.seen, self.rows[a]
         near = self._near(rows, b)
         shift_s = find_shift(self.tracks[b], seen.label[near], seen.t_s[near], seen.xy[near], self.gap_s)
-        common = self._common(near, b, shift_s)
-        if len(np.unique(seen.frame[common.rows])) < MIN_INSTANTS:
+        together, apart = self._motion(a, b, near, 0.0), self._motion(a, b, near, shift_s)
+        if shift_s and not _tells(together, apart, len(np.unique(seen.t_s[near]))):
+            shift_s, apart = 0.0, together
+        if apart is None:
             return None
-        found = self._motion(a, common)
-        if found is None:
-            return None
-        T, good = found
+        common, T, good = apart.common, apart.T, apart.good
         inliers = common.rows[good]
         if len(np.unique(seen.frame[inliers])) < MIN_INSTANTS:
             return None
@@ -98,7 +109,8 @@ class Pairs:
         return TwoView(a, b, T, shift_s, len(inliers), share, len(ratios) > 0, depth)
 
     def _near(self, rows: Index, b: int) -> Index:
-        """Rows at whose time, clocks apart, camera b could have seen the wand; not more than are worth while."""
+        """Rows at whose time, clocks apart, camera b could have seen the wand; of whole frames, as the markers of a
+        frame tell the scale, and not more than are worth while."""
         times = np.unique(self.seen.t_s[self.rows[b]])
         if not len(times) or not len(rows):
             return rows[:0]
@@ -109,7 +121,10 @@ class Pairs:
             np.abs(times[after] - self.seen.t_s[rows]), np.abs(times[other] - self.seen.t_s[rows])
         )
         near = rows[gap <= self.gap_s]
-        return near[np.linspace(0, len(near) - 1, min(SAMPLE, len(near))).round().astype(np.intp)]
+        frames = np.unique(self.seen.frame[near])
+        count = min(len(frames), max(round(SAMPLE * len(frames) / max(len(near), 1)), 1))
+        chosen = frames[np.linspace(0, len(frames) - 1, count).round().astype(np.intp)]
+        return near[np.isin(self.seen.frame[near], chosen)]
 
     def _common(self, rows: Index, b: int, shift_s: float) -> Common:
         seen = self.seen
@@ -117,15 +132,22 @@ class Pairs:
             self.tracks[b], rows, seen.label[rows], seen.t_s[rows], seen.xy[rows], shift_s, self.gap_s
         )
 
-    def _motion(self, a: int, common: Common) -> tuple[Array, NDArray[np.bool_]] | None:
+    def _motion(self, a: int, b: int, rows: Index, shift_s: float) -> "_Motion | None":
+        """The motion that most of what both saw agrees to, if b's stamps are later by `shift_s`."""
+        common = self._common(rows, b, shift_s)
+        if len(np.unique(self.seen.frame[common.rows])) < MIN_INSTANTS:
+            return None
         gate = GATE_PX / ((self.lenses[a].fx + self.lenses[a].fy) / 2)
-        E, mask = cv2.findEssentialMat(common.xy_a, common.xy_b, np.eye(3), cv2.RANSAC, 0.9999, gate)[:2]
+        E, mask = cv2.findEssentialMat(common.xy_a, common.xy_b, np.eye(3), cv2.USAC_ACCURATE, 0.9999, gate)[
+            :2
+        ]
         if E is None or E.shape != (3, 3):
             return None
         _, R, t, mask = cv2.recoverPose(E, common.xy_a, common.xy_b, np.eye(3), mask=mask)[:4]
         T_b_a = np.eye(4)
         T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
-        return invert(T_b_a), mask.ravel() > 0
+        miss = sampson(np.asarray(E, float), common.xy_a, common.xy_b)
+        return _Motion(common, invert(T_b_a), mask.ravel() > 0, float(np.quantile(miss, AGREEING)))
 
     def _ratios(self, points: Array, rows: Index) -> Array:
         """By what to multiply the points so that the wand has its lengths, or else roundels their size; (r,) votes."""
@@ -154,6 +176,23 @@ class Pairs:
                     zip(theirs[np.minimum(at, len(theirs) - 1)].tolist(), far[mine].tolist(), strict=True)
                 )
         return depth
+
+
+def _tells(together: _Motion | None, apart: _Motion | None, moments: int) -> bool:
+    """Whether the data say that clocks are apart, by as much as `find_shift` asks for."""
+    if together is None or apart is None:
+        return together is None
+    told = min(len(apart.common.rows), 2 * moments) - FITTED
+    return together.misfit > apart.misfit * np.exp(EVIDENCE / told)
+
+
+def sampson(E: Array, xy_a: Array, xy_b: Array) -> Array:
+    """(n,) distances of correspondences (n, 2) from the epipolar constraint x_b' E x_a = 0 (Hartley and Zisserman,
+    section 11.4.3)."""
+    a, b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b))
+    line_b, line_a = a @ E.T, b @ E
+    slope = np.concatenate([line_b[:, :2], line_a[:, :2]], axis=1)
+    return np.abs((b * line_b).sum(axis=1)) / np.linalg.norm(slope, axis=1)
 
 
 def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.errors import CalibrationError
+from calib.lengths import distances, free_markers
 from calib.linearisation import Linearisation
 from calib.problem import LENS, Observations
-from calib.sightings import ranges
+from calib.sightings import Sightings, ranges
 from camera_node.body import Body
 from camera_node.lens import Lens
 
@@ -20,6 +21,9 @@ Array = NDArray[np.float64]
 FOCAL, CENTRE = 0.05, 0.04  # of the focal length and of the image: what no lens that was calibrated is off by
 AGREE = 0.6  # of a camera's sightings must fit the rig: gross errors are rarer
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
+SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
+FEW = 8  # moments at which a distance is measured
+MOVES = 0.02  # of an image's longer side: a wand that stays within is not waved
 SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
 
 
@@ -63,6 +67,43 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations
         raise CalibrationError(
             f"only {share.min():.0%} of what camera '{name}' saw fits what the others saw: are its name and its "
             f"intrinsics its own? else did it move? run python -m calib intrinsics --camera {name}, or leave it out"
+        )
+
+
+def check_motion(wave: Sightings, names: Sequence[str], lenses: Sequence[Lens]) -> None:
+    """Raise CalibrationError where no camera saw the wand move: a wand at rest fixes little, and nothing of clocks."""
+    moved, share = {}, {}
+    for k, (name, lens) in enumerate(zip(names, lenses, strict=True)):
+        for marker in np.unique(wave.label[wave.camera == k]):
+            uv = wave.uv[(wave.camera == k) & (wave.label == marker)]
+            away = float(np.quantile(np.linalg.norm(uv - np.median(uv, axis=0), axis=1), 0.95))
+            moved[name] = max(moved.get(name, 0.0), away)
+            share[name] = moved[name] / max(lens.width, lens.height)
+    if share and max(share.values()) < MOVES:
+        name = max(moved, key=moved.__getitem__)
+        raise CalibrationError(
+            f"the wand hardly moved: by {moved[name]:.1f} px before '{name}', and less before others; wave it through "
+            "the whole volume"
+        )
+
+
+def check_spacing(wand: Body, adjusted: Adjusted, seen: Observations) -> None:
+    """Raise CalibrationError where the cameras see the wand's markers at other distances than its file has."""
+    pairs = np.array(list(combinations(range(len(wand.markers)), 2)), np.intp)
+    if len(pairs) < 2:
+        return
+    told = distances(wand.points[None], pairs)[0]
+    measured = distances(free_markers(adjusted, seen), pairs)
+    known = np.isfinite(measured).sum(axis=0) >= FEW
+    if not known.any():
+        return
+    found = np.nanmedian(measured[:, known], axis=0)
+    worst = int(np.abs(found - told[known]).argmax())
+    if abs(found[worst] - told[known][worst]) > SPACING * told.max():
+        a, b = pairs[known][worst]
+        raise CalibrationError(
+            f"the wand is not as its file says: markers {a} and {b} are {told[known][worst]:.3f} m apart there, and "
+            f"{found[worst]:.3f} m by what the cameras saw; measure the wand again"
         )
 
 

@@ -124,7 +124,7 @@ def grid_points(x: Array, y: Array, z: float) -> Array:
 
 def _draw(told: PrecisionMap, cameras: Mapping[str, Camera]) -> NDArray[np.uint8]:
     rows, columns = told.sigma_mm.shape
-    margin = 2 * CELL
+    margin = 3 * CELL
     canvas = np.full((rows * CELL + 2 * margin, columns * CELL + 2 * margin, 3), PAPER, np.uint8)
     step = told.x[1] - told.x[0] if columns > 1 else 1.0
     best = max(float(np.min(told.sigma_mm)), 1e-6) if np.isfinite(told.sigma_mm).any() else 1.0
@@ -136,10 +136,16 @@ def _draw(told: PrecisionMap, cameras: Mapping[str, Camera]) -> NDArray[np.uint8
         place = camera.matrix()[:2, 3]
         u = margin + ((place[0] - told.x[0]) / step + 0.5) * CELL
         v = margin + (rows - 0.5 - (place[1] - told.y[0]) / step) * CELL
-        u, v = np.clip(u, 8, canvas.shape[1] - 8), np.clip(v, 24, canvas.shape[0] - 8)
+        u, v = np.clip(u, 8, canvas.shape[1] - 8), np.clip(v, 36, canvas.shape[0] - 8)
         cv2.circle(canvas, (round(u), round(v)), 6, (200, 90, 20), -1, cv2.LINE_AA)
-        _write(canvas, name, (min(u + 9, canvas.shape[1] - 9 * len(name)), v + 4))
-    title = f"expected mm at z = {told.z:.2f} m: {told.typical_mm:.2f} median"
+        room = canvas.shape[1] - u > 9 * len(name) + 12
+        _write(canvas, name, (u + 9 if room else u - 9 * len(name) - 6, v + 4))
+    for c, x in enumerate(told.x):
+        _write(canvas, f"{x:.2f}", (margin + c * CELL + 5, margin + rows * CELL + 16))
+    for r, y in enumerate(told.y):
+        _write(canvas, f"{y:>5.2f}", (margin - 42, margin + (rows - r - 0.5) * CELL + 4))
+    _write(canvas, "y / x, m", (margin - 42, margin + rows * CELL + 34))
+    title = f"expected error, mm, at z = {told.z:.2f} m: {told.typical_mm:.2f} in the median"
     _write(canvas, title, (8, 18))
     return canvas
 

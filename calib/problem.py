@@ -3,13 +3,13 @@
 
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera import with_distortion
 from calib.trajectory import AffineWand
 from camera_node.lens import Lens
-from camera_node.pose import rotation_from_vector
+from camera_node.pose import adjoint, invert, rotation_from_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -85,16 +85,10 @@ class State:
         scale, cx, cy, k1 = self.lenses[camera].tolist()
         if not any((scale, cx, cy, k1)):
             return lens
-        rest = lens.distortion or (0.0,) * (4 if lens.model == "fisheye" else 5)
-        factor = float(np.exp(scale))
-        return msgspec.structs.replace(
-            lens,
-            fx=lens.fx * factor,
-            fy=lens.fy * factor,
-            cx=lens.cx + cx,
-            cy=lens.cy + cy,
-            distortion=(rest[0] + k1, *rest[1:]),
-        )
+        parameters = with_distortion(lens).parameters
+        parameters[:2] *= np.exp(scale)
+        parameters[2:5] += cx, cy, k1
+        return lens.with_parameters(parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,24 +121,26 @@ class Problem:
         """The cameras that are sought."""
         return tuple(range(len(self.lenses))) if self.sought is None else self.sought
 
+    def to_scale(self, state: State) -> State:
+        """The state with the fixed distance as it is: nothing that cameras see tells a world from a larger one."""
+        if self.fixed_distance is None:
+            return state
+        a, b, distance = self.fixed_distance
+        factor = distance / float(np.linalg.norm(state.cameras[a, :3, 3] - state.cameras[b, :3, 3]))
+        cameras = state.cameras.copy()
+        cameras[:, :3, 3] *= factor
+        return replace(state, cameras=cameras, motion=factor * state.motion)
+
     def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
         """The same with other parameters sought."""
         return replace(self, free=tuple(sorted(sum(parameters, ()))))
-
-
-def skew(v: Array) -> Array:
-    """(..., 3, 3) the matrix of the cross product with v (..., 3)."""
-    S = np.zeros((*v.shape, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return S - np.swapaxes(S, -1, -2)
 
 
 def unobserved(state: State, free: tuple[int, ...]) -> Array:
     """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
     columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
     for T, rows in zip(state.cameras, columns, strict=True):
-        R, p = T[:3, :3], T[:3, 3]
-        rows[:6, :6] = np.block([[R.T, np.zeros((3, 3))], [-R.T @ skew(p), R.T]])
+        rows[:6, :6] = adjoint(invert(T))
         rows[6, 6] = rows[7, 7] = 1.0
     kept = [g for g in range(8) if g < 6 or g in free]
     return columns[:, free][:, :, kept].reshape(-1, len(kept))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted, adjust, find_robustly
+from calib.dependence import widen
 from calib.errors import CalibrationError
 from calib.outcome import clock_values
 from calib.pairwise import Pairs
@@ -83,7 +84,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     problem = replace(problem.freeing(POSE, OFFSET), sought=(this,))
     state = find_robustly(problem, observations, state)
     observations = with_disc_centres(wave, problem, state, observations)
-    adjusted = adjust(problem, observations, state)
+    adjusted = widen(adjust(problem, observations, state), observations)
     check_agreement(recording.names, adjusted, observations)
     return _conclude(rig, name, this, adjusted, observations)
 

@@ -5,15 +5,19 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
+
+from calib.lens_change import describe, find_changes
 
 if TYPE_CHECKING:
     from calib.outcome import Calibration
     from calib.trust import Trust
     from calib.waving import Progress
 
+WIDENED = 1.2  # below, it is not worth a line
 WORST = 5  # outliers that are listed one by one
 
 
@@ -48,7 +52,7 @@ class WandReport:
 
     `unplaced` holds the reason for each camera without a pose; `scale` is what residuals are over what the detector
     claimed; lengths are those that the cameras measure less the wand file's, None without two markers; `metric` is
-    False where nothing gives the scale.
+    False where nothing gives the scale; standard deviations are `widened` times what independent errors would give.
     """
 
     cameras: list[CameraReport]
@@ -59,6 +63,7 @@ class WandReport:
     length_std_mm: float | None
     outliers: list[Outlier]
     metric: bool
+    widened: float = 1.0
 
     @property
     def residual_px(self) -> float:
@@ -76,6 +81,7 @@ class WandReport:
             "metric": self.metric,
             "instants": self.instants,
             "residual_px": round(self.residual_px, 4),
+            "widened": round(self.widened, 2),
             "wand_length_error_mm": _figures(self.length_mean_mm, self.length_std_mm),
             "cameras": {
                 row.name: {
@@ -101,7 +107,7 @@ def print_report(result: "Calibration", trust: "Trust", console: Console) -> Non
     report, clocks = result.report, bool((result.time_sigma_ms > 0).any())
     error = "error mm" if report.metric else "error %"
     heads = ["camera", "grade", "frames", "outliers", "residual px", error, "waved"]
-    table = Table(*heads, *["clock ms"] * clocks)
+    table = Table(*heads, *["clock ms"] * clocks, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     judged = {camera.name: camera for camera in trust.cameras}
     for k, row in enumerate(report.cameras):
         camera = judged[row.name]
@@ -113,7 +119,8 @@ def print_report(result: "Calibration", trust: "Trust", console: Console) -> Non
     console.print(table)
     foretold = trust.expected.lines() if trust.expected else []
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
-    for line in [*_remarks(report), *_drifts(result), *foretold, *wave, trust.sentence()]:
+    lenses = describe(find_changes(result.names, result.adjusted))
+    for line in [*_remarks(report), *_drifts(result), *lenses, *foretold, *wave, trust.sentence()]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
@@ -122,6 +129,14 @@ def _drifts(result: "Calibration") -> list[str]:
         return []
     rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
     return ["clocks drift apart, in ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]
+
+
+def lenses_as_dict(result: "Calibration") -> dict[str, Any]:
+    """What a wave changed of the lenses, for the `calibration` map of `rig.yaml`; empty where they are as given."""
+    changes = find_changes(result.names, result.adjusted)
+    return (
+        {"adjusted_lenses": {name: change.as_dict() for name, change in changes.items()}} if changes else {}
+    )
 
 
 def clocks_as_dict(result: "Calibration") -> dict[str, Any]:
@@ -156,6 +171,11 @@ def show_progress(told: "Progress") -> Group:
 
 def _remarks(report: WandReport) -> list[str]:
     lines = [f"{report.instants} instants, residual {report.residual_px:.3f} px"]
+    if report.widened > WIDENED:
+        lines.append(
+            f"what neighbouring moments say is off alike (a lens or a clock that fits not quite): all errors below are "
+            f"taken {report.widened:.1f} times as large as noise alone would make them"
+        )
     if report.length_mean_mm is not None and report.length_std_mm is not None:
         lines.append(
             f"wand length as the cameras measure it: {report.length_mean_mm:+.2f} mm off in the mean, "
@@ -173,7 +193,7 @@ def _remarks(report: WandReport) -> list[str]:
             f"{o.camera} {o.t_s:.3f} s marker {o.marker} ({o.off_px:.1f} px)" for o in report.outliers[:WORST]
         )
         lines.append(f"{len(report.outliers)} marker centres rejected as outliers; the worst: {worst}")
-    lines += [f"warning: camera '{name}' has no pose: {why}" for name, why in report.unplaced.items()]
+    lines += [f"warning: camera '{name}' has no place: {why}" for name, why in report.unplaced.items()]
     lines.append(
         "world: z up as the cameras are mounted (upright), origin under the middle of the wave, z = 0 at its lowest"
     )

@@ -2,7 +2,7 @@
 """The rig: named cameras and where they stand. Read and written as `rig.yaml`."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -13,6 +13,8 @@ from calib.errors import CalibrationError
 from calib.history import keep
 from camera_node.config import load_yaml, write_atomically
 from camera_node.errors import ConfigError
+
+T = TypeVar("T")
 
 
 class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,16 +51,24 @@ def load_rig(path: Path) -> Rig:
         ConfigError: the file is missing, broken, or has a field that no rig has.
         CalibrationError: a camera has no intrinsics.
     """
-    for name, entry in load_yaml(path, _Entries).cameras.items():
+    for name, entry in _read(path, _Entries).cameras.items():
         if missing := [key for key in ("width", "height", "fx", "fy", "cx", "cy") if key not in entry]:
             raise CalibrationError(
                 f"camera '{name}' in {path} has no intrinsics ({', '.join(missing)} missing); "
                 f"run python -m calib intrinsics --camera {name}"
             )
-    rig = load_yaml(path, Rig)
+    rig = _read(path, Rig)
     if not rig.cameras:
         raise ConfigError(f"{path} names no camera; run python -m calib intrinsics")
     return rig
+
+
+def _read(path: Path, kind: type[T]) -> T:
+    try:
+        return load_yaml(path, kind)
+    except ConfigError as error:
+        hint = "; is it a rig, and of this version of Roundel?" if "unknown field" in str(error) else ""
+        raise ConfigError(f"{error}{hint}") from None
 
 
 def save_rig(rig: Rig, path: Path) -> Path | None:

@@ -42,12 +42,12 @@ def common_sightings(
     tracks: list[Track], rows: Index, label: Index, t_s: Array, xy: Array, shift_s: float, gap_s: float
 ) -> Common:
     """Sightings `rows` with those of another camera, whose `tracks` are by marker and stamped `shift_s` later."""
-    other = _interpolate(tracks, label, t_s + shift_s, gap_s)
+    other = interpolate(tracks, label, t_s + shift_s, gap_s)
     good = np.isfinite(other[:, 0])
     return Common(rows[good], xy[good], other[good])
 
 
-def _interpolate(tracks: list[Track], label: Index, t_s: Array, gap_s: float) -> Array:
+def interpolate(tracks: list[Track], label: Index, t_s: Array, gap_s: float) -> Array:
     """(..., n, 2) positions of the markers `label` (n,) at times (..., n)."""
     found = np.full((*t_s.shape, 2), np.nan)
     for marker, track in enumerate(tracks):
@@ -64,19 +64,21 @@ def find_shift(tracks: list[Track], label: Index, t_s: Array, xy: Array, gap_s: 
         label, t_s, xy: (n,), (n,), (n, 2) camera a's sightings.
         gap_s: the longest time over which b's tracks are interpolated.
     """
+    if not len(label):
+        return 0.0
     chosen = np.linspace(0, len(label) - 1, min(SAMPLE, len(label))).round().astype(np.intp)
     label, t_s, xy = label[chosen], t_s[chosen], xy[chosen]
     coarse = STEP_S * np.arange(-round(RANGE_S / STEP_S), round(RANGE_S / STEP_S) + 1)
-    misfits = misfit(xy, _interpolate(tracks, label, t_s + coarse[:, None], gap_s))
+    misfits = misfit(xy, interpolate(tracks, label, t_s + coarse[:, None], gap_s))
     together = misfits[len(coarse) // 2]
     best = int(np.nanargmin(misfits)) if np.isfinite(misfits).any() else len(coarse) // 2
-    common = np.isfinite(_interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
+    common = np.isfinite(interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
     moments = len(np.unique(t_s[common]))
     told = min(int(common.sum()), 2 * moments) - FITTED
     if moments < MIN_MOMENTS or not together > misfits[best] * np.exp(EVIDENCE / told):
         return 0.0
     fine = coarse[best] + STEP_S * np.linspace(-1, 1, 11)
-    misfits = misfit(xy, _interpolate(tracks, label, t_s + fine[:, None], gap_s))
+    misfits = misfit(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
     return float(fine[np.nanargmin(misfits)]) if np.isfinite(misfits).any() else float(coarse[best])
 
 

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted, adjust, find_robustly
+from calib.dependence import widen
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
 from calib.linearisation import Linearisation
-from calib.plausibility import check_agreement, check_lenses, check_sizes
+from calib.plausibility import check_agreement, check_lenses, check_sizes, check_spacing
 from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
@@ -67,7 +68,8 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)
-    return Solution(adjusted, observations)
+        check_spacing(wave.wand, adjusted, observations)
+    return Solution(widen(adjusted, observations), observations)
 
 
 def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:

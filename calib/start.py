@@ -99,7 +99,7 @@ def explain_unplaced(
         refused = {(set(pair) - {k}).pop(): share for pair, share in start.refused.items() if k in pair}
         told = ", ".join(f"{shared[k, j]} with {name}" for j, name in enumerate(names) if j != k)
         if not frames[k]:
-            reasons[names[k]] = "never saw the wand"
+            reasons[names[k]] = "never saw the wand; wave before it"
         elif refused and (share := max(refused.values())) > 0:
             reasons[names[k]] = (
                 f"what it saw fits no other camera (at best {share:.0%} of the sightings it shares); "
@@ -107,7 +107,8 @@ def explain_unplaced(
             )
         else:
             reasons[names[k]] = (
-                f"instants shared with other cameras: {told}; {MIN_INSTANTS} or more that agree are needed"
+                f"instants shared with other cameras: {told}; {MIN_INSTANTS} or more that agree are needed; "
+                "wave where its view overlaps theirs"
             )
     return reasons
 

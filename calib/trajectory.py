@@ -112,16 +112,18 @@ def hermite_rate(knot_s: Array, t_s: Array, place: Place) -> Array:
     return weights
 
 
-def whitened_motion(dt: float, density: float) -> Array:
-    """(2, 4) whitened error of constant velocity over `dt`, as factors of p0, v0, p1, v1, along one axis.
+def whitened_motion(dt: Array, density: float) -> Array:
+    """(L, 2, 4) whitened errors of constant velocity over `dt`, as factors of p0, v0, p1, v1, along one axis.
 
     Args:
-        dt: time between the knots, s.
+        dt: (L,) times between the knots, s.
         density: power spectral density of the acceleration, m^2/s^3.
     """
-    error = np.array([[-1.0, -dt, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0]])
-    Q = density * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(Q), error), float)
+    error, Q = np.zeros((len(dt), 2, 4)), np.empty((len(dt), 2, 2))
+    error[:, 0, 0], error[:, 0, 1], error[:, 0, 2] = -1.0, -dt, 1.0
+    error[:, 1, 1], error[:, 1, 3] = -1.0, 1.0
+    Q[:, 0, 0], Q[:, 0, 1], Q[:, 1, 0], Q[:, 1, 1] = dt**3 / 3, dt**2 / 2, dt**2 / 2, dt
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(density * Q), error), float)
 
 
 def finite_velocities(knot_s: Array, points: Array, gap_s: float) -> Array:

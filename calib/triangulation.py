@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.camera import Camera, transform
+from calib.camera import Camera, pixel_jacobians, transform
 from calib.errors import CalibrationError
-from calib.linearisation import POSE
+from calib.problem import POSE
 from camera_node.lens import Lens
 from camera_node.pose import invert
 
@@ -139,14 +139,8 @@ def _pixel_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...])
 def camera_jacobians(camera: Lens, points: Array, parameters: tuple[int, ...] = POSE) -> Array:
     """(N, 2, d) how the pixels of points (N, 3), camera frame, change with the camera's `parameters`.
 
-    They are numbered as in `linearisation`: a turn w and a shift t of the camera in its own frame, which move points
-    there by p x w - t; time offset and drift, which leave points at rest where they are; the log of the focal length,
-    cx, cy, k1.
+    They are numbered as in `problem`; time offset and drift leave points at rest where they are.
     """
-    if not camera.distortion:
-        camera = camera.with_parameters([*camera.parameters, 0.0, 0.0, 0.0, 0.0])
-    _, J, by_lens = camera.project_with_jacobians(points)
-    focal = by_lens[:, :, :1] * camera.fx + by_lens[:, :, 1:2] * camera.fy
+    _, _, J_pose, J_lens = pixel_jacobians(camera, points)
     still = np.zeros((len(points), 2, 2))
-    every = [np.cross(J, points[:, None, :]), -J, still, focal, by_lens[:, :, 2:5]]
-    return np.concatenate(every, axis=2)[:, :, list(parameters)]
+    return np.concatenate([J_pose, still, J_lens], axis=2)[:, :, list(parameters)]

@@ -40,7 +40,6 @@ ADVICE = {
     "rejected": "look for reflections and other round things in its view",
     "pose_px": "wave longer where it and two other cameras see the wand",
     "length": "measure the wand, and calibrate the lenses again",
-    "unplaced": "wave where it and another camera see the wand",
 }
 NOT_RECORDED = "is not in the recording"  # the reason of a camera that was not there, which is nobody's fault
 CELLS = (4, 6)  # rows and columns in which an image is counted
@@ -62,6 +61,11 @@ class CameraTrust:
     coverage: Coverage
     useful: NDArray[np.bool_]
     figures: dict[str, float]
+
+    @property
+    def missing(self) -> NDArray[np.bool_]:
+        """(rows, columns) useful cells through which the wand was not waved."""
+        return self.useful & ~self.coverage.used
 
     @property
     def strain(self) -> float:
@@ -93,13 +97,13 @@ class Trust:
 
     Attributes:
         cameras: placed ones.
-        unplaced: names of those that could not be placed.
+        unplaced: why, and what to do, by name of those that could not be placed.
         length: how far the wand's length is off in the mean, as a part of it; None without two markers.
         expected: errors of points across the waved arena, at robots' height; None where the rig knows no metres.
     """
 
     cameras: list[CameraTrust]
-    unplaced: list[str]
+    unplaced: dict[str, str]
     length: float | None
     expected: PrecisionMap | None
 
@@ -113,9 +117,8 @@ class Trust:
         """The grade, whose fault it is, and what to do."""
         worst = max(self.cameras, key=lambda camera: _strain(camera.worst, camera.figures[camera.worst]))
         if self.unplaced:
-            names = enumerate_words([f"'{name}'" for name in self.unplaced])
-            who = f"cameras {names} have" if len(self.unplaced) > 1 else f"camera {names} has"
-            return f"grade D: {who} no place; {ADVICE['unplaced']}"
+            told = "; ".join(f"camera '{name}' has no place: {why}" for name, why in self.unplaced.items())
+            return f"grade D: {told}"
         if self.length is not None and grade("length", self.length) == self.grade > worst.grade:
             return f"grade {self.grade}: the wand's length is {self.length:.2%} off; {ADVICE['length']}"
         if self.grade == "A":
@@ -194,7 +197,7 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
         placed = [result.rig.cameras[name] for name in result.names]
         expected = map_precision(placed, low, high, height_m, sigma_px, joint_of(result))
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
-    unplaced = sorted(name for name, why in result.report.unplaced.items() if why != NOT_RECORDED)
+    unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     return Trust(cameras, unplaced, off, expected)
 
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.diagnosis import find_faults
 from calib.errors import CalibrationError
 from calib.labelling import label
 from calib.outcome import Calibration, Told, conclude
-from calib.pairwise import Pairs
+from calib.pairwise import MIN_INSTANTS, Pairs
+from calib.plausibility import check_motion
 from calib.rig import Rig
 from calib.sightings import Frames, Sightings, frame_counts, gather
 from calib.solution import solve
@@ -56,12 +58,15 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
     counts = frame_counts(recording.seen, len(recording.names))
     if not len(recording.seen):
         raise CalibrationError(_unseen(recording))
+    check_motion(recording.seen, recording.names, recording.lenses)
     pairs = Pairs(recording.seen, recording.lenses, wand, recording.frames.period_s())
     start = find_start(pairs, range(len(recording.names)))
     unplaced = explain_unplaced(recording.names, list(start.poses), counts, pairs.shared(), start)
+    faults = find_faults(recording.names, recording.frames, pairs, sorted(start.poses))
+    unplaced |= faults
     unplaced |= {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
     if len(start.poses) < 2:
-        raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced))
+        raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced, faults))
     placed = sorted(start.poses)
     solution = solve(gather_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric)
     told = Told(
@@ -108,11 +113,24 @@ def _unseen(recording: Recording) -> str:
     return f"the wand was in no frame ({told}); do the wand file's diameter and markers match the wand?"
 
 
-def _unplaceable(recording: Recording, counts: list[int], pairs: Pairs, unplaced: dict[str, str]) -> str:
+def _unplaceable(
+    recording: Recording, counts: list[int], pairs: Pairs, unplaced: dict[str, str], faults: dict[str, str]
+) -> str:
+    if faults:
+        told = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
+        return f"no two cameras could be placed: {told}"
     shared = pairs.shared()
     if not (shared - np.diag(np.diag(shared))).any():
         seen = ", ".join(f"{name} {n}" for name, n in zip(recording.names, counts, strict=True))
         return f"no two cameras ever saw the wand at once (frames with the wand: {seen}); wave where views overlap"
+    if shared.max(initial=0, where=~np.eye(len(shared), dtype=bool)) >= MIN_INSTANTS:
+        most = np.triu(shared, 1)
+        a, b = np.unravel_index(int(most.argmax()), most.shape)
+        return (
+            f"no two cameras could be placed, though '{recording.names[a]}' and '{recording.names[b]}' saw the wand at "
+            f"once {most.max()} times: what they saw does not fit a wand with these markers; measure it, and compare "
+            "the intrinsics with the cameras"
+        )
     told = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
     return f"no two cameras could be placed; wave where two see the wand at once ({told})"
 

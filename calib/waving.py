@@ -10,24 +10,20 @@ holds the GIL. Covariances shrink with the number of frames, so what all frames 
 """
 
 import os
-import queue
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.pool import AsyncResult
 
 import zenoh
 
-from calib.coverage import Coverage
 from calib.errors import CalibrationError
-from calib.live import nothing_came
+from calib.live import Heard, listen
 from calib.rig import Rig
 from camera_node.body import Body
-from camera_node.messages import Detections, Keys, MessageError, decode
+from camera_node.messages import Detections
 
 TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions
 TRIAL_FRAMES = 150  # of each camera: a solution of a second or less
@@ -35,7 +31,6 @@ BLOCK_S = 0.5  # frames that are taken or left together, so that the motion betw
 ADDS = 0.05  # to the error of a pixel, that a camera's covariance may add
 USED = 0.5  # of what a camera shares with others
 IDLE_S = 15.0  # without anything added to that
-TELL_EVERY_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +39,7 @@ class Trial:
 
     Attributes:
         fault: why no two cameras could be placed; empty where they were.
-        unplaced: names of cameras that could not.
+        unplaced: why, by name of cameras that could not.
         strain: by camera, its covariance in the image over the noise of its pixels.
         used: by camera, the part of what it shares with others that was waved through.
         advice: by camera, where to wave next.
@@ -53,7 +48,7 @@ class Trial:
     """
 
     fault: str = ""
-    unplaced: tuple[str, ...] = ()
+    unplaced: dict[str, str] = field(default_factory=dict)
     strain: dict[str, float] = field(default_factory=dict)
     used: dict[str, float] = field(default_factory=dict)
     advice: dict[str, str] = field(default_factory=dict)
@@ -75,30 +70,11 @@ class Progress:
 
 
 @dataclass(slots=True)
-class _Wave:
-    """What came so far."""
+class Rule:
+    """The rule by which a wave stops, with what it remembers from trial to trial."""
 
-    messages: list[Detections] = field(default_factory=list)
-    frames: Counter[str] = field(default_factory=Counter)
-    coverage: dict[str, Coverage] = field(default_factory=dict)
-    bad: int = 0
     best_used: float = 0.0
     grown: float = 0.0
-
-    def take(self, data: bytes) -> None:
-        """Count and keep a message, or count what is none."""
-        try:
-            message = decode(data, Detections)
-        except MessageError:
-            self.bad += 1
-            return
-        self.messages.append(message)
-        if not len(message):
-            return
-        self.frames[message.camera] += 1
-        seen = Coverage.of(message.unpack().uv, message.width, message.height)
-        before = self.coverage.get(message.camera)
-        self.coverage[message.camera] = before + seen if before else seen
 
     def judge(self, trial: Trial, now: float) -> bool:
         """Whether it is enough."""
@@ -122,7 +98,7 @@ def wave(
     by_itself: bool = True,
     trials: bool = True,
     every_s: float = TRIAL_EVERY_S,
-) -> tuple[list[Detections], int, str]:
+) -> tuple[Heard, str]:
     """Collect the detections of all cameras of an arena while a wand is waved.
 
     Args:
@@ -137,67 +113,45 @@ def wave(
         every_s: how long to wait from one to the next.
 
     Returns:
-        the detections, the number of bad messages, and why it ended.
+        what was heard, and why it ended.
 
     Raises:
         CalibrationError: nothing came.
     """
-    arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    key = Keys(arena).detections()
-    subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
-    try:
-        with _Trials(rig, wand, trials, every_s) as solver:
-            state, why = _follow(arrived, solver, seconds, tell, ended or threading.Event(), by_itself)
-    finally:
-        subscriber.undeclare()
-    if not state.messages:
-        raise CalibrationError(nothing_came(key, seconds, state.bad))
-    return state.messages, state.bad, why
+    rule = Rule()
+    with _Trials(rig, wand, trials, every_s) as solver:
+
+        def look(heard: Heard, passed: float) -> str:
+            if ended is not None and ended.is_set():
+                return "ended by hand"
+            trial = solver.step(heard.messages, passed)
+            enough = trial is not None and rule.judge(trial, passed)
+            tell(progress(heard, passed, trial, enough))
+            return "more waving would not help" if enough and by_itself else ""
+
+        return listen(session, arena, seconds, look)
 
 
-def _follow(
-    arrived: queue.SimpleQueue[bytes],
-    trials: "_Trials",
-    seconds: float,
-    tell: Callable[[Progress], None],
-    ended: threading.Event,
-    by_itself: bool,
-) -> tuple[_Wave, str]:
-    state, begun, told = _Wave(), time.monotonic(), 0.0
-    while (passed := time.monotonic() - begun) < seconds:
-        with suppress(queue.Empty):
-            state.take(arrived.get(timeout=min(seconds - passed, TELL_EVERY_S)))
-        if ended.is_set():
-            return state, "ended by hand"
-        if passed - told < TELL_EVERY_S:
-            continue
-        told, trial = passed, trials.step(state.messages, passed)
-        enough = trial is not None and state.judge(trial, passed)
-        tell(progress(state, passed, trial, enough))
-        if enough and by_itself:
-            return state, "more waving would not help"
-    return state, f"{seconds:g} s are over"
-
-
-def progress(state: _Wave, passed: float, trial: Trial | None, enough: bool) -> Progress:
+def progress(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> Progress:
     """What to tell a person."""
-    covered = {name: coverage.share() for name, coverage in sorted(state.coverage.items())}
+    covered = {name: coverage.share() for name, coverage in sorted(heard.coverage.items())}
     return Progress(
-        passed, dict(sorted(state.frames.items())), covered, trial, enough, _advise(state, trial, enough)
+        passed, dict(sorted(heard.frames.items())), covered, trial, enough, _advise(heard, trial, enough)
     )
 
 
-def _advise(state: _Wave, trial: Trial | None, enough: bool) -> str:
+def _advise(heard: Heard, trial: Trial | None, enough: bool) -> str:
     if enough:
         return "that is enough"
-    if not state.frames:
-        return "waiting for roundels" if state.messages else "waiting for cameras"
+    if not heard.frames:
+        return "waiting for roundels" if heard.messages else "waiting for cameras"
     if trial is None:
         return "wave the wand where two cameras or more see it"
     if trial.fault:
         return trial.fault
     if trial.unplaced:
-        return f"wave where '{trial.unplaced[0]}' and another camera see the wand"
+        name, why = next(iter(trial.unplaced.items()))
+        return f"'{name}' has no place yet: {why}"
     name = min(trial.used, key=trial.used.__getitem__)
     if trial.used[name] < USED and trial.advice.get(name):
         return f"{name}: {trial.advice[name]}"
@@ -257,7 +211,7 @@ def try_part(rig: Rig, wand: Body, part: Sequence[Detections], share: float) -> 
     trust, fewer = assess(result, wand), share**0.5
     delivering = {message.camera for message in part}
     return Trial(
-        unplaced=tuple(name for name in trust.unplaced if name in delivering),
+        unplaced={name: why for name, why in trust.unplaced.items() if name in delivering},
         strain={c.name: fewer * c.strain for c in trust.cameras},
         used={c.name: 1 - c.figures["unused"] for c in trust.cameras},
         advice={c.name: c.wave_next for c in trust.cameras},

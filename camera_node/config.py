@@ -14,6 +14,7 @@ from camera_node.errors import ConfigError
 
 T = TypeVar("T")
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 NAME = re.compile(r"[^/*$#?\s]+")
 
 
@@ -30,7 +31,9 @@ def load_yaml(path: Path, kind: type[T]) -> T:
             the file and the place in it, such as `$.cameras.cam0.fx`.
     """
     try:
-        data = msgspec.yaml.decode(path.read_bytes())
+        text = path.read_bytes()
+        _require_single(yaml.compose(text, _LOADER))
+        data = msgspec.yaml.decode(text)
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; check the path") from None
     except OSError as error:
@@ -42,6 +45,21 @@ def load_yaml(path: Path, kind: type[T]) -> T:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {_name_entry(data, kind, str(error))}") from None
+
+
+def _require_single(node: yaml.Node | None) -> None:
+    """Raise YAMLError where a mapping has a key twice: PyYAML would take the last one in silence."""
+    if isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            name, line = str(key.value), key.start_mark.line + 1
+            if name in lines:
+                raise yaml.YAMLError(f"'{name}' is there twice, in lines {lines[name]} and {line}; keep one")
+            lines[name] = line
+            _require_single(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            _require_single(value)
 
 
 def _name_entry(data: Any, kind: type, fault: str) -> str:

@@ -166,6 +166,13 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     max_diameter_px: float | None = None
     search_share: float | None = None
 
+    def check(self) -> None:
+        """Raises MessageError where no camera can be set so."""
+        if not all(x is None or math.isfinite(x) for x in (self.exposure_us, self.gain)):
+            raise MessageError("exposure and gain must be finite")
+        if self.exposure_us is not None and not 0 < self.exposure_us <= 1e7:
+            raise MessageError(f"an exposure of {self.exposure_us} us is not possible")
+
 
 class ClockReply(msgspec.Struct, frozen=True):
     """The server's time, in answer to a query on `<arena>/clock`."""

@@ -5,6 +5,8 @@ import contextlib
 import logging
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -13,16 +15,17 @@ from camera_node.clock import Clock
 from camera_node.draw import draw_roundels
 from camera_node.eye import Eye
 from camera_node.health import Health
-from camera_node.messages import CameraStatus, Detections, Keys, encode
+from camera_node.messages import CameraStatus, Detections, Keys, Settings, encode
 from camera_node.network import ServerWatch
 from camera_node.requests import (
     RequestError,
-    answering,
     encode_jpeg,
+    encode_reply,
     parse_draw,
     parse_quality,
-    parse_settings,
-    settings_reply,
+    parse_request,
+    payload_of,
+    respond,
 )
 from camera_node.roundels import Roundels
 from camera_node.source import Frame, Replay, Source
@@ -116,7 +119,7 @@ class Node:
         )
         stack.callback(publisher.undeclare)
         for key, answer in ((keys.snapshot(name), self._snapshot), (keys.settings(name), self._change)):
-            queryable = session.declare_queryable(key, answering(answer, self.health.refuse))
+            queryable = session.declare_queryable(key, partial(self._answer, answer))
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
         watch = ServerWatch(session, keys.fusion_alive)
@@ -161,6 +164,10 @@ class Node:
             clock_error_ms=estimate[1] / 1e6 if estimate else None,
         )
 
+    def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:
+        if not respond(query, answer):
+            self.health.refuse()
+
     def _snapshot(self, query: zenoh.Query) -> bytes:
         if self._seen is None:
             raise RequestError("no frame yet")
@@ -170,6 +177,6 @@ class Node:
         return encode_jpeg(image, parse_quality(query.parameters))
 
     def _change(self, query: zenoh.Query) -> bytes:
-        if query.payload and (payload := query.payload.to_bytes()):
-            self.eye.adjust(parse_settings(payload))
-        return settings_reply(query, self.eye.settings)
+        if payload := payload_of(query):
+            self.eye.adjust(parse_request(payload, Settings))
+        return encode_reply(payload, self.eye.settings)

@@ -78,6 +78,20 @@ def invert(T: Array) -> Array:
     return inverse
 
 
+def skew(vectors: ArrayLike) -> Array:
+    """(..., 3, 3) matrices [v]x of vectors (..., 3): [v]x w = v x w."""
+    v = np.asarray(vectors, float)
+    W = np.zeros((*v.shape, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return W - np.swapaxes(W, -1, -2)
+
+
+def adjoint(T: Array) -> Array:
+    """(6, 6) how a (4, 4) rigid motion carries a twist, rotation first: T Exp(xi) = Exp(Ad xi) T."""
+    R, p = T[:3, :3], T[:3, 3]
+    return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
+
+
 def look_at(position: ArrayLike, target: ArrayLike) -> Array:
     """T_world_cam (4, 4) of a camera at `position` that looks at `target`, its image upright (world z up).
 

@@ -1,49 +1,77 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a camera node answers: its settings, and a picture. A bad request gets an error in reply, nothing else."""
+"""How queries are answered, and what a camera node is asked for: its settings, and a picture.
+
+A bad request gets an error in reply, nothing else.
+"""
 
 import logging
-import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import cv2
 import msgspec
 import zenoh
 
-from camera_node.errors import ConfigError
-from camera_node.messages import MessageError, Settings, decode, encode
+from camera_node.errors import RoundelError
+from camera_node.messages import MessageError, decode, encode
 from camera_node.pixels import Grey
 
 log = logging.getLogger("camera_node.requests")
 
 QUALITY = 85  # of a JPEG
-MAX_PAYLOAD = 65536
+MAX_PAYLOAD = 1 << 20
+T = TypeVar("T", bound=msgspec.Struct)
 
 
-class RequestError(ValueError):
+class RequestError(RoundelError):
     """A request that makes no sense, told to whoever asked."""
 
 
-def parse_settings(payload: bytes) -> Settings:
-    """The settings that a request asks for, a map in MessagePack or, starting with `{`, in JSON.
+def payload_of(query: zenoh.Query) -> bytes:
+    """What came with a query, or nothing."""
+    return query.payload.to_bytes() if query.payload else b""
+
+
+def parse_request(payload: bytes, kind: type[T]) -> T:
+    """What a request asks for: a map in MessagePack or, starting with `{`, in JSON.
 
     Raises:
-        RequestError: the payload is neither, or names an unknown setting, or a value is impossible.
+        RequestError: the payload is neither, names what is unknown, or asks for what is impossible.
     """
     if len(payload) > MAX_PAYLOAD:
-        raise RequestError(f"{len(payload)} bytes are no settings")
+        raise RequestError(f"{len(payload)} bytes are no {kind.__name__}")
     try:
-        if payload.lstrip()[:1] == b"{":
-            settings = msgspec.json.decode(payload, type=Settings)
-        else:
-            settings = decode(payload, Settings)
+        return decode(
+            msgspec.msgpack.encode(msgspec.json.decode(payload)) if _is_json(payload) else payload, kind
+        )
     except (msgspec.DecodeError, MessageError, RecursionError) as error:
-        raise RequestError(str(error)) from None
-    if not all(x is None or math.isfinite(x) for x in (settings.exposure_us, settings.gain)):
-        raise RequestError("settings must be finite")
-    if settings.exposure_us is not None and not 0 < settings.exposure_us <= 1e7:
-        raise RequestError(f"an exposure of {settings.exposure_us} us is not possible")
-    return settings
+        raise RequestError(f"no {kind.__name__}: {error}") from None
+
+
+def encode_reply(payload: bytes, message: msgspec.Struct) -> bytes:
+    """A message in the encoding in which it was asked for."""
+    return msgspec.json.encode(message) if _is_json(payload) else encode(message)
+
+
+def _is_json(payload: bytes) -> bool:
+    return payload.lstrip()[:1] == b"{"
+
+
+def respond(query: zenoh.Query, answer: Callable[[zenoh.Query], bytes]) -> bool:
+    """Reply with what `answer` returns; a fault that the asker can mend goes back as an error of one line.
+
+    Returns:
+        Whether the request was granted.
+    """
+    with query:
+        try:
+            query.reply(query.key_expr, answer(query))
+        except RoundelError as error:
+            query.reply_err(str(error))
+            return False
+        except zenoh.ZError as error:
+            log.debug("no reply: %s", error)
+    return True
 
 
 def encode_jpeg(image: Grey, quality: int) -> bytes:
@@ -65,27 +93,3 @@ def parse_quality(parameters: zenoh.Parameters) -> int:
     if not (text.isdecimal() and len(text) < 4 and 1 <= int(text) <= 100):
         raise RequestError(f"quality={text}: give a number from 1 to 100")
     return int(text)
-
-
-def answering(
-    answer: Callable[[zenoh.Query], bytes], refuse: Callable[[], None]
-) -> Callable[[zenoh.Query], Any]:
-    """A Zenoh callback that replies with what `answer` returns; errors of the request go back as error replies."""
-
-    def respond(query: zenoh.Query) -> None:
-        with query:
-            try:
-                query.reply(query.key_expr, answer(query))
-            except (RequestError, ConfigError) as error:
-                refuse()
-                query.reply_err(str(error))
-            except zenoh.ZError as error:
-                log.debug("no reply: %s", error)
-
-    return respond
-
-
-def settings_reply(query: zenoh.Query, settings: Settings) -> bytes:
-    """The settings in the encoding in which they were asked for."""
-    payload = query.payload.to_bytes() if query.payload else b""
-    return msgspec.json.encode(settings) if payload.lstrip()[:1] == b"{" else encode(settings)

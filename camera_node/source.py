@@ -16,6 +16,8 @@ import numpy as np
 from camera_node.errors import CameraError, ConfigError
 from camera_node.pixels import Grey, grey
 
+IMAGES = (".png", ".jpg", ".jpeg")  # files that hold one frame
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -107,7 +109,7 @@ class FolderSource:
         """Raises CameraError where the folder is missing, or holds no frames named by their capture time."""
         if not folder.is_dir():
             raise CameraError(f"{folder} is no folder; frames are expected as {folder}/<t_ns>.png or .jpg")
-        files = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
         if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,19}", path.stem)]:
             raise CameraError(
                 f"{folder / min(bad)} is not named by its capture time in nanoseconds, as <t_ns>.png"

@@ -6,13 +6,16 @@ detections are assigned globally, frame by frame: no detection is of two markers
 log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from fusion.optics import Discs, Optics, Views
+from camera_node.pose import skew
+from fusion.instants import Frame, Instant
+from fusion.optics import Discs, Exposures, Optics, Views
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
 
@@ -36,52 +39,107 @@ class _Pairs:
     cost: Array
 
 
-def match(
-    optics: Optics, states: States, catalogue: Catalogue, active: NDArray[np.bool_], sightings: Sightings
-) -> Matches:
-    """Match the detections of an instant to the markers of the robots that are `active` (N,)."""
-    markers = np.flatnonzero(active[catalogue.robot])
-    n_frames = len(sightings.exposures.camera)
-    if not len(sightings) or not len(markers):
-        return Matches.none()
-    rows = np.tile(markers, n_frames)
-    discs = catalogue.discs(rows, np.repeat(np.arange(n_frames), len(markers)))
-    views = optics.view(optics.pose(states, sightings.exposures), discs)
-    spread = _spread(optics, states, catalogue, markers, sightings, views)
-    pairs = _candidates(optics, discs, views, spread, sightings)
-    chosen = _assign(pairs, discs.frame)
-    return Matches.of(pairs.sighting[chosen], rows[pairs.marker[chosen]])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Expected:
+    """M markers of robots that are followed: their rows in the catalogue, and how well their places are predicted.
+
+    At a capture time tau after the instant the covariance (3, 3, M) of a place is `at + tau * rate + tau^2 * drift`.
+    """
+
+    markers: Index
+    at: Array
+    rate: Array
+    drift: Array
+
+    @classmethod
+    def of(cls, states: States, catalogue: Catalogue, active: NDArray[np.bool_]) -> "_Expected":
+        markers = np.flatnonzero(active[catalogue.robot])
+        owner, marker = catalogue.robot[markers], catalogue.marker[:, markers].T
+        R, P = states.R[owner], states.P[owner]
+        arm = np.einsum("nij,nj->ni", R, marker)
+        by_turn, by_rate = -R @ skew(marker), -skew(arm)  # of a place, and of its velocity
+        place, velocity = by_turn @ P[:, THETA] + P[:, POSITION], by_rate @ P[:, OMEGA] + P[:, VELOCITY]
+        by_turn, by_rate = by_turn.transpose(0, 2, 1), by_rate.transpose(0, 2, 1)
+        at = place[:, :, THETA] @ by_turn + place[:, :, POSITION]
+        both = place[:, :, OMEGA] @ by_rate + place[:, :, VELOCITY]
+        drift = velocity[:, :, OMEGA] @ by_rate + velocity[:, :, VELOCITY]
+        columns = (at, both + both.transpose(0, 2, 1), drift)
+        return cls(markers, *(np.ascontiguousarray(C.transpose(1, 2, 0)) for C in columns))
+
+    def covariance(self, tau: Array) -> Array:
+        """(3, 3, F * M) at the times of F frames."""
+        tau = tau[:, None]
+        C = self.at[:, :, None] + tau * self.rate[:, :, None] + tau**2 * self.drift[:, :, None]
+        return C.reshape(3, 3, -1)
 
 
-def _spread(
-    optics: Optics, states: States, catalogue: Catalogue, markers: Index, sightings: Sightings, views: Views
-) -> Array:
-    """(2, 2, F * M) covariance of where markers are predicted, in the undistorted plane."""
-    owner = catalogue.robot[markers]
-    arm = np.einsum("nij,jn->ni", states.R[owner], catalogue.marker[:, markers])
-    P = states.P[owner]
-    at, along = _lever(states.R[owner], catalogue.marker[:, markers].T), _lever(np.eye(3), arm)
-    place, rate = at @ P[:, THETA] + P[:, POSITION], along @ P[:, OMEGA] + P[:, VELOCITY]
-    at, along = at.transpose(0, 2, 1), along.transpose(0, 2, 1)
-    C0 = place[:, :, THETA] @ at + place[:, :, POSITION]
-    C1 = place[:, :, OMEGA] @ along + place[:, :, VELOCITY]
-    C2 = rate[:, :, OMEGA] @ along + rate[:, :, VELOCITY]
-    C0, C1, C2 = (C.transpose(1, 2, 0)[:, :, None] for C in (C0, C1, C2))
-    tau, R = sightings.exposures.tau[:, None], optics.R_cam_world[sightings.exposures.camera]
-    C = C0 + tau * (C1 + C1.transpose(1, 0, 2, 3)) + tau**2 * C2
-    R = (
-        np.repeat(R[:, :2, :].transpose(1, 2, 0), len(markers), axis=2),
-        np.repeat(R[:, 2].T, len(markers), axis=1),
-    )
-    g = (R[0] - views.xy[:, None] * R[1]) / views.centre[2]
-    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C.reshape(3, 3, -1)), g)
+class Association:
+    """An instant's detections matched to robots, as many frames at a time as there are.
+
+    Args:
+        optics: the cameras.
+        catalogue: the robots' markers.
+        states: the robots as predicted at `t_ns`.
+        active: (N,) those whose markers are looked for.
+        t_ns: the instant.
+        floor_px: see `Sightings.of`.
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        catalogue: Catalogue,
+        states: States,
+        active: NDArray[np.bool_],
+        t_ns: int,
+        floor_px: float,
+    ) -> None:
+        self._optics, self._catalogue, self._states = optics, catalogue, states
+        self._expected = _Expected.of(states, catalogue, active)
+        self._t_ns, self._floor_px = t_ns, floor_px
+        self._done: dict[int, tuple[Frame, Matches]] = {}  # by the frame's id(), each with its rows from 0
+
+    def missing(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        """Those of the frames that are not matched yet."""
+        return tuple(frame for frame in frames if id(frame) not in self._done)
+
+    def add(self, frames: Sequence[Frame]) -> None:
+        """Match those of the frames that are not matched yet, all at once."""
+        new = self.missing(frames)
+        if new:
+            sightings = Sightings.of(Instant(self._t_ns, new), self._optics, self._floor_px)
+            parts = self._match(sightings).split([len(frame.roundels) for frame in new])
+            self._done |= {id(frame): (frame, part) for frame, part in zip(new, parts, strict=True)}
+
+    def whole(self, instant: Instant) -> tuple[Sightings, Matches]:
+        """All detections of the instant, and what they are matched to."""
+        self.add(instant.frames)
+        sightings = Sightings.of(instant, self._optics, self._floor_px)
+        counts = [len(frame.roundels) for frame in instant.frames]
+        return sightings, Matches.stack([self._done[id(frame)][1] for frame in instant.frames], counts)
+
+    def _match(self, sightings: Sightings) -> Matches:
+        exposures, markers = sightings.exposures, self._expected.markers
+        if not len(sightings) or not len(markers):
+            return Matches.none()
+        n_frames = len(exposures.camera)
+        rows = np.tile(markers, n_frames)
+        discs = self._catalogue.discs(rows, np.repeat(np.arange(n_frames), len(markers)))
+        views = self._optics.view(self._optics.pose(self._states, exposures), discs)
+        spread = _spread(self._optics, exposures, self._expected.covariance(exposures.tau), views)
+        pairs = _candidates(self._optics, discs, views, spread, sightings)
+        chosen = _assign(pairs, discs.frame)
+        return Matches.of(pairs.sighting[chosen], rows[pairs.marker[chosen]])
 
 
-def _lever(R: Array, v: Array) -> Array:
-    """(N, 3, 3) -R [v]x."""
-    W = np.zeros((len(v), 3, 3))
-    W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = v[:, 2], -v[:, 1], v[:, 0]
-    return R @ (W - W.transpose(0, 2, 1))
+def _spread(optics: Optics, exposures: Exposures, C: Array, views: Views) -> Array:
+    """(2, 2, F * M) covariance, in the undistorted plane, of places with covariances C (3, 3, F * M) in the world."""
+    R = optics.R_cam_world[exposures.camera]
+    n_markers = C.shape[2] // len(R)
+    across = np.repeat(R[:, :2, :].transpose(1, 2, 0), n_markers, axis=2)
+    along = np.repeat(R[:, 2].T, n_markers, axis=1)
+    g = (across - views.xy[:, None] * along) / views.centre[2]
+    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C), g)
 
 
 def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sightings: Sightings) -> _Pairs:

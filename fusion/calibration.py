@@ -2,16 +2,32 @@
 """The rig in force: where it comes from, what corrects it, and how that is taken back and kept."""
 
 import logging
+import time
 from pathlib import Path
 
 import msgspec
+import yaml
 
 from calib.camera import Camera
-from calib.rig import Rig, load_rig, save_rig
+from calib.messages import RigMessage
+from calib.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.errors import RoundelError
+from camera_node.messages import MessageError, decode
 from fusion.errors import FusionError
 
 log = logging.getLogger("fusion")
+
+
+def parse_rig(data: bytes) -> Rig:
+    """The rig of a `RigMessage`'s bytes.
+
+    Raises:
+        MessageError: they are none; in one line.
+    """
+    try:
+        return msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
+    except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise MessageError(" ".join(str(error).split())[:200]) from None
 
 
 class Calibration:
@@ -43,11 +59,20 @@ class Calibration:
         log.info("the rig that was last published is in force: %s", self._kept)
         return kept
 
-    def replace(self, rig: Rig) -> None:
-        """Another rig is in force, and kept."""
-        self.rig = rig
+    def replace(self, rig: Rig) -> str | None:
+        """Another rig is in force, and kept; the camera in which alone it differs from the old one, if it does."""
+        old, self.rig = self.rig, rig
         self._corrected.clear()
         self._keep()
+        if old is None or rig.placed().keys() != old.placed().keys():
+            return None
+        moved = [name for name in rig.cameras if rig.cameras[name] != old.cameras.get(name)]
+        return moved[0] if len(moved) == 1 else None
+
+    def message(self) -> RigMessage:
+        """The rig in force, of which there is one, as a message."""
+        assert self.rig is not None
+        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.rig))
 
     def correct(self, name: str, camera: Camera) -> None:
         """A camera stands elsewhere."""

@@ -19,9 +19,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from camera_node.pose import skew
 from fusion.optics import Optics
 from fusion.sightings import Sightings
-from fusion.state import skew
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

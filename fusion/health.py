@@ -16,7 +16,7 @@ from fusion.messages import CameraHealth, FusionStatus, State
 from fusion.report import CameraUse
 
 log = logging.getLogger("fusion")
-MAX_CAMERAS = 256  # more names are a fault of whoever publishes them
+MAX_STRANGERS = 64  # cameras that the rig does not know: more names are a fault of whoever publishes them
 GONE_S = 2.0
 PERIOD_NS = 1_000_000_000
 
@@ -28,6 +28,7 @@ class _Camera:
     last_ns: int = 0
     gone: bool = False
     late: bool = False
+    shared: bool = False
     lateness_ms: list[float] = field(default_factory=list)
     used: int = 0
     unused: int = 0
@@ -43,6 +44,7 @@ class Health:
         self._lock = threading.Lock()
         self._faults: Counter[str] = Counter()
         self._cameras: dict[str, _Camera] = {}
+        self._known: set[str] = set()  # those that the rig placed
         self._robots: dict[str, State] = {}
         self._latencies: list[float] = []
         self._instants = 0
@@ -54,19 +56,28 @@ class Health:
         with self._lock:
             self._faults[fault] += 1
 
-    def arrived(self, name: str, t_ns: int, received_ns: int) -> bool:
-        """Note a camera's frame; False if there are already more cameras than any arena has."""
+    def arrived(self, name: str, t_ns: int, received_ns: int, known: bool) -> bool:
+        """Note a camera's frame; False of one that the rig does not know, if there are too many of these."""
         if name not in self._cameras:
-            if len(self._cameras) >= MAX_CAMERAS:
+            if not known and len(self._cameras.keys() - self._known) >= MAX_STRANGERS:
                 self.count("too many cameras")
                 return False
             log.info("camera %s appeared", name)
+        if known:
+            self._known.add(name)
         camera = self._cameras.setdefault(name, _Camera())
         if camera.gone:
             log.info("camera %s is back", name)
         camera.gone, camera.last_ns = False, received_ns
         camera.lateness_ms.append((received_ns - t_ns) * 1e-6)
         return True
+
+    def shared(self, name: str, is_shared: bool) -> None:
+        """Say once when two nodes publish under a camera's name, and when one of them ended."""
+        camera = self._cameras[name]
+        if is_shared and not camera.shared:
+            log.warning("two nodes publish as camera %s: give each a --name of its own", name)
+        camera.shared = is_shared
 
     def noted(self, name: str, in_time: bool, late_ms: float) -> None:
         """Say once when a camera's frames begin to come too late, and when they come in time again."""
@@ -98,9 +109,9 @@ class Health:
         self, now_ns: int, calibrated: set[str], late: dict[str, int], aside: set[str]
     ) -> FusionStatus | None:
         """The status of the last second, or None before it is over."""
-        if now_ns - self._since_ns < PERIOD_NS:
+        if 0 <= now_ns - self._since_ns < PERIOD_NS:
             return None
-        seconds = (now_ns - self._since_ns) * 1e-9 if self._since_ns else 1.0
+        seconds = (now_ns - self._since_ns) * 1e-9 if 0 < self._since_ns < now_ns else 1.0
         self._find_gone(now_ns)
         cameras = {
             name: _told(c, seconds, late.get(name, 0), name in calibrated, name in aside)
@@ -149,6 +160,7 @@ def _told(camera: _Camera, seconds: float, late: int, calibrated: bool, aside: b
         late=late,
         calibrated=calibrated,
         aside=aside,
+        shared=camera.shared,
     )
     camera.lateness_ms.clear()
     camera.used = camera.unused = 0

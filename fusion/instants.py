@@ -4,6 +4,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from calib.camera import Camera
 from camera_node.lens import Lens
 from camera_node.messages import Detections
 from camera_node.roundels import Roundels
+from fusion.undistortion import undistort
 
 Array = NDArray[np.float64]
 
@@ -55,10 +57,7 @@ class Frame:
     @classmethod
     def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":
         """The frame of roundels that a lens saw."""
-        xy = lens.normalise(roundels.uv)
-        scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
-        columns = np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))
-        return cls(name, t_ns, roundels, *columns)
+        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +74,14 @@ class _Camera:
 
     times: deque[int] = field(default_factory=lambda: deque(maxlen=LEARN_FRAMES))
     late: int = 0
+    interval_ns: int = 0  # median
 
-    @property
-    def interval_ns(self) -> int:
-        return int(np.median(np.diff(self.times))) if len(self.times) > 1 else 0
+    def note(self, t_ns: int) -> None:
+        """Take a frame's time."""
+        self.times.append(t_ns)
+        steps = sorted(b - a for a, b in pairwise(self.times))
+        if steps:
+            self.interval_ns = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) // 2
 
 
 class Instants:
@@ -111,7 +114,7 @@ class Instants:
             camera.late += 1
             return False
         if not camera.times or frame.t_ns > camera.times[-1]:
-            camera.times.append(frame.t_ns)
+            camera.note(frame.t_ns)
         self._waiting.append(frame)
         self._newest_ns = max(self._newest_ns, frame.t_ns)
         return True
@@ -121,6 +124,13 @@ class Instants:
         if self._end_ns is None and not self._begin(now_ns):
             return []
         return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns, GONE_NS)
+
+    def open(self) -> tuple[Instant | None, int]:
+        """What is there already of the instant that is closed next, and how many cameras it waits for."""
+        if self._end_ns is None or not self.period_ns or not self._waiting:
+            return None, 0
+        opened = self._gather(self._end_ns, self.period_ns)
+        return (opened if opened.frames else None), self._owing(self._end_ns)
 
     def finish(self) -> list[Instant]:
         """The instants of all frames that are left, at the end of a recording."""
@@ -186,11 +196,18 @@ class Instants:
         return closed
 
     def _cut(self, end_ns: int, period_ns: int) -> Instant:
-        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
+        instant = self._gather(end_ns, period_ns)
         self._waiting = [frame for frame in self._waiting if frame.t_ns >= end_ns]
+        return instant
+
+    def _gather(self, end_ns: int, period_ns: int) -> Instant:
+        frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
         return Instant(end_ns - period_ns // 2, tuple(frames))
 
     def _complete(self, end_ns: int) -> bool:
-        """Whether no live camera owes a frame of the instant, were it to keep its rhythm (to a tenth)."""
-        live = [c for c in self._cameras.values() if c.times and c.times[-1] > self._newest_ns - GONE_NS]
-        return all(c.times[-1] + 1.1 * c.interval_ns >= end_ns for c in live)
+        return not self._owing(end_ns)
+
+    def _owing(self, end_ns: int) -> int:
+        """How many live cameras owe a frame of the instant, were they to keep their rhythms (to a tenth)."""
+        live = (c for c in self._cameras.values() if c.times and c.times[-1] > self._newest_ns - GONE_NS)
+        return sum(c.times[-1] + 1.1 * c.interval_ns < end_ns for c in live)

@@ -118,6 +118,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     late: int  # frames dropped since the start because they came too late
     calibrated: bool
     aside: bool = False  # it was moved: its detections are set aside until it is placed anew
+    shared: bool = False  # two nodes publish under its name
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):

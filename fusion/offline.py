@@ -20,7 +20,7 @@ from camera_node.observations import detect_frames, read_observations
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose
 from fusion.recording import RecordingWriter, iterate, read_recording
-from fusion.report import Fused
+from fusion.report import Fused, Move
 from fusion.robots import Robot, load_robots
 from fusion.smoothing import Smoother
 from fusion.tracker import Limits, Tracker
@@ -39,6 +39,7 @@ class Summary:
     squared_px: Counter[str] = field(default_factory=Counter)
     unlabelled: int = 0
     faults: Counter[str] = field(default_factory=Counter)
+    moves: list[str] = field(default_factory=list)
 
     def add(self, fused: Fused) -> None:
         self.instants += 1
@@ -62,6 +63,7 @@ class Summary:
             yield f"{name}: residual {rms:.2f} px, {self.used[name]} detections used, {self.unused[name]} not"
         for reason, count in sorted(self.faults.items()):
             yield f"skipped: {count} {reason}"
+        yield from self.moves
 
 
 def fuse_recording(
@@ -72,6 +74,7 @@ def fuse_recording(
     limits: Limits | None = None,
     faults: Counter[str] | None = None,
     smooth: bool = False,
+    moves: list[str] | None = None,
 ) -> Iterator[Fused]:
     """Fuse recorded detections, in order of arrival.
 
@@ -83,6 +86,7 @@ def fuse_recording(
         limits: see `Limits`.
         faults: counts what is skipped, by its reason.
         smooth: tell of each instant by all of them, at the end.
+        moves: takes a line for each camera that was found to be moved.
     """
     limits = limits or Limits()
     tracker = Tracker(cameras, robots, limits)
@@ -96,9 +100,19 @@ def fuse_recording(
         else:
             smoother.add(fused)
         for move in tracker.inspect():
-            told[f"camera '{move.name}' was moved{', and placed anew' if move.camera else ''}"] += 1
+            if moves is not None:
+                moves.append(_line(move, instant.t_ns))
     if smoother is not None:
         yield from smoother.smooth()
+
+
+def _line(move: Move, t_ns: int) -> str:
+    """What a person should know of a moved camera."""
+    if move.camera is None:
+        return f"moved: camera '{move.name}', seen at t_ns {t_ns}; its detections are left out from then on"
+    return (
+        f"moved: camera '{move.name}' is placed anew at t_ns {t_ns} and used again; the rig file is as it was"
+    )
 
 
 def run(
@@ -129,7 +143,7 @@ def run(
     declared = load_robots(robots)
     messages = _in_order(_read(frames, observations, cameras), cameras)
     summary = Summary()
-    fused = fuse_recording(messages, cameras, declared, rate_hz, faults=summary.faults, smooth=smooth)
+    fused = fuse_recording(messages, cameras, declared, rate_hz, None, summary.faults, smooth, summary.moves)
     _tell(fused, out, summary, declared)
     return 0
 
@@ -164,7 +178,7 @@ def replay(
     declared = load_robots(robots) if robots else recorded.robots
     summary = Summary(faults=recorded.faults)
     fused = fuse_recording(
-        recorded.detections, cameras, declared, rate_hz, faults=summary.faults, smooth=smooth
+        recorded.detections, cameras, declared, rate_hz, None, summary.faults, smooth, summary.moves
     )
     if out.suffix == ".mcap":
         _copy(recording, out, track(fused, "fusing", transient=True), summary)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calib.camera import Camera
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States, turns
+from fusion.undistortion import table_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -99,6 +100,8 @@ class Optics:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
         self.cameras = tuple(cameras.values())
+        for camera in self.cameras:
+            table_of(camera)  # before the first frame has to wait for it
         self._set()
 
     def place(self, name: str, camera: Camera) -> None:

@@ -32,6 +32,7 @@ from fusion.robots import Robot
 
 log = logging.getLogger("fusion.recording")
 QUEUE = 20_000
+MAGIC = 8  # bytes that every MCAP begins with
 CHUNK = 1 << 16  # bytes, compressed together: what is lost of a recording that is cut off
 ASK_S = 1.0  # for the server to tell of its rig and robots; they are asked for again while they are not there
 
@@ -123,7 +124,7 @@ def iterate(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[st
                 for _, channel, message in reader.iter_messages(log_time_order=False):
                     yield channel.topic, message.data, message.log_time
             except (McapError, EOFError, struct.error) as error:
-                if faults is None or not file.tell():
+                if faults is None or file.tell() <= MAGIC:
                     raise ConfigError(f"{path} is no MCAP recording: {error}") from None
                 faults["end: the recording was cut off"] += 1
     except OSError as error:

@@ -2,18 +2,20 @@
 """What an instant tells the world: poses, markers, and how much of each camera was of use."""
 
 from dataclasses import dataclass
+from itertools import compress
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
+from camera_node.pose import skew
 from fusion.grouping import Marker
 from fusion.instants import Instant
-from fusion.messages import Markers, RobotPose, State
+from fusion.messages import Latency, Markers, RobotPose, State
 from fusion.optics import Optics
 from fusion.sightings import Catalogue, Matches, Sightings
-from fusion.state import States, skew, wxyz_of
+from fusion.state import States, wxyz_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -58,25 +60,51 @@ class Fused:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class Seen:
     """What was used of every robot: by robot and camera (B, C), by marker of the catalogue and camera (K, C)."""
 
     by_robot: NDArray[np.bool_]
     by_marker: NDArray[np.bool_]
+    n_markers: Index  # (B,)
     residual_px: Array  # (B,) RMS, NaN without observations
 
 
 def report(
-    tracker: Told, instant: Instant, sightings: Sightings, matches: Matches, free: list[Marker]
+    tracker: Told,
+    instant: Instant,
+    sightings: Sightings,
+    matches: Matches,
+    free: list[Marker],
+    told: dict[int, RobotPose],
 ) -> Fused:
-    """What to tell of an instant after its observations."""
-    seen = _look(tracker, sightings, matches)
-    poses = _poses(tracker, instant.t_ns, seen)
+    """What to tell of an instant after its observations; the poses in `told`, by robot, stay as they were told."""
+    seen = look(tracker, sightings, matches)
+    rest = [k for k, status in enumerate(tracker.status) if status is not None and k not in told]
+    poses = told | tell_poses(tracker, instant.t_ns, seen, rest)
     markers = _markers(tracker, instant.t_ns, seen, free)
-    return Fused(instant.t_ns, poses, markers, _usage(tracker, sightings, matches, free))
+    usage = _usage(tracker, sightings, matches, free)
+    return Fused(instant.t_ns, tuple(poses[k] for k in sorted(poses)), markers, usage)
 
 
-def _look(tracker: Told, sightings: Sightings, matches: Matches) -> _Seen:
+def latency_of(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
+    """Where the time went since the newest exposure; None for an instant without frames."""
+    newest = max(instant.frames, key=lambda frame: frame.t_ns, default=None)
+    if newest is None:
+        return None
+    sent_ns = newest.sent_ns or newest.received_ns
+    return Latency(
+        exposure_ms=newest.exposure_us / 2e3,
+        detect_ms=newest.detect_us * 1e-3,
+        camera_ms=(sent_ns - newest.t_ns) * 1e-6,
+        network_ms=(newest.received_ns - sent_ns) * 1e-6,
+        wait_ms=(begun_ns - newest.received_ns) * 1e-6,
+        fuse_ms=(done_ns - begun_ns) * 1e-6,
+        total_ms=(done_ns - newest.t_ns) * 1e-6,
+    )
+
+
+def look(tracker: Told, sightings: Sightings, matches: Matches) -> Seen:
+    """See `Seen`."""
     robots, cameras = len(tracker.names), len(tracker.optics.names)
     body, camera = tracker.catalogue.robot[matches.disc], sightings.camera[matches.sighting]
     by_robot = np.zeros((robots, cameras), bool)
@@ -84,35 +112,37 @@ def _look(tracker: Told, sightings: Sightings, matches: Matches) -> _Seen:
     by_robot[body, camera] = by_marker[matches.disc, camera] = True
     count = np.bincount(body, minlength=robots)
     mean = np.bincount(body, matches.squared_px, robots) / np.where(count, count, np.nan)
-    return _Seen(by_robot, by_marker, np.sqrt(mean))
+    n_markers = np.bincount(tracker.catalogue.robot[by_marker.any(1)], minlength=robots)
+    return Seen(by_robot, by_marker, n_markers, np.sqrt(mean))
 
 
-def _poses(tracker: Told, t_ns: int, seen: _Seen) -> tuple[RobotPose, ...]:
-    states, names = tracker.states, tracker.optics.names
+def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[int, RobotPose]:
+    """The poses of robots `rows` that are this shard's, by robot; each has a status."""
+    states, names, status = tracker.states, tracker.optics.names, tracker.status
     p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
     wxyz, residual = wxyz_of(states.R).tolist(), seen.residual_px.tolist()
-    P, by_robot = states.P.astype("<f4").tobytes(), seen.by_robot.tolist()
-    markers = np.add.reduceat(seen.by_marker.any(1), tracker.catalogue.first[:-1]).tolist() if p else []
-    return tuple(
-        RobotPose(
+    P, markers = states.P.astype("<f4").tobytes(), seen.n_markers.tolist()
+    owned, by_robot = tracker.owned.tolist(), seen.by_robot.tolist()
+    return {
+        k: RobotPose(
             robot=tracker.names[k],
             t_ns=t_ns,
-            state=status,
+            state=state,
             position=tuple(p[k]),
             quaternion_wxyz=tuple(wxyz[k]),
             velocity=tuple(v[k]),
             angular_velocity=tuple(omega[k]),
             covariance=P[576 * k : 576 * (k + 1)],
             n_markers=markers[k],
-            cameras=tuple([name for name, saw in zip(names, by_robot[k], strict=True) if saw]),
+            cameras=tuple(compress(names, by_robot[k])),
             residual_px=residual[k] if markers[k] else None,
         )
-        for k, status in enumerate(tracker.status)
-        if status is not None and tracker.owned[k]
-    )
+        for k in rows
+        if owned[k] and (state := status[k]) is not None
+    }
 
 
-def _markers(tracker: Told, t_ns: int, seen: _Seen, free: list[Marker]) -> Markers:
+def _markers(tracker: Told, t_ns: int, seen: Seen, free: list[Marker]) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1))
     owner = tracker.catalogue.robot[discs]

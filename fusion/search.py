@@ -32,6 +32,7 @@ SLACK_PX = 0.7
 HINT_SIGMA_M = 0.1  # of `start_m`
 REACH = 16.3  # chi-square with 3 degrees, one in a thousand: where a lost single marker may be found again
 FAR = 50.0  # chi-square of a constellation that is nowhere near where it was: it may have been carried
+FLOOD = 600  # free detections of a frame: one with more shows a texture, or is a fault, and is not searched
 BODIES = 12  # constellations that are looked for in one instant; the others' turn is next
 
 
@@ -113,6 +114,8 @@ class Search:
         """Markers out of the detections that nothing claims."""
         free = np.ones(len(sightings), bool)
         free[matches.sighting] = False
+        count = np.bincount(sightings.frame[free], minlength=len(sightings.exposures.camera))
+        free &= (count <= FLOOD)[sightings.frame]
         sizes = np.unique(2 * self.tracker.catalogue.radius)
         return group(self.tracker.optics, sightings, np.flatnonzero(free), sizes) if free.any() else []
 

@@ -7,37 +7,33 @@ Zenoh's callbacks only enqueue; one thread, that of `Server.run`, decodes, fuses
 import contextlib
 import gc
 import logging
-import queue
 import threading
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
-import yaml
+import numpy as np
 import zenoh
 
 from calib.camera import Camera
-from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig
-from camera_node.messages import ClockReply, Detections, Keys, MessageError, decode, encode
-from camera_node.network import open_client, open_router
-from fusion.calibration import Calibration
+from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
+from camera_node.requests import encode_reply, parse_request, payload_of
+from fusion.calibration import Calibration, parse_rig
 from fusion.config import ArenaConfig
 from fusion.health import Health
-from fusion.instants import Frame, Instant, Instants
-from fusion.messages import Latency, RobotPose, Robots, State, robots_key, undo_key
-from fusion.report import Fused, Move
-from fusion.requests import parse_robots, respond, robots_reply
+from fusion.instants import Instant, Instants
+from fusion.intake import FAR_NS, Intake
+from fusion.link import Link, open_session
+from fusion.messages import Latency, RobotPose, Robots, RobotsRequest, State, robots_key, undo_key
+from fusion.report import Move, latency_of
 from fusion.robots import changed, load_robots
 from fusion.shards import Shard
 from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
-QUEUE = 2000  # messages: seconds of a large arena
-FAR_NS = 5_000_000_000  # a capture time so far from now is a fault
 TICK_S = 0.005  # how finely the end of a wait is met
+BACK_NS = 1_000_000_000  # by which this machine's clock may be set back without anything being begun anew
 
 
 class Server:
@@ -54,18 +50,20 @@ class Server:
         self.shard = Shard.parse(config.shard)
         self.robots = load_robots(Path(config.robots))
         self.health = Health(config.limits.lateness_ms)
+        self._intake = Intake(self.keys, self.health)
         kept = Path(config.kept_rig) if config.kept_rig else None
         self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
         self._tracker: Tracker | None = None
+        self._now_ns = 0
         self._start()
-        self._messages: queue.Queue[Callable[[], None]] = queue.Queue(QUEUE)
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
-            self.session = stack.enter_context(self._open())
-            self._declare(stack)
+            self.session = stack.enter_context(open_session(self.config, self.shard))
+            self.link = Link(self.session, self.health.count, stack)
+            self._declare()
             self._closing = stack.pop_all()
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
         log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
@@ -82,110 +80,62 @@ class Server:
 
     def run(self) -> None:
         """Serve."""
-        gc.freeze()  # what was imported is not looked through again and again
-        while not self._stopped.is_set():
-            with contextlib.suppress(queue.Empty):
-                self._messages.get(timeout=TICK_S)()
-            now_ns = time.time_ns()
-            for instant in self._instants.take(now_ns):
-                self._fuse(instant)
-            aside = self._tracker.watch.bumped if self._tracker else set()
-            if status := self.health.status(now_ns, set(self._cameras()), self._instants.late, aside):
-                own = "" if self.shard.leads else f"/{self.shard.index}"
-                self._publish(self.keys.fusion_status + own, status)
+        with _collecting_between_instants() as collect:
+            while not self._stopped.is_set():
+                more = self.link.work(TICK_S)
+                now_ns = self._tell_time()
+                for instant in self._instants.take(now_ns):
+                    self._fuse(instant)
+                if not more:
+                    self._anticipate()
+                if self._tell_status(now_ns):
+                    collect()
 
-    def _declare(self, stack: contextlib.ExitStack) -> None:
-        keys, session = self.keys, self.session
-        self._publishers: dict[str, zenoh.Publisher] = {}
-        takes = {keys.detections(): self._take_detections, keys.rig: self._take_rig}
+    def _tell_time(self) -> int:
+        """Now. Once the clock was set back, what was followed lies in the future: everything begins anew."""
+        now_ns = time.time_ns()
+        if now_ns < self._now_ns - BACK_NS:
+            log.warning(
+                "this machine's clock was set back by %.0f s; robots are found anew",
+                (self._now_ns - now_ns) * 1e-9,
+            )
+            self._start()
+        self._now_ns = now_ns
+        return now_ns
+
+    def _declare(self) -> None:
+        keys, link = self.keys, self.link
+        link.subscribe(keys.detections(), self._take_detections)
+        link.subscribe(keys.rig, self._take_rig)
+        link.answer_later(robots_key(keys.arena), self._change_robots)
         if self.shard.count > 1:
-            takes[keys.robot_pose()] = self._take_pose
-        answers = {robots_key(keys.arena): self._later(self._change_robots)}
+            link.subscribe(keys.robot_pose(), self._take_pose)
         if self.shard.leads:
-            answers |= {keys.clock: self._answer_clock, keys.rig: self._answer_rig}
-            answers[undo_key(keys.arena)] = self._later(self._undo)
-            stack.callback(session.liveliness().declare_token(keys.fusion_alive).undeclare)
-        for key, answer in answers.items():
-            stack.callback(session.declare_queryable(key, answer).undeclare)
-        for key, take in takes.items():
-            stack.callback(session.declare_subscriber(key, self._enqueue(take)).undeclare)
-
-    def _open(self) -> zenoh.Session:
-        """The arena's router, or of another shard a connection to it."""
-        zenoh_config = Path(self.config.zenoh) if self.config.zenoh else None
-        if self.shard.leads:
-            return open_router(self.config.listen, zenoh_config)
-        return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in self.config.listen], zenoh_config)
-
-    def _enqueue(self, take: Callable[[bytes, str, int], None]) -> Callable[[zenoh.Sample], None]:
-        """A callback that only enqueues: whatever else it did would stall the link."""
-
-        def callback(sample: zenoh.Sample) -> None:
-            self._put(partial(take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns()))
-
-        return callback
-
-    def _later(self, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
-        """A callback that has the server's thread answer a query."""
-        return lambda query: self._put(partial(respond, query, answer))
-
-    def _put(self, task: Callable[[], None]) -> None:
-        try:
-            self._messages.put_nowait(task)
-        except queue.Full:
-            self.health.count("queue full")
-
-    def _publish(self, key: str, message: msgspec.Struct) -> None:
-        if key not in self._publishers:
-            self._publishers[key] = self.session.declare_publisher(key)
-        self._publishers[key].put(encode(message))
+            link.answer(keys.clock, self._answer_clock)
+            link.answer(keys.rig, self._answer_rig)
+            link.answer_later(undo_key(keys.arena), self._undo)
+            link.show_alive(keys.fusion_alive)
 
     # What arrives.
 
     def _take_detections(self, data: bytes, key: str, received_ns: int) -> None:
-        try:
-            message = decode(data, Detections)
-            if key != self.keys.detections(message.camera):
-                raise MessageError("of another camera than its key")
-        except MessageError:
-            self.health.count("detections that are no message")
-            return
-        if abs(message.t_ns - received_ns) > FAR_NS:
-            self.health.count("implausible time")
-            return
-        if self.health.arrived(message.camera, message.t_ns, received_ns):
-            self._add(message, received_ns)
-
-    def _add(self, message: Detections, received_ns: int) -> None:
-        if self._tracker is None:
-            return
-        camera = self._cameras().get(message.camera)
-        if camera is None:
-            self.health.count("unknown camera")
-        elif (message.width, message.height) != (camera.width, camera.height):
-            self.health.count("wrong image size")
-        else:
-            frame = Frame.of(message, camera, received_ns)
-            self.health.noted(message.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
+        frame = self._intake.receive(data, key, received_ns, self._cameras())
+        if frame is not None:
+            self.health.noted(frame.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            rig = msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
-        except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+            rig = parse_rig(data)
+        except MessageError as error:
             self.health.count("rig that is no rig")
-            log.warning(
-                "a published rig is refused, the old one stays: %s", " ".join(str(error).split())[:200]
-            )
-
+            log.warning("a published rig is refused, the old one stays: %s", error)
             return
-        old = self.calibration.rig
-        if rig == old:  # our own, or one that came twice
+        if rig == self.calibration.rig:  # our own, or one that came twice
             return
-        self.calibration.replace(rig)
-        moved = [name for name in rig.cameras if old and rig.cameras[name] != old.cameras.get(name)]
-        if old and len(moved) == 1 and rig.placed().keys() == old.placed().keys() and self._tracker:
-            self._tracker.place(moved[0], rig.cameras[moved[0]])  # robots stay as they are
-            self._tracker.watch.trust(moved[0])
+        moved = self.calibration.replace(rig)
+        if moved is not None and self._tracker is not None:
+            self._tracker.place(moved, rig.cameras[moved])  # robots stay as they are
+            self._tracker.watch.trust(moved)
         else:
             self._start()
 
@@ -196,7 +146,9 @@ class Server:
         except MessageError:
             self.health.count("poses that are no message")
             return
-        if self._tracker is not None and not self.shard.owns(pose.robot):
+        if abs(pose.t_ns - received_ns) > FAR_NS:
+            self.health.count("implausible time")
+        elif self._tracker is not None and not self.shard.owns(pose.robot):
             self._tracker.follow(pose)
 
     def _start(self) -> None:
@@ -218,56 +170,78 @@ class Server:
 
     def _answer_rig(self, query: zenoh.Query) -> None:
         if self.calibration.rig is not None:
-            query.reply(self.keys.rig, encode(self._rig_message()))
+            query.reply(self.keys.rig, encode(self.calibration.message()))
 
-    def _rig_message(self) -> RigMessage:
-        assert self.calibration.rig is not None
-        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.calibration.rig))
-
-    def _undo(self, payload: bytes) -> bytes:
+    def _undo(self, _: zenoh.Query) -> bytes:
         """Take the last correction back; that camera is not doubted again until another rig comes."""
         name, camera = self.calibration.undo()
         log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
         if self._tracker is not None:
             self._tracker.place(name, camera)
             self._tracker.watch.hold(name)
-        message = self._rig_message()
-        self._publish(self.keys.rig, message)
+        message = self.calibration.message()
+        self.link.publish(self.keys.rig, message)
         return encode(message)
 
-    def _change_robots(self, payload: bytes) -> bytes:
+    def _change_robots(self, query: zenoh.Query) -> bytes:
         """Rename, remove and define robots, all or none; what they are then."""
-        request = parse_robots(payload)
+        payload = payload_of(query)
+        request = parse_request(payload, RobotsRequest) if payload else RobotsRequest()
         robots = changed(self.robots, request.rename, request.remove, request.define)
         if robots != self.robots:
             for name in self.robots.keys() - robots.keys():
-                self._forget(self.keys.robot_pose(name))
+                self.link.forget(self.keys.robot_pose(name))
             self.robots = robots
             log.info("robots: %s", ", ".join(robots) or "none")
             if self._tracker is not None:
                 self._tracker = self._tracker.with_robots(robots, request.rename)
-        return robots_reply(payload, Robots(robots=self.robots))
-
-    def _forget(self, key: str) -> None:
-        if key in self._publishers:
-            self._publishers.pop(key).undeclare()
+        return encode_reply(payload, Robots(robots=self.robots))
 
     # What is told.
+
+    def _tell_status(self, now_ns: int) -> bool:
+        aside = self._tracker.watch.bumped if self._tracker else set()
+        status = self.health.status(now_ns, set(self._cameras()), self._instants.late, aside)
+        if status is not None:
+            own = "" if self.shard.leads else f"/{self.shard.index}"
+            self.link.publish(self.keys.fusion_status + own, status)
+        return status is not None
+
+    def _anticipate(self) -> None:
+        """Use the wait for the last frames of an instant."""
+        instant, owed = self._instants.open()
+        if self._tracker is not None and instant is not None:
+            self._tracker.anticipate(instant, owed)
 
     def _fuse(self, instant: Instant) -> None:
         if self._tracker is None:
             return
+        try:
+            self._follow(self._tracker, instant)
+        except (np.linalg.LinAlgError, RuntimeError):  # NumPy's and GTSAM's, of a system that has no solution
+            self.health.count("instant that could not be solved")
+            log.exception("an instant could not be solved; robots are found anew")
+            self._start()
+
+    def _follow(self, tracker: Tracker, instant: Instant) -> None:
         begun_ns = time.time_ns()
-        fused = self._tracker.fuse(instant)
-        latency = _latency(instant, begun_ns, time.time_ns())
-        for pose in fused.poses:
-            told = msgspec.structs.replace(pose, latency=latency)
-            self._publish(self.keys.robot_pose(pose.robot), told)
+        first = tracker.advance(instant)
+        latency = latency_of(instant, begun_ns, time.time_ns())
+        self._tell_poses(first, latency)
+        fused = tracker.complete()
+        told = {pose.robot for pose in first}
+        self._tell_poses([pose for pose in fused.poses if pose.robot not in told], latency)
         if self.shard.leads:
-            self._publish(self.keys.markers, fused.markers)
-        for move in self._tracker.inspect():
+            self.link.publish(self.keys.markers, fused.markers)
+        for move in tracker.inspect():
             self._tell(move)
-        self._note(fused, latency)
+        states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
+        self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
+
+    def _tell_poses(self, poses: Iterable[RobotPose], latency: Latency | None) -> None:
+        for pose in poses:
+            told = msgspec.structs.replace(pose, latency=latency)
+            self.link.publish(self.keys.robot_pose(pose.robot), told)
 
     def _tell(self, move: Move) -> None:
         """Say that a camera was moved, or where it stands now."""
@@ -277,30 +251,22 @@ class Server:
             )
             return
         self.calibration.correct(move.name, move.camera)  # only the leading shard gets here
-        self._publish(self.keys.rig, self._rig_message())
+        self.link.publish(self.keys.rig, self.calibration.message())
         log.warning(
             "camera %s is placed anew and used again; a query on %s takes that back",
             move.name,
             undo_key(self.keys.arena),
         )
 
-    def _note(self, fused: Fused, latency: Latency | None) -> None:
-        states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
-        self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
 
-
-def _latency(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
-    """Where the time went since the newest exposure; None for an instant without frames."""
-    newest = max(instant.frames, key=lambda frame: frame.t_ns, default=None)
-    if newest is None:
-        return None
-    sent_ns = newest.sent_ns or newest.received_ns
-    return Latency(
-        exposure_ms=newest.exposure_us / 2e3,
-        detect_ms=newest.detect_us * 1e-3,
-        camera_ms=(sent_ns - newest.t_ns) * 1e-6,
-        network_ms=(newest.received_ns - sent_ns) * 1e-6,
-        wait_ms=(begun_ns - newest.received_ns) * 1e-6,
-        fuse_ms=(done_ns - begun_ns) * 1e-6,
-        total_ms=(done_ns - newest.t_ns) * 1e-6,
-    )
+@contextlib.contextmanager
+def _collecting_between_instants() -> Iterator[Callable[[], object]]:
+    """No garbage is collected but when the function is called that this gives: between instants, once a second."""
+    gc.collect()
+    gc.freeze()  # what was imported is not looked through again and again
+    gc.disable()
+    try:
+        yield gc.collect
+    finally:
+        gc.enable()
+        gc.unfreeze()

@@ -127,13 +127,6 @@ def turns(w: Array) -> Array:
     return R
 
 
-def skew(vectors: Array) -> Array:
-    """(..., 3, 3) matrices [v]x of vectors (..., 3): [v]x w = v x w."""
-    W = np.zeros((*vectors.shape, 3))
-    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
-    return W - np.swapaxes(W, -1, -2)
-
-
 def _noise(dt: Array, densities: Array, R_half: Array) -> Array:
     """(N, 12, 12) of white noise on acceleration: q [dt^3/3, dt^2/2; dt^2/2, dt]."""
     Q = np.zeros((len(dt), 12, 12))

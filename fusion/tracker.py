@@ -1,29 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Instants in, robots and markers out: the same code live and offline, without a clock of its own."""
 
+from dataclasses import dataclass
+
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
 from camera_node.pose import rotation_from_wxyz
-from fusion.association import match
+from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
-from fusion.instants import Frame, Instant
+from fusion.inspection import Inspection
+from fusion.instants import Instant
 from fusion.messages import RobotPose, State
-from fusion.optics import Exposures, Optics
-from fusion.report import Fused, Move, report
+from fusion.optics import Optics
+from fusion.report import Fused, Move, look, report, tell_poses
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
 from fusion.state import POSITION, States, exp_so3
-from fusion.watch import Expected, Watch
+from fusion.watch import Watch
 
 Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
-WATCHED = 40  # markers that are compared with their images in one instant, about
-WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
 
@@ -37,6 +38,16 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tracked_sigma_m: float = (
         0.05  # a robot whose position is known worse is `coasting`, though a camera sees it
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Begun:
+    """An instant before it is whole: the robots' prediction, which of them are followed (N,), and what is matched."""
+
+    t_ns: int
+    prediction: Prediction
+    followed: NDArray[np.bool_]
+    association: Association
 
 
 class Tracker:
@@ -58,6 +69,7 @@ class Tracker:
     ) -> None:
         self.optics = Optics(cameras)
         self.names, self.robots = tuple(robots), list(robots.values())
+        self._row = {name: k for k, name in enumerate(robots)}
         self.limits, self.shard = limits or Limits(), shard
         self.owned = np.array([shard.owns(name) for name in self.names], bool)
         self.catalogue = Catalogue.of(self.robots)
@@ -69,25 +81,54 @@ class Tracker:
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
         self.search = Search(self)
         self.watch = Watch()
-        self._watched = 0
+        self._inspection = Inspection(self)
         self._last: tuple[Instant, Sightings, Matches] | None = None
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
+        self._begun: _Begun | None = None  # the instant that comes next
+        self._told: dict[int, RobotPose] = {}  # of the last instant, before it was complete
+        self._others: dict[int, RobotPose] = {}  # of other shards' robots, since the last instant was begun
 
     def fuse(self, instant: Instant) -> Fused:
         """Follow the robots into this instant, and look for those that are not tracked."""
-        prediction = self._predict(instant.t_ns)
-        trusted = Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
-        sightings = Sightings.of(trusted, self.optics, self.limits.sigma_floor_px)
-        followed = self._followed(prediction.states)
-        self.predicted = prediction, followed
-        matches = match(self.optics, prediction.states, self.catalogue, followed, sightings)
-        matches = self._update(prediction, sightings, matches)
-        matches, free = self.search.find(np.flatnonzero(~followed), sightings, matches)
+        self.advance(instant)
+        return self.complete()
+
+    def anticipate(self, instant: Instant, owed: int) -> None:
+        """Do what can be done of an instant of which `owed` frames are still to come.
+
+        Each round costs as much as three frames, so that one waits for as many frames as are then left.
+        """
+        association, trusted = self._begin(instant.t_ns).association, self._trusted(instant)
+        if len(association.missing(trusted.frames)) >= owed > 0:
+            association.add(trusted.frames)
+
+    def advance(self, instant: Instant) -> tuple[RobotPose, ...]:
+        """Follow the robots into this instant; the poses that no search can change any more."""
+        begun = self._begin(instant.t_ns)
+        self._begun, self._t_ns = None, instant.t_ns
+        self.predicted = begun.prediction, begun.followed
+        trusted = self._trusted(instant)
+        sightings, matches = begun.association.whole(trusted)
+        matches = self._update(begun.prediction, sightings, matches)
         self._note(instant.t_ns, matches)
+        rows = np.flatnonzero(begun.followed & ~(self.estimator.single & self._misses_bodies(begun.followed)))
+        self._told = tell_poses(self, instant.t_ns, look(self, sightings, matches), rows.tolist())
         self._last = instant, sightings, matches
-        return report(self, trusted, sightings, matches, free)
+        return tuple(self._told.values())
+
+    def complete(self) -> Fused:
+        """After `advance`: look for robots that are not tracked, and tell the whole instant."""
+        assert self._last is not None
+        instant, sightings, matches = self._last
+        missing = np.flatnonzero(~self.predicted[1])
+        n_known = len(matches)
+        matches, free = self.search.find(missing, sightings, matches)
+        if len(matches) != n_known:
+            self._note(instant.t_ns, matches)
+        self._last = instant, sightings, matches
+        return report(self, self._trusted(instant), sightings, matches, free, self._told)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
@@ -113,62 +154,35 @@ class Tracker:
     def place(self, name: str, camera: Camera) -> None:
         """A camera stands elsewhere from now on; robots stay as they are."""
         self.optics.place(name, camera)
+        self._begun = None
 
     def inspect(self) -> tuple[Move, ...]:
-        """After an instant was told: compare frames with what robots seen by two other cameras should look like.
+        """After an instant was told: which cameras are found to be moved, and where they stand; see `Inspection`."""
+        return () if self._last is None else self._inspection.inspect(*self._last)
 
-        Places a camera anew that was moved; says which were, and where they stand.
-        """
-        if self._last is None:
-            return ()
-        instant, sightings, matches = self._last
-        seen = np.zeros((len(self.robots), len(self.optics.names)), bool)
-        seen[self.catalogue.robot[matches.disc], sightings.camera[matches.sighting]] = True
-        steady = np.array([status == "tracked" for status in self.status])
-        for frame in self._turn(instant.frames):
-            camera = self.optics.index[frame.camera]
-            others = seen.sum(1) - seen[:, camera]
-            markers = np.flatnonzero((steady & (others >= 2))[self.catalogue.robot])
-            markers = np.roll(markers, -self._watched)[:WATCHED]
-            points = self._expect(frame, camera, (frame.t_ns - instant.t_ns) * 1e-9, markers)
-            if points.shape[1]:
-                self.watch.note(self.optics.cameras[camera], Expected(frame, points))
-        return self._heal()
+    def _begin(self, t_ns: int) -> "_Begun":
+        """The instant at `t_ns`, begun now if it was not yet."""
+        if self._begun is None or self._begun.t_ns != t_ns:
+            self._take_others()
+            prediction = self._predict(t_ns)
+            followed = self._followed(prediction.states)
+            scene = self.optics, self.catalogue, prediction.states, followed
+            association = Association(*scene, t_ns, self.limits.sigma_floor_px)
+            self._begun = _Begun(t_ns, prediction, followed, association)
+        return self._begun
 
-    def _turn(self, frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
-        """Some of the frames, others in the next instant, so that watching costs the same in a large arena."""
-        n = max(1, WATCHED // max(len(self.catalogue.robot), 1))
-        first = self._watched % max(len(frames), 1)
-        self._watched += n
-        return (frames + frames)[first : first + min(n, len(frames))]
+    def _trusted(self, instant: Instant) -> Instant:
+        """The instant without the frames of cameras that are set aside."""
+        if not self.watch.bumped:
+            return instant
+        return Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
 
-    def _expect(self, frame: Frame, camera: int, tau: float, markers: NDArray[np.intp]) -> Array:
-        """(3, N) points in the world whose projections are the outlines' centres that the frame should show."""
-        exposures = Exposures(np.array([camera]), np.array([tau]))
-        discs = self.catalogue.discs(markers, np.zeros(len(markers), np.intp))
-        views = self.optics.view(self.optics.pose(self.states, exposures), discs)
-        points = self.optics.R_cam_world[camera].T @ views.q + self.optics.centres[camera][:, None]
-        lens = self.optics.cameras[camera]
-        uv = lens.project(views.q.T)
-        inside = ((uv > WATCH_MARGIN_PX) & (uv < np.array([lens.width, lens.height]) - WATCH_MARGIN_PX)).all(
-            1
-        )
-        return points[:, inside & (views.facing > WATCH_FACING)]
-
-    def _heal(self) -> tuple[Move, ...]:
-        moves = []
-        if (name := self.watch.find_bumped()) is not None:
-            moves.append(Move(name, None))
-        for name in sorted(self.watch.bumped) if self.shard.leads else ():
-            camera = self.watch.heal(name, self.optics.cameras[self.optics.index[name]])
-            if camera is not None:
-                self.place(name, camera)
-                moves.append(Move(name, camera))
-        return tuple(moves)
+    def _misses_bodies(self, followed: NDArray[np.bool_]) -> bool:
+        """Whether constellations are looked for, which may prove that a single robot's marker is their own."""
+        return bool((~followed & ~self.estimator.single).any())
 
     def _predict(self, t_ns: int) -> Prediction:
         dt = BIRTH_S if self._t_ns is None else max((t_ns - self._t_ns) * 1e-9, BIRTH_S)
-        self._t_ns = t_ns
         return self.estimator.predict(self.states, np.full(len(self.robots), min(dt, MAX_COAST_S)))
 
     def _followed(self, states: States) -> NDArray[np.bool_]:
@@ -238,17 +252,27 @@ class Tracker:
 
     def follow(self, pose: RobotPose) -> None:
         """Another shard's robot is there: its detections are its own, and not for ours."""
-        if pose.robot not in self.names or self._t_ns is None:
+        k = self._row.get(pose.robot)
+        if k is None or self.owned[k] or not np.isfinite(pose.covariance_matrix).all():
             return
-        k = self.names.index(pose.robot)
-        if self.owned[k] or pose.t_ns <= self._seen_ns[k]:
+        if pose.t_ns > self._seen_ns[k]:
+            self._others[k] = pose
+            self._seen_ns[k] = pose.t_ns
+
+    def _take_others(self) -> None:
+        """The robots of other shards as these told of them, at this tracker's last instant."""
+        if not self._others or self._t_ns is None:
             return
-        dt = (self._t_ns - pose.t_ns) * 1e-9
-        omega, v = np.array([pose.angular_velocity]), np.array([pose.velocity])
-        R = exp_so3(omega * dt) @ rotation_from_wxyz(pose.quaternion_wxyz)
-        there = States(R, pose.position + v * dt, omega, v, pose.covariance_matrix[None])
-        self.states = self.states.with_rows(np.array([k]), there)
-        self.status[k], self._seen_ns[k] = pose.state, pose.t_ns
+        rows, poses = np.array(list(self._others)), list(self._others.values())
+        self._others = {}
+        dt = (self._t_ns - np.array([pose.t_ns for pose in poses]))[:, None] * 1e-9
+        omega, v = (np.array([getattr(p, name) for p in poses]) for name in ("angular_velocity", "velocity"))
+        R = np.array([rotation_from_wxyz(pose.quaternion_wxyz) for pose in poses])
+        p, P = np.array([pose.position for pose in poses]), np.array([q.covariance_matrix for q in poses])
+        there = States(exp_so3(omega * dt) @ R, p + v * dt, omega, v, P)
+        self.states = self.states.with_rows(rows, there)
+        for k, pose in zip(rows, poses, strict=True):
+            self.status[k] = pose.state
 
     def adopt(self, rows: NDArray[np.intp], states: States) -> None:
         """Robots that were found stand there from now on."""

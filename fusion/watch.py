@@ -19,10 +19,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
-from camera_node.pose import Pose
+from calib.camera import Camera, pixel_jacobians
+from camera_node.pose import Pose, rotation_from_vector
 from fusion.instants import Frame
-from fusion.state import exp_so3, skew
 
 Array = NDArray[np.float64]
 AGREE_PX = 2.0  # between where a roundel is expected and detected, while a camera stands
@@ -220,23 +219,27 @@ def _fit(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Arra
     The tangent is rotation, then translation, in the camera's frame.
     """
     for _ in range(8):
-        A, b = _linearise(camera, T, points, measured)
-        w = 1 / (1 + np.sum(b**2, 1))
-        H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(H, np.einsum("n,nai,na->i", w, A, b))
+        H, right, _ = _normal_equations(camera, T, points, measured)
+        step = np.linalg.solve(H, right)
         T = T.copy()
         T[:3, 3] += T[:3, :3] @ step[3:]
-        T[:3, :3] = T[:3, :3] @ exp_so3(step[None, :3])[0]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
+    H, _, rms = _normal_equations(camera, T, points, measured)
+    return T, rms, np.asarray(np.linalg.inv(H), float)
+
+
+def _normal_equations(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array, float]:
+    """(6, 6) information and (6,) right side, weighed by Cauchy; and the median distance, pixels."""
     A, b = _linearise(camera, T, points, measured)
-    w = 1 / (1 + np.sum(b**2, 1))
-    H = np.einsum("n,nai,naj->ij", w, A, A) + 1e-9 * np.eye(6)
-    return T, float(np.sqrt(np.median(np.sum(b**2, 1)))), np.asarray(np.linalg.inv(H), float)
+    square = np.sum(b**2, 1)
+    weighed = A / (1 + square)[:, None, None]
+    H = np.einsum("nai,naj->ij", weighed, A) + 1e-9 * np.eye(6)
+    return H, np.einsum("nai,na->i", weighed, b), float(np.sqrt(np.median(square)))
 
 
 def _linearise(camera: Camera, T: Array, points: Array, measured: Array) -> tuple[Array, Array]:
     """A (K, 2, 6) and b (K, 2) of A xi = b, the points that can be seen."""
     p = (points - T[:3, 3]) @ T[:3, :3]
-    uv, J = camera.project_with_jacobian(p)
-    by_pose = np.concatenate([skew(p), np.tile(-np.eye(3), (len(p), 1, 1))], 2)
+    uv, _, J_pose, _ = pixel_jacobians(camera, p)
     known = np.isfinite(uv).all(1)
-    return (J @ by_pose)[known], (measured - uv)[known]
+    return J_pose[known], (measured - uv)[known]

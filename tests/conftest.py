@@ -1,12 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What several folders of tests need."""
 
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """A Zenoh endpoint on loopback that is free."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture

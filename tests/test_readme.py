@@ -16,6 +16,7 @@ import cv2
 import pytest
 
 from tests.calib.test_intrinsics import SPEC, board_poses, render
+from tests.conftest import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -117,8 +118,7 @@ COMMAND_BLOCK = next(k for k, block in enumerate(blocks("sh")) if "camera_node.s
 @pytest.fixture
 def server(folder: Path) -> Iterator[tuple[Path, str]]:
     """The README's live server on a port that is free here, and its endpoint."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        endpoint = f"tcp/localhost:{probe.getsockname()[1]}"
+    endpoint = f"tcp/localhost:{free_port()}"
     command = [*words(find("python -m fusion --config")), "--listen", endpoint]
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
@@ -141,8 +141,7 @@ def test_the_live_programs(server: tuple[Path, str]):
     wand = find("python -m calib wand --live").replace("--seconds 30", f"--seconds 2 --connect {endpoint}")
     assert "error: " in run(wand, folder, expected=2).stderr
     view = find("python -m web").replace("tcp/localhost:7447", endpoint)
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     process = subprocess.Popen([*words(view), "--port", str(port)], cwd=folder, stdout=subprocess.DEVNULL)
     try:
         wait_for_port(port)
@@ -162,10 +161,8 @@ def wait_for_port(port: int) -> None:
             time.sleep(0.05)
 
 
-def test_the_subscription_prints_poses(tmp_path: Path):
+def test_the_subscription_prints_poses(tmp_path: Path, endpoint: str):
     """The README's Python follows the rover of a running demo."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     (code,) = [block for block in blocks("python") if "Arena.connect" in block]
     (tmp_path / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
     demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60", "--listen", endpoint]

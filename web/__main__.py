@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m web`: watch an arena in the browser, or on one line a second; or start a simulated one with --demo."""
+"""`python -m web`: watch an arena or its recording, in the browser or on one line a second; or start a demo."""
 
 import signal
 import threading
@@ -11,6 +11,8 @@ import tyro
 from camera_node.errors import run
 from camera_node.network import open_client
 from web.feed import Feed
+from web.replay import Replay
+from web.subscription import Subscription
 from web.tables import describe
 
 
@@ -27,6 +29,7 @@ class Options:
         headless: One line a second instead of a page.
         seconds: End after so long; of a demo, so long after calibration.
         demo: Start a simulated arena, calibrate it by a wand wave, track its robots, and watch it.
+        replay: Show a recording (MCAP, by python -m fusion record) instead of a running arena.
         scene: The demo's scene; arena.yaml, robots.yaml and wand.yaml lie beside it. The checkout's own by default.
         listen: Zenoh endpoint of the demo's server, as tcp/127.0.0.1:7447; a free one by default.
     """
@@ -39,6 +42,7 @@ class Options:
     headless: bool = False
     seconds: float | None = None
     demo: bool = False
+    replay: Path | None = None
     scene: Path | None = None
     listen: str | None = None
 
@@ -47,22 +51,39 @@ def watch(options: Options, stop: threading.Event) -> None:
     """Show the arena until `stop` is set."""
     session = open_client(options.connect, options.zenoh)
     try:
-        feed = Feed(session, options.arena)
-        if options.headless:
-            ended = False
-            while not ended:
-                ended = stop.wait(1.0)
-                print(describe(feed.latest()), flush=True)
-        else:
-            _show(feed, options, stop)
+        feed = Feed(options.arena)
+        _show(feed, Subscription(session, feed), options, stop)
     finally:
         session.close()
 
 
-def _show(feed: Feed, options: Options, stop: threading.Event) -> None:
+def replay(path: Path, options: Options, stop: threading.Event) -> None:
+    """Show a recording until `stop` is set; without a page, until it ends."""
+    recorded = Replay(path)
+    feed = Feed(recorded.arena, clock=recorded.seconds)
+    teller = threading.Thread(target=recorded.run, args=(feed, stop, options.headless))
+    teller.start()
+    try:
+        _show(feed, recorded, options, stop)
+    finally:
+        stop.set()
+        teller.join()
+
+
+def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: threading.Event) -> None:
+    if options.headless:
+        ended = False
+        while not ended:
+            ended = stop.wait(1.0)
+            print(describe(feed.latest()), flush=True)
+        return
+    from web.controls import LiveControls
+    from web.playback import ReplayControls
     from web.view import View
 
     view = View(feed, options.host, options.port)
+    live = isinstance(source, Subscription)
+    view.add(LiveControls(view.server, source) if live else ReplayControls(view.server, source))
     print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
     try:
         view.run(stop)
@@ -89,7 +110,10 @@ def program() -> int | None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     if options.seconds is not None:
         threading.Timer(options.seconds, stop.set).start()
-    watch(options, stop)
+    if options.replay is not None:
+        replay(options.replay, options, stop)
+    else:
+        watch(options, stop)
     return 0
 
 

@@ -26,6 +26,7 @@ from web.feed import Feed, Latest
 from web.messages import Progress, progress_key
 from web.processes import Processes, ProgramFailed, ended_by_signals
 from web.score import Array, Score, summarise
+from web.subscription import Subscription
 from web.usage import Usage
 
 ARENA = "demo"
@@ -93,7 +94,8 @@ class Demo:
         self.scene, self.files, self.processes, self.endpoint = scene, files, processes, endpoint
         self.session = open_client([endpoint])
         self.epoch_ns = time.time_ns() + round(START_S * 1e9)
-        self.feed = Feed(self.session, ARENA, self._take_pose)
+        self.feed = Feed(ARENA, self._take_pose)
+        self.subscription = Subscription(self.session, self.feed)
         self._score: Score | None = None
 
     def play(self, page: tuple[str, int] | None, seconds: float | None) -> int:
@@ -105,7 +107,7 @@ class Demo:
             self._acquire()
             return self._track(seconds)
         finally:
-            self.feed.close()
+            self.subscription.close()
             self.session.close()
 
     def _start(self, page: tuple[str, int] | None) -> None:

@@ -67,7 +67,7 @@ class MarkerCloud:
 
     def draw(self, latest: Latest) -> None:
         seen = latest.markers
-        points = seen.message.positions() if seen is not None and seen.age() < 0.5 else np.empty((0, 3))
+        points = seen.message.positions() if seen is not None and latest.age(seen) < 0.5 else np.empty((0, 3))
         known = (np.abs(points) < FAR_M).all(axis=1)  # NaN is not
         self._cloud.visible = bool(known.any())
         if seen is not None and known.any():
@@ -95,7 +95,7 @@ class Robots:
         poses = [latest.poses[name].message for name in names]
         positions = np.array([pose.position for pose in poses], np.float32)
         wxyzs = np.array([pose.quaternion_wxyz for pose in poses], np.float32)
-        states = [robot_state(latest.poses[name]) for name in names]
+        states = [robot_state(latest, name) for name in names]
         if names != self._names:
             self._recreate(names, positions, wxyzs)
         self._axes.batched_positions, self._axes.batched_wxyzs = positions, wxyzs

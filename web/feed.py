@@ -7,10 +7,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
-import zenoh
 
 from calib.messages import RigMessage
 from calib.rig import Rig
@@ -19,7 +18,6 @@ from fusion.messages import FusionStatus, Markers, RobotPose
 from web.coverage import Coverage
 from web.messages import Progress, progress_key
 
-T = TypeVar("T", bound=msgspec.Struct)
 MAX_NAMES = 256  # cameras or robots of one arena; more are a fault of whoever publishes them
 MAX_REASONS = 32
 FAR_M = 1e5  # nothing of an arena is so far away
@@ -27,20 +25,17 @@ FAR_M = 1e5  # nothing of an arena is so far away
 
 @dataclass(frozen=True)
 class Seen:
-    """A message and when it came, seconds of `time.monotonic()`."""
+    """A message and when it came, seconds of the feed's clock."""
 
     message: Any
     at: float
-
-    def age(self) -> float:
-        """Seconds since it came."""
-        return time.monotonic() - self.at
 
 
 @dataclass
 class Latest:
     """What is known of an arena at one moment."""
 
+    now: float = 0.0  # seconds of the feed's clock
     poses: dict[str, Seen] = field(default_factory=dict)
     cameras: dict[str, Seen] = field(default_factory=dict)
     coverage: dict[str, Coverage] = field(default_factory=dict)
@@ -52,45 +47,72 @@ class Latest:
     received: Counter[str] = field(default_factory=Counter)  # messages by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # what was skipped, by its reason
 
+    def age(self, seen: Seen | None) -> float:
+        """Seconds since a message came; infinite where there is none."""
+        return self.now - seen.at if seen else math.inf
+
 
 class Feed:
-    """Subscriptions to one arena. Bad bytes are counted in `Latest.faults` and go no further."""
+    """What an arena's messages say. Bad bytes are counted in `Latest.faults` and go no further.
+
+    Messages come by `receive`: from Zenoh (`web.subscription`) or from a recording (`web.replay`), whose clock may
+    stand still.
+    """
 
     def __init__(
-        self, session: zenoh.Session, arena: str, on_pose: Callable[[RobotPose], None] | None = None
+        self,
+        arena: str,
+        on_pose: Callable[[RobotPose], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.session, self.keys = session, Keys(arena)
-        self._on_pose = on_pose
+        self.keys = Keys(arena)
+        self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
         self._latest = Latest()
         keys = self.keys
-        self._subscribers: list[Any] = [
-            self._subscribe(keys.robot_pose(), RobotPose, self._take_pose),
-            self._subscribe(keys.markers, Markers, self._keep("markers")),
-            self._subscribe(keys.fusion_status, FusionStatus, self._take_status),
-            self._subscribe(keys.camera_status(), CameraStatus, self._take_camera),
-            self._subscribe(keys.detections(), Detections, self._take_detections),
-            self._subscribe(keys.rig, RigMessage, self._take_rig),
-            self._subscribe(progress_key(arena), Progress, self._keep("progress")),
-            session.liveliness().declare_subscriber(keys.fusion_alive, self._server_changed, history=True),
-        ]
+        self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
+            keys.robot_pose(): (RobotPose, self._take_pose),
+            keys.markers: (Markers, self._keep("markers")),
+            keys.fusion_status: (FusionStatus, self._keep("status")),
+            keys.camera_status(): (CameraStatus, self._take_camera),
+            keys.detections(): (Detections, self._take_detections),
+            keys.rig: (RigMessage, self._take_rig),
+            progress_key(arena): (Progress, self._keep("progress")),
+        }
 
-    def close(self) -> None:
-        """Stop listening; the session stays open."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
+    @property
+    def key_exprs(self) -> tuple[str, ...]:
+        """The Zenoh key expressions of all that is understood."""
+        return tuple(self._kinds)
+
+    def receive(self, key_expr: str, key: str, data: bytes) -> None:
+        """A message on a key that one of `key_exprs` includes."""
+        kind, take = self._kinds[key_expr]
+        try:
+            message = decode(data, kind)
+            with self._lock:
+                take(message, key)
+                self._latest.received[kind.__name__] += 1
+        except MessageError as error:
+            self.count_fault(f"{kind.__name__}: {error}"[:120])
 
     def latest(self) -> Latest:
         """A copy that no later message changes."""
         with self._lock:
             latest = self._latest
             copies = {name: getattr(latest, name).copy() for name in _CONTAINERS}
-            return replace(latest, **copies)
+            return replace(latest, now=self._clock(), **copies)
 
-    def snapshot(self, camera: str, timeout_s: float = 2.0) -> bytes | None:
-        """The JPEG that a camera sees now, or None where it does not answer in time."""
-        replies = self.session.get(self.keys.snapshot(camera), timeout=timeout_s)
-        return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None), None)
+    def server_changed(self, alive: bool) -> None:
+        """The server came or went."""
+        with self._lock:
+            self._latest.server_alive = alive
+
+    def forget(self) -> None:
+        """Know nothing, but what was skipped and whether the server is there."""
+        with self._lock:
+            known = self._latest
+            self._latest = Latest(server_alive=known.server_alive, faults=known.faults)
 
     def count_fault(self, reason: str) -> None:
         """Count something of the arena that could not be shown."""
@@ -98,20 +120,8 @@ class Feed:
             faults = self._latest.faults
             faults[reason if reason in faults or len(faults) < MAX_REASONS else "others"] += 1
 
-    def _subscribe(self, key: str, kind: type[T], take: Callable[[T, str], None]) -> zenoh.Subscriber:
-        return self.session.declare_subscriber(key, lambda sample: self._receive(sample, kind, take))
-
-    def _receive(self, sample: zenoh.Sample, kind: type[T], take: Callable[[T, str], None]) -> None:
-        try:
-            message = decode(sample.payload.to_bytes(), kind)
-            with self._lock:
-                take(message, str(sample.key_expr))
-                self._latest.received[kind.__name__] += 1
-        except MessageError as error:
-            self.count_fault(f"{kind.__name__}: {error}"[:120])
-
     def _keep(self, name: str) -> Callable[[msgspec.Struct, str], None]:
-        return lambda message, key: setattr(self._latest, name, Seen(message, time.monotonic()))
+        return lambda message, key: setattr(self._latest, name, Seen(message, self._clock()))
 
     def _take_pose(self, pose: RobotPose, key: str) -> None:
         if max(map(abs, pose.position)) > FAR_M or math.hypot(*pose.quaternion_wxyz) < 1e-6:
@@ -119,11 +129,6 @@ class Feed:
         self._store(self._latest.poses, pose.robot, pose, key)
         if self._on_pose is not None:
             self._on_pose(pose)
-
-    def _take_status(self, status: FusionStatus, key: str) -> None:
-        self._latest.status = Seen(status, time.monotonic())
-        if self._latest.rig is None:  # the server may be known before its queryable is
-            self._ask_rig()
 
     def _take_camera(self, status: CameraStatus, key: str) -> None:
         self._store(self._latest.cameras, status.camera, status, key)
@@ -145,21 +150,7 @@ class Feed:
 
     def _store(self, into: dict[str, Seen], name: str, message: msgspec.Struct, key: str) -> None:
         _check_name(into, name, key)
-        into[name] = Seen(message, time.monotonic())
-
-    def _server_changed(self, sample: zenoh.Sample) -> None:
-        alive = sample.kind == zenoh.SampleKind.PUT
-        with self._lock:
-            self._latest.server_alive = alive
-        if alive:  # whoever joins late asks for the calibration in force
-            self._ask_rig()
-
-    def _ask_rig(self) -> None:
-        self.session.get(self.keys.rig, self._receive_reply, timeout=5.0)
-
-    def _receive_reply(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._receive(reply.ok, RigMessage, self._take_rig)
+        into[name] = Seen(message, self._clock())
 
 
 _CONTAINERS = ("poses", "cameras", "coverage", "received", "faults")

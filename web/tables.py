@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.messages import FusionStatus, RobotPose
+from fusion.messages import CameraHealth, FusionStatus, Latency, RobotPose
 from web.feed import Latest, Seen
 
 STALE_S = 2.0  # a robot or a camera that was silent for so long is away
@@ -34,9 +34,10 @@ class Table:
         return f'<table style="{style}"><tr style="opacity:.6">{head}</tr>{body}</table>'
 
 
-def robot_state(seen: Seen) -> str:
+def robot_state(latest: Latest, robot: str) -> str:
     """The state that a robot's newest pose tells, or "away" when it is too old to tell one."""
-    return "away" if seen.age() > STALE_S else seen.message.state
+    seen = latest.poses[robot]
+    return "away" if latest.age(seen) > STALE_S else seen.message.state
 
 
 def tabulate_robots(latest: Latest) -> Table:
@@ -44,7 +45,7 @@ def tabulate_robots(latest: Latest) -> Table:
     rows, hues = [], []
     for name, seen in sorted(latest.poses.items()):
         pose: RobotPose = seen.message
-        state = robot_state(seen)
+        state = robot_state(latest, name)
         place = " ".join(f"{x:+.2f}" for x in pose.position)
         speed, sigma = float(np.linalg.norm(pose.velocity)), position_sigma_mm(pose)
         rows.append((name, state, place, f"{speed:.2f}", f"{sigma:.1f}", str(pose.n_markers)))
@@ -69,7 +70,7 @@ def tabulate_cameras(latest: Latest) -> Table:
         seen, health = latest.cameras.get(name), server.get(name)
         own = seen.message if seen else None
         lost = f"{own.dropped if own else 0} / {health.late if health else 0}"
-        advice = _advise(seen, own, health)
+        advice = _advise(latest, seen, health)
         rows.append(
             (
                 name,
@@ -88,10 +89,14 @@ def tabulate_cameras(latest: Latest) -> Table:
     return Table(header, rows, hues)
 
 
-def _advise(seen: Seen | None, own: object, health: object) -> str:
-    if seen is None or seen.age() > STALE_S:
+def _advise(latest: Latest, seen: Seen | None, health: CameraHealth | None) -> str:
+    if seen is None or latest.age(seen) > STALE_S:
         return "away"
-    return getattr(own, "advice", "") or ("" if getattr(health, "calibrated", True) else "not placed")
+    if health is not None and not health.calibrated:
+        return "not placed"
+    if health is not None and health.aside:
+        return "moved: set aside until it is placed anew"
+    return seen.message.advice
 
 
 def describe_server(latest: Latest) -> str:
@@ -103,6 +108,20 @@ def describe_server(latest: Latest) -> str:
         f"{status.instants_per_s:.0f} instants/s, latency {_number(status.latency_ms, 1)} ms, "
         f"processor {100 * status.cpu:.0f} %, {status.memory_mb:.0f} MB"
     )
+
+
+def describe_latency(latest: Latest) -> str:
+    """Where the time goes from the newest exposure's middle to the pose, by the mean of all robots' newest poses."""
+    told = [seen.message.latency for seen in latest.poses.values() if latest.age(seen) < STALE_S]
+    told = [latency for latency in told if latency is not None]
+    if not told:
+        return ""
+    parts = (
+        f"{name.removesuffix('_ms')} {np.mean([getattr(latency, name) for latency in told]):.1f}"
+        for name in Latency.__struct_fields__
+        if name not in ("exposure_ms", "detect_ms")  # parts of the camera's
+    )
+    return f"latency ms: {', '.join(parts)}"
 
 
 def list_faults(latest: Latest) -> Table:

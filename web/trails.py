@@ -5,10 +5,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 LENGTH = 60  # points of one trail
+JUMP_M = 1.0  # between two points: no robot drives so fast, and none leaves a line through the air
 
 
 class Trails:
-    """The last `LENGTH` positions of every robot; a new robot's trail starts at its first position."""
+    """The last `LENGTH` positions of every robot; a trail starts at the first of them, and anew where a robot jumps."""
 
     def __init__(self) -> None:
         self._points: dict[str, NDArray[np.float32]] = {}
@@ -19,6 +20,10 @@ class Trails:
         points = self._points.get(robot)
         if points is None:
             self._points[robot] = np.tile(new, (LENGTH, 1))
+        elif (
+            np.linalg.norm(new - points[-1]) > JUMP_M
+        ):  # put elsewhere by hand, or another moment of a replay
+            points[:] = new
         else:
             points[:-1], points[-1] = points[1:].copy(), new
 

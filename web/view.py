@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 import time
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import viser
@@ -23,6 +23,13 @@ PANEL_EVERY = 15
 FIELD_OF_VIEW, DISTANCE = math.radians(42), 2.3  # a long lens, from a distance of so many radii of the rig
 
 
+class Part(Protocol):
+    """Controls of the panel."""
+
+    def update(self, latest: Latest) -> None:
+        """Show what is known now."""
+
+
 class View:
     """The page that browsers see. `update` draws one frame; `run` draws until it is told to stop."""
 
@@ -34,7 +41,7 @@ class View:
         self.server.gui.configure_theme(
             dark_mode=True, control_width="large", show_logo=False, show_share_button=False
         )
-        self.panel = Panel(self.server, feed, self.frame_arena)
+        self._parts: list[Part] = [Panel(self.server, self.frame_arena)]
         self._frames = 0
         self._rig: Rig | None = None
         self._cameras: list[Any] = []
@@ -84,8 +91,13 @@ class View:
             self._markers.draw(latest)
             self._draw_ghosts(latest)
             if self._frames % PANEL_EVERY == 0:
-                self.panel.update(latest)
+                for part in self._parts:
+                    part.update(latest)
         self._frames += 1
+
+    def add(self, part: Part) -> None:
+        """More controls for the panel."""
+        self._parts.append(part)
 
     def frame_arena(self) -> None:
         """Turn every browser's view, and that of those to come, to the whole arena."""
@@ -106,7 +118,9 @@ class View:
             self.frame_arena()
 
     def _draw_ghosts(self, latest: Latest) -> None:
-        ghosts = latest.progress.message.ghosts if latest.progress and latest.progress.age() < 1.0 else {}
+        ghosts = (
+            latest.progress.message.ghosts if latest.progress and latest.age(latest.progress) < 1.0 else {}
+        )
         for name in self.ghosts.keys() - ghosts.keys():
             self.ghosts.pop(name).remove()
         for name, points in ghosts.items():

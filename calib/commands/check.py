@@ -10,11 +10,10 @@ import msgspec
 from rich.console import Console
 
 from calib.agreement import Agreement, Placed, compare
-from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.errors import CalibrationError
 from calib.report import print_report
-from calib.residual_map import save_map
 from calib.rig import Rig, load_rig
 from camera_node.body import Body
 from camera_node.config import load_yaml
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class Check:
     """Judge a rig by a recording of a waved wand: does it still stand as it says, do two halves agree, how precise is
-    it where robots drive, and which camera is the weakest. Nothing is written unless --map or --out ask for it."""
+    it where robots drive, and which camera is the weakest. Nothing is written unless --maps or --out ask for it."""
 
     rig: Path
     """The rig to judge."""
@@ -40,8 +39,8 @@ class Check:
     """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels."""
-    map: Path | None = None
-    """A PNG of the expected errors across the arena."""
+    maps: Path | None = None
+    """A folder for pictures: each camera's residuals and where to wave next, and the errors to expect."""
     out: Path | None = None
     """Write the rig again, with what was found in its `calibration`."""
 
@@ -49,8 +48,8 @@ class Check:
         """Calibrate anew, whole and in halves, and compare."""
         if (self.frames is None) == (self.observations is None):
             raise ConfigError("give one of --frames FOLDER and --observations CSV")
-        for out in filter(None, (self.out, self.map)):
-            check_folder(out)
+        if self.out is not None:
+            check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
         messages = read_recording(rig, self.frames, self.observations, wand)
         said = self._judge(rig, wand, messages, console)
@@ -70,9 +69,8 @@ class Check:
         print_report(result, trust, console)
         halves = _compare_halves(result.rig, wand, messages, console)
         stands = _compare_with_rig(rig, result, console)
-        if self.map is not None and trust.expected is not None:
-            save_map(self.map, trust.expected.draw(result.rig.placed()))
-            say(console, f"wrote {self.map}")
+        if self.maps is not None:
+            save_maps(self.maps, result, trust, console)
         return {**trust.as_dict(), "halves": _figures(halves), "rig": _figures(stands)}
 
 

@@ -2,7 +2,7 @@
 """`calib intrinsics`: lenses from views of a board."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -11,13 +11,13 @@ from rich.progress import track
 
 from calib.board import make_finder
 from calib.board_wave import show_board
+from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.footage import find_cameras, read_frames, take_snapshots
 from calib.intrinsics import BoardViews, CalibratedLens, Model, merge
 from calib.residual_map import draw_residuals, save_map
 from calib.rig import load_rig
 from camera_node.errors import ConfigError
-from camera_node.network import open_client
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +41,7 @@ class Intrinsics:
     """A folder for a picture of each camera's residuals."""
     seconds: float = 180.0
     """How long a running camera is asked at the most."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name in the keys."""
-    zenoh: Path | None = None
-    """A Zenoh configuration of your own."""
+    server: Server = field(default_factory=Connection)
 
     def execute(self, console: Console) -> None:
         """Write the cameras' entries, keep the others; nothing is written unless all are good."""
@@ -61,7 +56,7 @@ class Intrinsics:
             lenses[views.camera] = lens = views.solve(self.model)
             report(views.camera, lens, console)
             if self.maps:
-                picture = draw_residuals(views.camera, lens.views, lens.adjusted)
+                picture = draw_residuals(views.camera, lens.camera, lens.seen(), lens.residuals())
                 save_map(self.maps / f"{views.camera}.png", picture)
         told = {**provenance(), "board": self.board}
         write_rig(merge(rig, lenses, told), self.out, console)
@@ -82,8 +77,8 @@ class Intrinsics:
             yield views
 
     def _watch(self, views: BoardViews, console: Console) -> BoardViews:
-        with open_client(self.connect, self.zenoh) as session:
-            pictures = take_snapshots(session, self.arena, views.camera, self.seconds)
+        with self.server.open() as session:
+            pictures = take_snapshots(session, self.server.arena, views.camera, self.seconds)
             with Live(console=console, transient=True) as live:
                 say(console, show_board(views, pictures, self.model, live.update))
         return views

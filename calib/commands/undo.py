@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`calib undo`: the rig before the last calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
 
+from calib.commands.connection import Connection, Server
 from calib.commands.output import say
 from calib.history import undo
-from calib.live import publish
 from calib.rig import load_rig
-from camera_node.network import open_client
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,12 +20,7 @@ class Undo:
     """The rig to bring back; earlier ones lie beside it as rig.1.yaml, rig.2.yaml, ..."""
     live: bool = False
     """Hand it to the running server too."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name in the keys."""
-    zenoh: Path | None = None
-    """A Zenoh configuration of your own."""
+    server: Server = field(default_factory=Connection)
 
     def execute(self, console: Console) -> None:
         """Swap the files, and publish what is then in force."""
@@ -38,6 +32,4 @@ class Undo:
             f"{self.rig} is again {kept.name}, made at {date}; the undone one is kept as {undone.name}",
         )
         if self.live:
-            with open_client(self.connect, self.zenoh) as session:
-                if not publish(session, self.arena, rig):
-                    say(console, f"warning: nobody took the rig; give the server {self.rig}")
+            self.server.hand_over(rig, self.rig, console)

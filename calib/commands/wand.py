@@ -2,7 +2,7 @@
 """`calib wand`: where cameras stand, by a wand waved before them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -10,17 +10,17 @@ from rich.console import Console
 from rich.live import Live
 from zenoh import Session
 
-from calib.commands.output import check_folder, provenance, say, write_rig
+from calib.commands.connection import Connection, Server
+from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
-from calib.live import publish
-from calib.report import clocks_as_dict, print_report, show_progress
+from calib.live import Heard
+from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.waving import wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
-from camera_node.network import open_client
 
 MOST_S = 180.0  # that a wave may last when it ends by itself
 
@@ -41,18 +41,15 @@ class Wand:
     """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
     live: bool = False
     """Or subscribe to the running cameras, and hand them the result."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name in the keys."""
     seconds: float | None = None
     """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
     only: str | None = None
     """Place this camera alone, anew, by a short wave; the rig's others stay where they are."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels: where errors are foretold."""
-    zenoh: Path | None = None
-    """A Zenoh configuration of your own."""
+    maps: Path | None = None
+    """A folder for pictures: each camera's residuals and where to wave next, and the errors to expect."""
+    server: Server = field(default_factory=Connection)
 
     def execute(self, console: Console) -> None:
         """Nothing is written unless two cameras or more were placed."""
@@ -77,8 +74,10 @@ class Wand:
             result = calibrate(rig, wand, messages)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
+        if self.maps is not None:
+            save_maps(self.maps, result, trust, console)
         told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
-        told |= _of_lenses(rig)
+        told |= {**lenses_as_dict(result), **_of_lenses(rig)}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed
@@ -103,24 +102,20 @@ class Wand:
         return placed
 
     def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
-        with open_client(self.connect, self.zenoh) as session:
-            messages, bad, why = self._wave(session, rig, wand, console)
-            say(console, f"the wave ended: {why}")
-            if bad:
-                say(console, f"warning: {bad} messages were none and were skipped")
-            placed = self._place(rig, wand, messages, console)
-            if not publish(session, self.arena, placed):
-                say(console, "warning: nobody took the rig; give the server the file that was written")
+        with self.server.open() as session:
+            heard, why = self._wave(session, rig, wand, console)
+        say(console, f"the wave ended: {why}")
+        if heard.bad:
+            say(console, f"warning: {heard.bad} messages were none and were skipped")
+        self.server.hand_over(self._place(rig, wand, heard.messages, console), self.out, console)
 
-    def _wave(
-        self, session: Session, rig: Rig, wand: Body, console: Console
-    ) -> tuple[list[Detections], int, str]:
+    def _wave(self, session: Session, rig: Rig, wand: Body, console: Console) -> tuple[Heard, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
         trials = self.seconds is None or console.is_terminal
         with Live(console=console, transient=True) as live:
             return wave(
                 session,
-                self.arena,
+                self.server.arena,
                 rig,
                 wand,
                 self.seconds or MOST_S,

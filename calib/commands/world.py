@@ -2,7 +2,7 @@
 """`calib world`: ground plane, origin and axes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
 from calib.errors import CalibrationError
 from calib.landmarks import is_line, locate_places, still_roundels
-from calib.live import collect, publish
+from calib.live import collect
 from calib.rig import Rig, load_rig
 from calib.world import align, align_places, read_positions, stand
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
-from camera_node.network import open_client
 
 Places = Mapping[str, NDArray[np.float64]]
 
@@ -52,14 +52,9 @@ class World:
     """Or take centres from a CSV: t_ns,camera,u,v[,marker]; a marker may be a point's name."""
     live: bool = False
     """Or look through the running cameras, and hand them the result."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name in the keys."""
     seconds: float = 3.0
     """How long to look through running cameras."""
-    zenoh: Path | None = None
-    """A Zenoh configuration of your own."""
+    server: Server = field(default_factory=Connection)
 
     def execute(self, console: Console) -> None:
         """Nothing is written unless the world is fixed."""
@@ -76,9 +71,7 @@ class World:
         moved = msgspec.structs.replace(moved, calibration={**moved.calibration, "world": world})
         write_rig(moved, self.out, console)
         if self.live:
-            with open_client(self.connect, self.zenoh) as session:
-                if not publish(session, self.arena, moved):
-                    say(console, f"warning: nobody took the rig; give the server {self.out}")
+            self.server.hand_over(moved, self.out, console)
 
     def _move(self, rig: Rig, console: Console) -> tuple[Rig, dict[str, float]]:
         if self.positions is not None:
@@ -107,8 +100,8 @@ class World:
             return read_recording(rig, self.frames, self.observations, body)
         if not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
-        with open_client(self.connect, self.zenoh) as session:
-            return collect(session, self.arena, self.seconds, "looking")[0]
+        with self.server.open() as session:
+            return collect(session, self.server.arena, self.seconds, "looking").messages
 
 
 def _markers(body: Body) -> dict[str, NDArray[np.float64]]:

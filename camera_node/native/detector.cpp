@@ -7,6 +7,7 @@
 
 #include "circles.hpp"
 #include "gates.hpp"
+#include "moving.hpp"
 #include "surface.hpp"
 
 namespace roundel {
@@ -22,13 +23,14 @@ constexpr double kNoiseSpan = 8.5;     // standard deviations
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear();
+    found_.clear(), lost_.clear();
     postponed_ = 0;
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
     follow(image);
     search(image);
+    follow_smeared(image);
     tracks_.update(found_);
     update_theta();
     return found_;
@@ -36,7 +38,21 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
 
 void Detector::follow(const ImageView& image) {
     for (const auto& expected : tracks_.expect())
-        accept(image, fit_circles(image, expected.seed, settings_), expected.track);
+        if (!accept(image, fit_circles(image, expected.seed, settings_), expected.track))
+            lost_.push_back(expected);
+}
+
+/// Those that were in the last frame, and are not to be seen sharp in this one.
+void Detector::follow_smeared(const ImageView& image) {
+    for (const auto& expected : lost_) {
+        const auto is_it = [&](const Roundel& r) {
+            const double apart =
+                std::hypot(r.fit.outer.x - double(expected.seed.x), r.fit.outer.y - double(expected.seed.y));
+            return r.track < 0 && apart < r.fit.outer.major;
+        };
+        if (std::none_of(found_.begin(), found_.end(), is_it))
+            keep(image, follow_moving(image, expected, settings_, noise_), expected.track);
+    }
 }
 
 /// The rows of the image that this frame's search looks at.
@@ -70,22 +86,27 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
     const std::vector<Seed>& seeds = chords_.run(band, threshold);
     const size_t n = seeds.size(), first = size_t(begin_at_ * double(n));
     size_t looked_at = 0;
-    for (int fits = 0; looked_at < n && fits < kMaxFits; ++looked_at) {
+    for (fits_ = 0; looked_at < n && fits_ < kMaxFits; ++looked_at) {
         Seed seed = seeds[(first + looked_at) % n];
         seed.y += float(top);
         if (claims_.cover_quickly(double(seed.x), double(seed.y))) continue;
-        fits += accept(image, fit_circles(image, seed, settings_), -1);
+        accept(image, fit_circles(image, seed, settings_), -1);
     }
     postponed_ = int(n - looked_at);
     begin_at_ = postponed_ ? double((first + looked_at) % n) / double(n) : 0;
 }
 
-/// Fits, tests and keeps a roundel, unless it was found before; returns whether a fit was needed.
+/// Fits, tests and keeps a roundel, unless it was found before; whether it is there.
 bool Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
-    if (!start || found_.size() >= kMaxRoundels || claims_.cover(start->outer.x, start->outer.y))
-        return false;
-    const auto fit = fit_roundel(image, *start, settings_, noise_, track >= 0);
-    if (!fit || is_bullseye(image, *fit)) return true;
+    if (!start) return false;
+    if (claims_.cover(start->outer.x, start->outer.y)) return true;
+    ++fits_;
+    return keep(image, fit_roundel(image, *start, settings_, noise_, track >= 0), track);
+}
+
+bool Detector::keep(const ImageView& image, const std::optional<Fit>& fit, int track) {
+    if (!fit || found_.size() >= kMaxRoundels || claims_.cover(fit->outer.x, fit->outer.y)) return false;
+    if (is_bullseye(image, *fit)) return false;
     claims_.add(fit->outer);
     found_.push_back({*fit, track});
     return true;

@@ -29,8 +29,10 @@ class Detector {
   private:
     void follow(const ImageView& image);
     void search(const ImageView& image);
+    void follow_smeared(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
     bool accept(const ImageView& image, const std::optional<Start>& start, int track);
+    bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
     ImageView next_band(const ImageView& image, int& top);
     void update_theta();
 
@@ -40,10 +42,11 @@ class Detector {
     Tracks tracks_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
+    std::vector<Tracks::Expected> lost_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     double begin_at_ = 0;     // share of the places to look at, where a frame had too many
-    int postponed_ = 0;
+    int fits_ = 0, postponed_ = 0;
     std::mutex mutex_;
 };
 

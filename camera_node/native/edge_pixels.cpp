@@ -3,99 +3,140 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <numbers>
+
+#include "simd.hpp"
 
 namespace roundel {
 
 namespace {
 
 constexpr int kMinRows = 10;  // fewer do not tell an ellipse
+constexpr int kEdges = 3;
+constexpr int kWideRows = 3;  // one in so many
+constexpr int kNowhere = INT32_MIN / 2;
 
-/// An ellipse, to be cut by rows.
-class Outline {
+double square(double x) { return x * x; }
+
+ROUNDEL_INLINE Bits floor_of(const Lanes& x) {
+    const Bits near = __builtin_convertvector(x, Bits);
+    return near + (__builtin_convertvector(near, Lanes) > x);  // a comparison that is true is -1
+}
+
+/// What lies within a distance of the edges, card's, outer and inner, as ellipses to be cut by rows: lanes 0
+/// to 2 are those around the edges, lanes 4 to 6 the holes within them. Other lanes are empty.
+class Strips {
   public:
-    Outline() = default;
-    /// The ellipse `e` with both half axes longer by `more`; nothing is left of it where one vanishes.
-    Outline(const CircleImage& e, double more) : x_(e.x), y_(e.y) {
-        const Eigen axes = eigen(e.shape);
-        const double a = std::sqrt(axes.first) + more, b = std::sqrt(std::max(axes.second, 0.0)) + more;
-        if (b <= 0) return;
-        const double c = std::cos(axes.angle), s = std::sin(axes.angle);
-        const double yy = a * a * s * s + b * b * c * c;
-        height_ = std::sqrt(yy), width_ = a * b / height_, lean_ = (a * a - b * b) * c * s / yy;
+    Strips(const Parameters& p, double distance, bool card) {
+        for (int k = card ? 0 : 1; k < kEdges; ++k) {
+            const CircleImage e = circle_image(p, k == 0 ? p[kCard] : k == 1 ? 1 : p[kRatio]);
+            set(k, e, distance), set(4 + k, e, -distance);
+            area_ += 2 * distance * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
+            const double whole = std::numbers::pi * square(std::sqrt(e.shape.xx + e.shape.yy) + distance);
+            most_ = std::max(most_, whole);
+        }
     }
-    double top() const { return y_ - height_; }
-    double bottom() const { return y_ + height_; }
+    double area() const { return std::min(area_, most_); }  // about
+    double top() const { return top_; }
+    double bottom() const { return bottom_; }
+
     /// Columns [begin, end) of row y that lie inside.
-    struct Span {
-        int begin, end;
+    struct Spans {
+        Bits begin, end;
+        bool has(int k) const { return begin[k] < end[k]; }
     };
-    Span cut(double y) const {
-        const double t = (y - y_) / height_, left = 1 - t * t;
-        if (!(height_ > 0) || left <= 0) return {0, 0};
-        const double middle = x_ + lean_ * (y - y_), half = width_ * std::sqrt(left);
-        return {int(std::ceil(middle - half)), int(std::floor(middle + half)) + 1};
+    ROUNDEL_INLINE Spans cut(float y) const {
+        const Lanes dy = y - y_, t = dy * per_height_, left = 1.0f - t * t;
+        const Bits inside = left > 1e-6f;
+        const Lanes share = inside ? left : all(1), half = width_ * share * inverse_sqrt(share);
+        const Lanes middle = x_ + lean_ * dy;
+        return {inside ? -floor_of(half - middle) : Bits{} + kNowhere,
+                inside ? floor_of(middle + half) + 1 : Bits{} + kNowhere};
     }
 
   private:
-    double x_ = 0, y_ = 0, height_ = 0, width_ = 0, lean_ = 0;
-};
-
-/// The bands along the edges, from the outside in.
-struct Bands {
-    Outline from[3], to[3];
-    double area;  // about
-};
-
-Bands bands(const Parameters& p, double band) {
-    Bands b{};
-    const double r[3] = {p[kCard], 1, p[kRatio]};
-    for (int k = 0; k < 3; ++k) {
-        const CircleImage e = circle_image(p, r[k]);
-        b.from[k] = Outline(e, band), b.to[k] = Outline(e, -band);
-        b.area += 2 * band * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
+    /// Lane k is the ellipse `e` with both half axes a and b longer by `more`; empty where one vanishes.
+    void set(int k, const CircleImage& e, double more) {
+        const double ab = std::sqrt(std::max(e.shape.det(), 0.0)),
+                     sum = std::sqrt(e.shape.xx + e.shape.yy + 2 * ab);
+        const double product = ab + more * (sum + more);  // (a + more) (b + more)
+        if (!(product > 0 && sum + 2 * more > 0)) return;
+        // (S^(1/2) + more)^2, where S^(1/2) = (S + a b) / (a + b)
+        const double scale = 1 + 2 * more / sum, yy = scale * e.shape.yy + more * (2 * ab / sum + more);
+        const double height = std::sqrt(yy);
+        x_[k] = float(e.x), y_[k] = float(e.y), per_height_[k] = float(1 / height);
+        width_[k] = float(product / height), lean_[k] = float(scale * e.shape.xy / yy);
+        top_ = std::min(top_, e.y - height), bottom_ = std::max(bottom_, e.y + height);
     }
-    const Symmetric& whole = circle_image(p, p[kCard]).shape;
-    const double a = std::sqrt(whole.xx + whole.yy) + band;
-    b.area = std::min(b.area, std::numbers::pi * a * a);
-    return b;
+
+    Lanes x_{}, y_{}, per_height_ = all(1e6f), width_{}, lean_{};
+    double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
+};
+
+/// Eight grey levels, of which `left` are in the image.
+ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
+    typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
+    Bytes seen{};
+    if (left >= kLanes)
+        std::memcpy(&seen, from, sizeof seen);
+    else
+        for (int i = 0; i < left; ++i) seen[i] = from[i];
+    return __builtin_convertvector(__builtin_convertvector(seen, Bits), Lanes);
 }
 
-/// Appends columns [begin, end) of row y, as far as they are inside the image.
-void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
+/// Appends columns [begin, end) of row y, as far as they are inside the image; eight at a time, where what is
+/// written beyond the end is overwritten by what comes next.
+ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
     to.expected += std::max(0, end - begin);
     if (y < 0 || y >= image.height) return;
     begin = std::max(begin, 0), end = std::min({end, image.width, begin + EdgePixels::kMax - to.used});
     const uint8_t* row = image.row(y);
-    float *x = to.x + to.used - begin, *level = to.level + to.used - begin;
-    for (int u = begin; u < end; ++u) x[u] = float(u - to.origin_x), level[u] = float(row[u]);
-    std::fill(to.y + to.used, to.y + to.used + std::max(0, end - begin), float(y - to.origin_y));
+    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
+    for (int u = begin; u < end; u += kLanes) {
+        const int at = to.used + u - begin;
+        store(to.x + at, float(u - to.origin_x) + kSteps);
+        store(to.y + at, all(float(y - to.origin_y)));
+        store(to.level + at, load_levels(row + u, image.width - u));
+    }
     to.used += std::max(0, end - begin);
 }
 
-/// Appends what row y has of the bands, left to right and each pixel once.
-void append_row(const ImageView& image, int y, const Bands& bands, EdgePixels& to) {
-    Outline::Span from[3], hole[3];
-    for (int k = 0; k < 3; ++k)
-        from[k] = bands.from[k].cut(y - to.origin_y), hole[k] = bands.to[k].cut(y - to.origin_y);
-    int done = INT32_MIN / 2;
-    const auto add = [&](int begin, int end) {
-        append(image, y, std::max(begin, done) + to.origin_x, end + to.origin_x, to);
-        done = std::max(done, end);
-    };
-    for (int k = 0; k < 3; ++k) add(from[k].begin, hole[k].begin < hole[k].end ? hole[k].begin : from[k].end);
-    for (int k = 2; k >= 0; --k)
-        if (hole[k].begin < hole[k].end) add(hole[k].end, from[k].end);
+/// Appends what row y has of the strips, left to right and each pixel once.
+ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& strips, EdgePixels& to) {
+    const Strips::Spans spans = strips.cut(float(y - to.origin_y));
+    int begin[2 * kEdges], end[2 * kEdges];  // left of the middle, then right
+    for (int k = 0; k < kEdges; ++k) {
+        const bool hole = spans.has(4 + k);
+        begin[k] = spans.begin[k], end[k] = hole ? spans.begin[4 + k] : spans.end[k];
+        begin[2 * kEdges - 1 - k] = hole ? spans.end[4 + k] : kNowhere;
+        end[2 * kEdges - 1 - k] = spans.end[k];
+    }
+    int done = kNowhere;
+    for (int k = 0; k < 2 * kEdges; ++k) {
+        const int from = std::max(begin[k], done);
+        if (from < end[k]) append(image, y, from + to.origin_x, end[k] + to.origin_x, to), done = end[k];
+    }
+}
+
+/// Every `step`-th row.
+ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, const Strips& wide, int step,
+                                EdgePixels& to) {
+    const int top = int(std::ceil(wide.top())), bottom = int(std::floor(wide.bottom()));
+    for (int y = top, k = 0; y <= bottom; y += step, ++k)
+        append_row(image, y + to.origin_y, k % kWideRows ? narrow : wide, to);
 }
 
 }  // namespace
 
-int select_pixels(const ImageView& image, const Parameters& p, double band, int limit, EdgePixels& pixels) {
-    const Bands all = bands(p, band);
+int select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+                  EdgePixels& pixels) {
+    const Strips narrow(p, band.narrow, band.card), wide(p, band.wide, band.card);
+    const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
     pixels.used = pixels.expected = 0;
-    const int top = int(std::ceil(all.from[0].top())), bottom = int(std::floor(all.from[0].bottom()));
-    const int step = std::max(1, std::min(int(std::ceil(all.area / limit)), (bottom - top) / kMinRows));
-    for (int y = top; y <= bottom; y += step) append_row(image, y + pixels.origin_y, all, pixels);
+    const int rows = int(wide.bottom() - wide.top());
+    const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
+    append_rows(image, narrow, wide, step, pixels);
     pixels.fill_up();
     return step;
 }

@@ -14,7 +14,7 @@ struct EdgePixels {
     int count = 0;                   // whole lanes
     int used = 0;                    // pixels inside the image
     int expected = 0;                // and outside
-    alignas(4 * kLanes) float x[kMax], y[kMax], level[kMax];
+    alignas(4 * kLanes) float x[kMax + kLanes], y[kMax + kLanes], level[kMax + kLanes];
     /// Ends the columns with whole lanes.
     void fill_up() {
         count = (used + kLanes - 1) / kLanes * kLanes;
@@ -22,8 +22,16 @@ struct EdgePixels {
     }
 };
 
-/// Fills `pixels` by what lies within `band` pixels of the three edges that `p` says, in every n-th row: n is
-/// the least that leaves about `limit` pixels or less, or ten rows. Gives n.
-int select_pixels(const ImageView& image, const Parameters& p, double band, int limit, EdgePixels& pixels);
+/// Which pixels, by their distance from the nearest edge: those within `narrow` in every row, and in every
+/// third one those within `wide`, which tell of the levels.
+struct Band {
+    double narrow, wide;
+    bool card;  // whether the card's edge is one of them
+};
+
+/// Fills `pixels` by the band along the edges that `p` says, in every n-th row: n is the least that leaves
+/// about `limit` pixels or less, or ten rows. Gives n.
+int select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+                  EdgePixels& pixels);
 
 }  // namespace roundel

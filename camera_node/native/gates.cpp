@@ -19,7 +19,13 @@ constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged may be letters
 constexpr double kMostOff = 0.2;  // share of ring and hole that is not as dark or bright as it should be
 
-/// Contrast, ratio and size within their limits, and levels that a camera can give.
+}  // namespace
+
+bool is_as_modelled(const Fit& fit, double noise, double misfit) {
+    const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, 2.5);
+    return fit.edge_residual < std::hypot(1.2 * noise, least * (fit.bright - fit.dark));
+}
+
 bool has_limits(const Fit& fit, const Settings& settings) {
     return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
            fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
@@ -27,12 +33,7 @@ bool has_limits(const Fit& fit, const Settings& settings) {
            fit.outer.major <= settings.max_diameter;
 }
 
-/// Whether the ring's edges are as the model says, but for noise and for what print and lens do to them:
-/// `misfit` of the contrast, and more where large ones are drawn or cut by hand.
-bool is_as_modelled(const Fit& fit, double noise, double misfit) {
-    const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, 2.5);
-    return fit.edge_residual < std::hypot(1.2 * noise, least * (fit.bright - fit.dark));
-}
+namespace {
 
 /// Whether ring and hole are as dark and bright as they should be. The fit looks only near the edges, so it
 /// takes several thin rings for a thick one.

@@ -22,6 +22,7 @@ ROUNDEL_INLINE Lanes load(const float* from) {
     __builtin_memcpy(&v, from, sizeof v);
     return v;
 }
+ROUNDEL_INLINE void store(float* to, const Lanes& v) { __builtin_memcpy(to, &v, sizeof v); }
 ROUNDEL_INLINE Lanes magnitude(const Lanes& x) { return Lanes(Bits(x) & 0x7fffffff); }
 
 /// 1 / sqrt(x) of x > 0 to 5e-6 of itself: a first guess by halving the exponent, and two of Newton's steps.
@@ -48,17 +49,22 @@ struct Normal {
     Lanes tail, density;
 };
 
-/// Abramowitz and Stegun 7.1.25, which is within 2.5e-5 of erf: the tail is within 1.3e-5.
+/// The tail over the density, Mills' ratio, by the polynomial of fifth degree that is nearest on [0, 5]: the
+/// tail is within 6.3e-5. A division would take longer.
 ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
-    const Lanes density = exp_negative(-0.5f * t * t);
-    const Lanes u = 1.0f / (1.0f + 0.33267f * magnitude(t));  // 0.47047 / sqrt(2)
-    const Lanes tail = density * u * (0.1740121f + u * (-0.0479399f + u * 0.3739278f));
+    const Lanes density = exp_negative(-0.5f * t * t), far = magnitude(t), u = far < 5.0f ? far : all(5);
+    const Lanes uu = u * u;
+    const Lanes mills = (0.49993733f - 0.39656799f * u) +
+                        uu * ((0.23543442f - 0.099663184f * u) + uu * (0.025280868f - 0.0027397065f * u));
+    const Lanes tail = density * mills;
     return {t > 0.0f ? tail : 1.0f - tail, density};
 }
 
 /// Sum in an order that all machines keep.
 ROUNDEL_INLINE float sum(const Lanes& v) {
-    return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]));
+    typedef float Half __attribute__((vector_size(2 * kLanes)));
+    const Half h = __builtin_shufflevector(v, v, 0, 1, 2, 3) + __builtin_shufflevector(v, v, 4, 5, 6, 7);
+    return (h[0] + h[2]) + (h[1] + h[3]);
 }
 
 }  // namespace roundel

@@ -11,7 +11,8 @@ namespace {
 
 constexpr int kColumns = kCount + 1;  // the gradient and the residual
 constexpr int kHigh = 2, kWide = 4;   // products of so many columns stay in registers
-constexpr int kSample = 192;
+constexpr int kSample = 24;           // lanes
+constexpr int kHalvings = 10;         // of 256 grey levels
 
 using Columns = Lanes[kColumns][kChunk];
 using Gram = Lanes[kColumns][kColumns];
@@ -93,6 +94,38 @@ ROUNDEL_CLONES void add_leftover(const Gradient* chunks, int lanes, const float*
         }
 }
 
+ROUNDEL_INLINE int count_below(const Lanes* values, int n, float limit) {
+    Bits below{};
+    for (int k = 0; k < n; ++k) below -= values[k] < limit;
+    int count = 0;
+    for (int i = 0; i < kLanes; ++i) count += below[i];
+    return count;
+}
+
+/// As Linearisation::median_residual, by halving an interval.
+ROUNDEL_CLONES float median_of(const Gradient* chunks, int lanes) {
+    Lanes residuals[kSample], slopes[kSample], most{};
+    const int step = (lanes + kSample - 1) / kSample;
+    int n = 0;
+    for (int k = 0; k < lanes; k += step, ++n) {
+        const Gradient& at = chunks[k / kChunk];
+        residuals[n] = magnitude(at.residual[k % kChunk]), slopes[n] = magnitude(at.ring[k % kChunk]);
+        const Lanes slope = residuals[n] < kAbsent ? slopes[n] : all(0);
+        most = slope > most ? slope : most;
+    }
+    float steep = 1e-3f;
+    for (int i = 0; i < kLanes; ++i) steep = std::max(steep, most[i] / 2);
+    for (int k = 0; k < n; ++k) residuals[k] = slopes[k] > steep ? residuals[k] : all(kAbsent);
+    const int count = count_below(residuals, n, kAbsent);
+    if (count < kLanes) return -1;
+    float low = 0, high = 256;
+    for (int k = 0; k < kHalvings; ++k) {
+        const float middle = (low + high) / 2;
+        (2 * count_below(residuals, n, middle) > count ? high : low) = middle;
+    }
+    return high;
+}
+
 }  // namespace
 
 void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
@@ -100,25 +133,7 @@ void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
     evaluate_all(pixels, Model(p), chunks_);
 }
 
-double Linearisation::median_residual() const {
-    float residuals[kSample], slopes[kSample];
-    const int step = (count_ * kLanes + kSample - 1) / kSample;
-    int n = 0;
-    for (int k = 0; k < count_; k += step)
-        for (int i = 0; i < kLanes; ++i) {
-            const Gradient& at = chunks_[k / kChunk];
-            residuals[n] = std::abs(at.residual[k % kChunk][i]);
-            slopes[n] = std::abs(at.ring[k % kChunk][i]);
-            n += residuals[n] < kAbsent;
-        }
-    const float steep = n > 0 ? *std::max_element(slopes, slopes + n) / 2 : 0;
-    int kept = 0;
-    for (int k = 0; k < n; ++k)
-        if (slopes[k] > steep) residuals[kept++] = residuals[k];
-    if (kept < kLanes) return -1;
-    std::nth_element(residuals, residuals + kept / 2, residuals + kept);
-    return double(residuals[kept / 2]);
-}
+double Linearisation::median_residual() const { return double(median_of(chunks_, count_)); }
 
 NormalEquations Linearisation::accumulate(double scale) const {
     Gram gram{};

@@ -116,7 +116,7 @@ Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, do
     pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
-    select_pixels(image, local, kBand, kPixels, pixels);
+    select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
     const auto [outer, inner] = misfit_by_sector(pixels, local);
     return {widen(outer.beyond(noise, slack), circle_image(local, 1)),
             widen(inner.beyond(noise, slack), circle_image(local, local[kRatio]))};

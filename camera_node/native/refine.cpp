@@ -7,15 +7,19 @@
 #include "cholesky.hpp"
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
+#include "pose_outputs.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2.5;       // pixels on either side of an edge that are used, at the least
-constexpr double kBandBlurs = 2.5;  // blurs, likewise
+constexpr double kNarrow = 1.25,
+                 kNarrowBlurs = 1.5;             // pixels on either side of an edge, at the least; and blurs
+constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
+constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
+constexpr double kConverged = 0.4;         // standard deviations that may be left to go
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
@@ -65,13 +69,14 @@ class Fitter {
 
     bool solve() {
         // Perspective moves the inner edge and the card's from where the start has them.
-        const double unknown = 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select(kBand + unknown, kCoarsePixels)) return false;
+        const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
+        if (!select({wide, wide, true}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card();
         if (!iterate(2)) return false;
-        const double band = std::max(kBand, kBandBlurs * p[kBlur]);
-        if ((step_ > 1 || band > kBand + unknown) && !select(band, EdgePixels::kMax)) return false;
-        return iterate(1);
+        const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
+        const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
+                        card};
+        return select(band, EdgePixels::kMax) && iterate(1);
     }
 
     void learn_print(double ratio);
@@ -81,8 +86,8 @@ class Fitter {
   private:
     PoseCovariance covariance() const;
 
-    bool select(double band, int limit) {
-        step_ = select_pixels(image_, p, band, limit, pixels_);
+    bool select(const Band& band, int limit) {
+        select_pixels(image_, p, band, limit, pixels_);
         if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
     }
@@ -116,7 +121,7 @@ class Fitter {
             const double deviation = noise_ / std::sqrt(equations_.H[kX][kX] + equations_.H[kY][kY]);
             double left = moved;
             for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
-            if (left < 0.2 * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
+            if (left < kConverged * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
         }
         return true;
     }
@@ -174,20 +179,8 @@ class Fitter {
     Leftover left_;
     std::optional<Cholesky<kCount>> factor_;
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
-    int step_ = 1;
     double scale_ = 255, noise_ = 0;
 };
-
-/// By the fit's pose: the outer ellipse's centre e = c - A g, its shape and the disc's own centre less e, to
-/// first order in g.
-std::array<Vector<kPoseCount>, kPoseCount> outputs_by_pose(const Parameters& p) {
-    const double gx = p[kGx], gy = p[kGy];
-    const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
-    std::array<Vector<kPoseCount>, kPoseCount> T{};
-    for (int k = 0; k < kPoseCount; ++k) T[0][k] = -hx[k], T[1][k] = -hy[k], T[5][k] = hx[k], T[6][k] = hy[k];
-    for (int k = 0; k < 5; ++k) T[k][k] += 1;
-    return T;
-}
 
 /// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
 void Fitter::learn_print(double ratio) {
@@ -205,15 +198,9 @@ PoseCovariance Fitter::covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
-    const auto T = outputs_by_pose(p);
-    PoseCovariance half{}, whole{};
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int i = 0; i < kPoseCount; ++i)
-            for (int j = 0; j < kPoseCount; ++j) half[a][j] += T[a][i] * inverse[i][j];
-    for (int a = 0; a < kPoseCount; ++a)
-        for (int b = 0; b < kPoseCount; ++b)
-            for (int j = 0; j < kPoseCount; ++j) whole[a][b] += square(noise_) * half[a][j] * T[b][j];
-    return whole;
+    for (auto& row : inverse)
+        for (double& value : row) value *= square(noise_);
+    return output_covariance(p, inverse);
 }
 
 Fit Fitter::fit() const {

@@ -32,6 +32,8 @@ struct Fit {
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double support;        // share of the ring's edges that is in the image and agrees
     Parameters p;          // as the model has them, in the image's frame
+    double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
+    double noise = 0;                   // of what the fit of a moving one leaves, grey levels
     /// Of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
     Symmetric offset_covariance() const { return {C[5][5], C[5][6], C[6][6]}; }

@@ -117,7 +117,8 @@ class Model {
         for (int k = 0; k < count; ++k) {
             const Lanes over = at.f[k] - r, bow = over * at.bow[k];
             const Lanes distance = over * at.stretch[k] * (1.0f + (bow > -0.5f ? bow : all(-0.5f)));
-            const Lanes bend = at.bend[k] * per_r, narrow = 1.0f / (1.0f + bend * bend);
+            const Lanes bend = at.bend[k] * per_r, bb = bend * bend < 0.5f ? bend * bend : all(0.5f);
+            const Lanes narrow = 1.0f - bb * (1.0f - bb);
             const Lanes shift = blur_ * bend * (1.0f + bend * at.flat[k] * per_r);
             const Normal normal = normal_tail((distance + shift) * per_blur_ * narrow);
             to.inside[k] = normal.tail, to.slope[k] = -peak_ * normal.density * narrow;

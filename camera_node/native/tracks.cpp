@@ -19,7 +19,7 @@ std::vector<Tracks::Expected> Tracks::expect() const {
         if (t.missed) continue;
         const auto x = float(t.fit.outer.x + t.vx), y = float(t.fit.outer.y + t.vy);
         const auto reach = float(t.fit.outer.major);
-        expected.push_back({{x, y, reach, int(t.fit.dark), int(t.fit.bright)}, t.number});
+        expected.push_back({{x, y, reach, int(t.fit.dark), int(t.fit.bright)}, t.number, t.fit, t.vx, t.vy});
     }
     return expected;
 }

@@ -20,6 +20,8 @@ class Tracks {
     struct Expected {
         Seed seed;
         int track;
+        Fit fit;        // of the last frame
+        double vx, vy;  // pixels a frame
     };
     std::vector<Expected> expect() const;
     /// Takes the roundels of a frame. Those without a number (below 0) get that of a track that is expected

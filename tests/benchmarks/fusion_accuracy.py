@@ -55,12 +55,13 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
 
 def instants(load: Load, seconds: float) -> Iterator[Instant]:
     """A load's whole instants, in order."""
-    gathered = Instants(round(1e9 / load.hz))
-    closed: list[Instant] = []
+    gathered, first = Instants(round(1e9 / load.hz)), True
     for frame in load.frames(seconds):
         gathered.add(frame)
-        closed += gathered.take(frame.t_ns)
-    yield from closed[1:]
+        for instant in gathered.take(frame.t_ns):
+            if not first:
+                yield instant
+            first = False
 
 
 class _Told:

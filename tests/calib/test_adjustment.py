@@ -10,12 +10,13 @@ from calib.errors import CalibrationError
 from calib.labelling import label
 from calib.linearisation import Linearisation
 from calib.pairwise import Pairs
-from calib.problem import DRIFT, LENS, OFFSET, POSE
+from calib.problem import DRIFT, LENS, OFFSET, POSE, unobserved
 from calib.rig import Rig
 from calib.sightings import gather
 from calib.trajectory import hermite_rate, interpolate, locate
 from calib.wand import calibrate
 from camera_node.body import Body
+from camera_node.pose import skew
 from tests.calib.synthetic import outlines, record, ring
 from tests.calib.wave import Recorded, Wave
 from tests.calib.wave import record as record_wave
@@ -40,6 +41,21 @@ def test_jacobians_are_those_of_the_residuals():
         there, here = (linear.residuals(state.moved(sign * by, along)) for sign in (1, -1))
         expected = -(there - here) / (2 * step)
         assert J[:, :, parameter] == pytest.approx(expected, abs=1e-3 * np.abs(expected).max() + 1e-6)
+
+
+def test_a_world_that_moves_changes_no_residual():
+    """Cameras moved by `unobserved` and the wand with them: what is left is of second order, 1e-10 of a motion of 1e-5
+    times the 600 px of a radian."""
+    arena = ring(3)
+    result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
+    linear, state = Linearisation(result.adjusted.problem, result.observations), result.adjusted.state
+    by = np.zeros((len(state.cameras), 12))
+    for column, twist in zip(unobserved(state, POSE).T, np.eye(6), strict=True):
+        by[:, :6] = 1e-5 * column.reshape(-1, 6)
+        along = state.motion @ skew(1e-5 * twist[:3]).T
+        along[:, 0] += 1e-5 * twist[3:]
+        moved = state.moved(by, along.reshape(len(along), -1))
+        assert linear.residuals(moved) == pytest.approx(linear.residuals(state), abs=600 * 1e-10 * 10)
 
 
 def test_velocity_is_the_derivative_of_position():

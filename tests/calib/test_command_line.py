@@ -2,11 +2,13 @@
 """`python -m calib` end to end: files in, a rig out; faults are one line and exit code 2."""
 
 import json
+import resource
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,9 +24,9 @@ from tests.calib.test_world import L_FRAME, elsewhere, lie_still
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
 
-def calib(*arguments: object) -> subprocess.CompletedProcess[str]:
+def calib(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "calib", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)
 
 
 @pytest.fixture
@@ -65,6 +67,8 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
         ("wand.yaml", "diameter_m: 0.1\nmarker: [[0,0,0]]\n", "unknown field"),
         ("lenses.yaml", "cameras: {cam0: {time_offset_ms: 1.0}}\n", "no intrinsics"),
         ("lenses.yaml", "cameras: [", "not valid YAML"),
+        ("lenses.yaml", "cameras: {cam0: {}, cam0: {}}\n", "'cam0' is there twice"),
+        ("lenses.yaml", "version: 9\ncameras: {}\n", "of this version of Roundel?"),
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n", "one camera"),
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam9,1,1\n", "'cam9'"),
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam1,1,1\n", "in no frame"),
@@ -86,6 +90,23 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert (tmp_path / "rig.yaml").read_text() == "precious"
 
 
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path, waved: Arena):
+    """A process that may write no file beyond 1000 bytes meets what a full disk does."""
+    (tmp_path / "rig.yaml").write_text("precious")
+    before = sorted(tmp_path.iterdir())
+    done = calib(
+        "wand",
+        *wand_options(tmp_path),
+        "--observations",
+        tmp_path / "observations.csv",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+    )
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "rig.yaml can't be written" in done.stderr
+    assert (tmp_path / "rig.yaml").read_text() == "precious"
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, waved: Arena):
     """The rig of the recording itself: it stands as it says, halves agree, and the figures land in the copy."""
     write_observations(
@@ -94,7 +115,7 @@ def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, wa
     observations = ("--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
     before = (tmp_path / "rig.yaml").read_text()
-    wrote = ("--out", tmp_path / "checked.yaml", "--map", tmp_path / "map.png")
+    wrote = ("--out", tmp_path / "checked.yaml", "--maps", tmp_path / "maps")
     done = calib(
         "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *wrote
     )
@@ -105,7 +126,9 @@ def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, wa
     check = load_rig(tmp_path / "checked.yaml").calibration["check"]
     assert check["halves"]["agree"]
     assert check["expected_mm"]["median"] < 2
-    assert cv2.imread(str(tmp_path / "map.png")) is not None
+    names = {f"{name}.png" for name in (*waved.truth.cameras, "expected")}
+    assert {path.name for path in (tmp_path / "maps").iterdir()} == names
+    assert all(cv2.imread(str(tmp_path / "maps" / name)) is not None for name in names)
 
 
 def test_only_one_camera_is_placed_anew(tmp_path: Path, waved: Arena):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures come out of folders, videos and running cameras, each with a name."""
 
-import socket
 import threading
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,16 +13,9 @@ from calib.footage import find_cameras, read_frames, take_snapshots
 from camera_node.errors import CameraError
 from camera_node.messages import Keys
 from camera_node.network import open_client, open_router
-from camera_node.requests import answering, encode_jpeg, parse_quality
+from camera_node.requests import encode_jpeg, parse_quality, respond
 
 IMAGE = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def test_folders_and_videos_are_found_and_read(tmp_path: Path):
@@ -55,7 +48,7 @@ def test_a_running_camera_is_asked(endpoint: str):
 
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         key = Keys("test").snapshot("north")
-        queryable = router.declare_queryable(key, answering(answer, lambda: None))
+        queryable = router.declare_queryable(key, partial(respond, answer=answer))
         pictures = take_snapshots(client, "test", "north", 20.0)
         (first, image), (second, _) = next(pictures), next(pictures)
         queryable.undeclare()

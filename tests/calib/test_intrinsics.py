@@ -246,7 +246,10 @@ def test_a_running_camera_is_asked_until_it_is_enough():
 def test_the_residual_map_is_a_picture():
     truth = see_through("pinhole")
     views = look(truth, SIDES, 0.2)
-    picture = draw_residuals("cam0", views, adjust_lens(truth, views))
+    residuals = np.concatenate(adjust_lens(truth, views).residuals)
+    picture = draw_residuals(
+        "cam0", truth, np.concatenate([view.pixels for view in views]).astype(float), residuals
+    )
     assert picture.shape == (34 + 900, 1200, 3)
     assert (picture[34:] != picture[-1, -1]).any(axis=2).mean() > 0.01
 

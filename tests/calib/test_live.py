@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Live calibration: detections are collected past bytes that are none, and the rig reaches who listens."""
 
-import socket
 import threading
 
 import pytest
@@ -13,13 +12,6 @@ from calib.rig import dump_rig
 from camera_node.messages import Keys, decode, encode
 from camera_node.network import open_client, open_router
 from tests.calib.synthetic import record, ring
-
-
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def test_collects_and_publishes(endpoint: str):
@@ -43,9 +35,9 @@ def test_collects_and_publishes(endpoint: str):
 
         thread = threading.Thread(target=send)
         thread.start()
-        collected, bad = collect(client, "test", 3.0)
+        heard = collect(client, "test", 3.0, "looking")
         thread.join(10)
-        assert (len(collected), bad) == (len(messages), 1)
+        assert (len(heard.messages), heard.bad) == (len(messages), 1)
         assert publish(client, "test", arena.truth)
         assert arrived.wait(10)
         assert rigs[0].yaml == dump_rig(arena.truth)
@@ -53,4 +45,4 @@ def test_collects_and_publishes(endpoint: str):
 
 def test_silence_is_a_fault_with_advice(endpoint: str):
     with open_client([endpoint]) as client, pytest.raises(CalibrationError, match="no detections on test/"):
-        collect(client, "test", 0.1)
+        collect(client, "test", 0.1, "looking")

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from calib.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.errors import CalibrationError
-from calib.linearisation import PER_CAMERA, POSE, State
 from calib.precision import map_precision
+from calib.problem import PER_CAMERA, POSE, State
 from calib.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
 from calib.trust import GRADES, LIMITS, CameraTrust, Trust, assess, grade
 from calib.wand import Calibration, calibrate
@@ -137,14 +137,15 @@ def judged(name: str, **figures: float) -> CameraTrust:
 )
 def test_the_guilty_camera_is_named(criterion: str, says: str):
     for k, limit in enumerate(LIMITS[criterion]):
-        trust = Trust([judged("good"), judged("bad", **{criterion: 1.01 * limit})], [], 1e-4, None)
+        trust = Trust([judged("good"), judged("bad", **{criterion: 1.01 * limit})], {}, 1e-4, None)
         assert trust.grade == GRADES[k + 1]
         assert f"camera 'bad', {says}" in trust.sentence() or says in trust.sentence()
         assert "'good'" not in trust.sentence()
 
 
 def test_grades_of_the_whole():
-    assert Trust([judged("a")], [], 1e-4, None).sentence() == "grade A: every camera is placed well"
-    assert "camera 'b' has no place" in Trust([judged("a")], ["b"], None, None).sentence()
-    assert "wand's length is 3.00% off" in Trust([judged("a")], [], 0.03, None).sentence()
-    assert Trust([judged("a", pose_px=float("nan"))], [], None, None).grade == "D"
+    assert Trust([judged("a")], {}, 1e-4, None).sentence() == "grade A: every camera is placed well"
+    told = Trust([judged("a")], {"b": "never saw the wand; wave before it"}, None, None).sentence()
+    assert told == "grade D: camera 'b' has no place: never saw the wand; wave before it"
+    assert "wand's length is 3.00% off" in Trust([judged("a")], {}, 0.03, None).sentence()
+    assert Trust([judged("a", pose_px=float("nan"))], {}, None, None).grade == "D"

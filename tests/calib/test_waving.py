@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wave before running cameras tells how far it is, and ends when more would not help."""
 
-import socket
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -11,18 +10,18 @@ import pytest
 import zenoh
 
 from calib.errors import CalibrationError
-from calib.waving import IDLE_S, Progress, Trial, _Wave, progress, thin, wave
+from calib.live import Heard
+from calib.waving import IDLE_S, Progress, Rule, Trial, progress, thin, wave
 from camera_node.messages import Detections, Keys, encode
 from camera_node.network import open_client, open_router
 from tests.calib.synthetic import record, ring
+from tests.conftest import free_port
 
 
 @contextmanager
 def sending(messages: list[Detections]) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
     """A client of a router that publishes messages, and junk, as soon as somebody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     listening = threading.Event()
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         block = zenoh.CongestionControl.BLOCK  # so fast, nothing must be dropped
@@ -43,11 +42,9 @@ def test_it_ends_by_itself():
     """20 s of a wave at 0.02 px, all at once: the first trial says that a pixel's noise is what counts."""
     arena, told = ring(3), []
     with sending(record(arena, 20.0, sigma_px=0.02)) as (client, done):
-        messages, bad, why = wave(
-            client, "test", arena.intrinsics, arena.wand, 90.0, told.append, every_s=1.0
-        )
+        heard, why = wave(client, "test", arena.intrinsics, arena.wand, 90.0, told.append, every_s=1.0)
         done()
-    assert (len(messages), bad) == (600, 1)
+    assert (len(heard.messages), heard.bad) == (600, 1)
     assert why == "more waving would not help"
     assert told[-1].enough
     assert told[-1].trial.expected_mm < 1
@@ -63,7 +60,7 @@ def test_it_is_ended_by_time_or_by_hand():
             ended.set()
 
     with sending(record(arena, 1.0)) as (client, done):
-        why = wave(client, "test", arena.intrinsics, arena.wand, 60.0, tell, ended, trials=False)[2]
+        why = wave(client, "test", arena.intrinsics, arena.wand, 60.0, tell, ended, trials=False)[1]
         done()
         assert why == "ended by hand"
         with pytest.raises(CalibrationError, match="no detections on test/"):
@@ -75,24 +72,24 @@ def test_the_rule():
     good = Trial(strain={"a": 0.3, "b": 0.1}, used={"a": 0.6, "b": 0.9})
     thin_ = Trial(strain=good.strain, used={"a": 0.2, "b": 0.9}, advice={"a": "wave in its left"})
     weak = Trial(strain={"a": 0.4, "b": 0.1}, used=good.used)
-    assert _Wave().judge(good, 10.0)
-    assert not _Wave().judge(weak, 10.0)  # (1 + 0.4^2)^1/2 = 1.077
-    state = _Wave()
-    assert not state.judge(thin_, 10.0)
-    assert not state.judge(thin_, 10.0 + IDLE_S)
-    assert state.judge(thin_, 10.1 + IDLE_S)
-    missing = Trial(strain=good.strain, used=good.used, unplaced=("c",))
-    assert not state.judge(missing, 99.0)
-    state.frames = Counter({"a": 1, "b": 1, "c": 1})
+    assert Rule().judge(good, 10.0)
+    assert not Rule().judge(weak, 10.0)  # (1 + 0.4^2)^1/2 = 1.077
+    rule = Rule()
+    assert not rule.judge(thin_, 10.0)
+    assert not rule.judge(thin_, 10.0 + IDLE_S)
+    assert rule.judge(thin_, 10.1 + IDLE_S)
+    missing = Trial(strain=good.strain, used=good.used, unplaced={"c": "never saw the wand; wave before it"})
+    assert not rule.judge(missing, 99.0)
+    heard = Heard(frames=Counter({"a": 1, "b": 1, "c": 1}))
     advice = [
-        progress(state, 5.0, trial, False).advice
+        progress(heard, 5.0, trial, False).advice
         for trial in (None, thin_, weak, missing, Trial("it failed"))
     ]
     assert advice == [
         "wave the wand where two cameras or more see it",
         "a: wave in its left",
         "go on, most before 'a'",
-        "wave where 'c' and another camera see the wand",
+        "'c' has no place yet: never saw the wand; wave before it",
         "it failed",
     ]
 

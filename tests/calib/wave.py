@@ -26,7 +26,8 @@ EPOCH_S = 1_000.0
 @dataclass(frozen=True, kw_only=True)
 class Wave:
     """What is recorded. `offset_ms` bounds the clocks' differences, `drift_ppm` their rates'; without sizes, centres
-    are the discs' own, not their ellipses'."""
+    are the discs' own, not their ellipses'. Cameras stand on an `arc` of the ring, see the wand from behind too if it
+    has `both_sides`, expose their rows one after the other over `rolling_ms`, and stamps jitter by `jitter_ms`."""
 
     cameras: int = 8
     seconds: float = 60.0
@@ -41,6 +42,10 @@ class Wave:
     sized: bool = True
     speed: float = 1.0
     radius_m: float = 3.2
+    arc: float = 1.0
+    both_sides: bool = False
+    rolling_ms: float = 0.0
+    jitter_ms: float = 0.0
     wand: Body = field(default_factory=lambda: WAND)
     seed: int = 0
 
@@ -92,7 +97,7 @@ def surround(wave: Wave, rng: np.random.Generator) -> Rig:
     """Cameras of 1280 x 800 on a ring, looking inwards, with distorted lenses and clocks apart."""
     cameras = {}
     for k in range(wave.cameras):
-        turn = 2 * np.pi * (k + 0.3 * rng.uniform(-1, 1)) / wave.cameras
+        turn = 2 * np.pi * wave.arc * (k + 0.3 * rng.uniform(-1, 1)) / wave.cameras
         at = [wave.radius_m * np.cos(turn), wave.radius_m * np.sin(turn), rng.uniform(2.2, 2.9)]
         focal = rng.uniform(760, 900)
         cameras[f"cam{k:02}"] = Camera(
@@ -120,6 +125,7 @@ def record(wave: Wave) -> Recorded:
         t_s = np.arange(int(wave.seconds * wave.rate_hz)) / wave.rate_hz + phase
         rate = 1 + drift[name] * 1e-6
         stamp_s = wave.seconds / 2 + (t_s - wave.seconds / 2 - camera.time_offset_ms * 1e-3) / rate
+        stamp_s = stamp_s + 1e-3 * wave.jitter_ms * rng.standard_normal(len(t_s))
         messages += _film(name, camera, wave, hand, t_s, stamp_s, rng)
     return Recorded(truth, drift, sorted(messages, key=lambda message: (message.t_ns, message.camera)))
 
@@ -127,18 +133,18 @@ def record(wave: Wave) -> Recorded:
 def _film(
     name: str, camera: Camera, wave: Wave, hand: Hand, t_s: Array, stamp_s: Array, rng: np.random.Generator
 ) -> list[Detections]:
-    R, place = hand.pose(t_s)
     count = len(wave.wand.markers)
-    world = np.einsum("nij,mj->nmi", R, wave.wand.points) + place[:, None]
-    T = invert(camera.matrix())
-    points = world @ T[:3, :3].T + T[:3, 3]
-    normal = np.repeat((R[:, :, 2] @ T[:3, :3].T)[:, None], count, axis=1)
-    uv, axes, angle = outlines(camera, points.reshape(-1, 3), normal.reshape(-1, 3), wave.wand.diameter_m / 2)
-    cosine = -(points * normal).sum(axis=2).ravel() / np.linalg.norm(points, axis=2).ravel()
+    points, normal = _place(camera, wave, hand, np.repeat(t_s, count))
+    if wave.rolling_ms:
+        row = np.nan_to_num(camera.project(points)[:, 1] / camera.height - 0.5)
+        points, normal = _place(camera, wave, hand, np.repeat(t_s, count) + 1e-3 * wave.rolling_ms * row)
+    uv, axes, angle = outlines(camera, points, normal, wave.wand.diameter_m / 2)
+    cosine = -(points * normal).sum(axis=1) / np.linalg.norm(points, axis=1)
+    cosine = np.abs(cosine) if wave.both_sides else cosine
     inside = ((uv > 20) & (uv < [camera.width - 20, camera.height - 20])).all(axis=1)
-    seen = inside & (cosine > 0.3) & (rng.random(len(uv)) >= wave.missing)
+    seen = inside & (cosine > 0.3 * wave.sized) & (rng.random(len(uv)) >= wave.missing)
     if not wave.sized:
-        uv = camera.project(points.reshape(-1, 3))
+        uv = camera.project(points)
     uv = uv + wave.sigma_px * rng.standard_normal(uv.shape)
     axes = axes + 2 * wave.sigma_px * rng.standard_normal(axes.shape)
     gross = rng.random(len(uv)) < wave.outliers
@@ -154,6 +160,15 @@ def _film(
         header = {"seq": k, "t_ns": stamp_ns, "width": camera.width, "height": camera.height}
         messages.append(Detections.pack(columns, camera=name, **header))
     return messages
+
+
+def _place(camera: Camera, wave: Wave, hand: Hand, t_s: Array) -> tuple[Array, Array]:
+    """Markers (n, 3), one after the other, at their times (n,), and their normals (n, 3); camera's frame."""
+    R, place = hand.pose(t_s)
+    local = np.tile(wave.wand.points, (len(t_s) // len(wave.wand.markers), 1))
+    T = invert(camera.matrix())
+    world = np.einsum("nij,nj->ni", R, local) + place
+    return world @ T[:3, :3].T + T[:3, 3], R[:, :, 2] @ T[:3, :3].T
 
 
 def _with_sizes(roundels: Roundels, axes: Array, angle: Array) -> Roundels:

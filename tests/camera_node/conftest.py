@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Zenoh routers on loopback, and waiting with a deadline."""
 
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ import zenoh
 
 from camera_node.errors import NetworkError
 from camera_node.network import open_client, open_router
+from tests.conftest import free_port
 
 DEADLINE_S = 15.0  # generous: a loaded machine; nothing waits for it unless a test fails
 
@@ -72,12 +72,6 @@ class Network:
     def close(self) -> None:
         for session in reversed(self._sessions):
             session.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from camera_node.errors import ConfigError
         ("diameter_m: -1", "diameter"),
         ("{}", "diameter_m"),
         ("[1, 2", "not valid YAML"),
+        ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' is there twice, in lines 1 and 2"),
         ("", "object"),
         ("a: \xff\x00", "YAML"),
         ("diameter_m: 1\nmarkers: [[.nan, 0, 0]]", "finite"),

@@ -5,13 +5,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from camera_node.pose import (
     Pose,
+    adjoint,
     invert,
     look_at,
     rotation_from_vector,
     rotation_from_wxyz,
+    skew,
     wxyz_from_rotation,
 )
 
@@ -71,3 +74,16 @@ def test_a_camera_that_looks_straight_down_has_no_upright():
 def test_impossible_poses_are_refused(pose: tuple):
     with pytest.raises(ValueError, match=r"zero|finite"):
         Pose(*pose)
+
+
+@given(poses, st.tuples(*[st.floats(-0.5, 0.5)] * 3), st.tuples(coordinate, coordinate, coordinate))
+def test_the_adjoint_carries_a_twist_through_a_pose(
+    pose: Pose, turn: tuple[float, ...], shift: tuple[float, ...]
+):
+    """T Exp(xi) = Exp(Ad xi) T, by the exponential of 4x4 matrices as SciPy computes it."""
+    T, xi = pose.matrix(), np.array([*turn, *shift])
+    np.testing.assert_allclose(T @ expm(_hat(xi)), expm(_hat(adjoint(T) @ xi)) @ T, atol=1e4 * EPS)
+
+
+def _hat(xi: np.ndarray) -> np.ndarray:
+    return np.block([[skew(xi[:3]), xi[3:, None]], [np.zeros((1, 4))]])

@@ -96,7 +96,7 @@ def test_a_recording_by_another_renderer(shared_data, tmp_path):
         frames=folder / "robots",
     )
     with (tmp_path / "poses.csv").open() as file:
-        rows = settled(list(csv.DictReader(file)))
+        rows = [row for row in csv.DictReader(file) if row["state"] == "tracked"]
     for robot, poses in truth["robots"]["poses_at_stamps_of_cam0"].items():
         mine = np.array(
             [[row[k] for k in ("t_ns", "x", "y", "z")] for row in rows if row["robot"] == robot], float
@@ -108,17 +108,6 @@ def test_a_recording_by_another_renderer(shared_data, tmp_path):
         rms = np.sqrt(((mine[inside, 1:] - true) ** 2).sum(1).mean())
         assert len(mine) > 20
         assert rms < 1e-3
-
-
-def settled(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Poses by two cameras of robots tracked for three instants: before, free-running cameras don't know a speed."""
-    run: dict[str, int] = {}
-    kept = []
-    for row in rows:
-        run[row["robot"]] = run.get(row["robot"], 0) + 1 if row["state"] == "tracked" else 0
-        if run[row["robot"]] > 3 and int(row["n_cameras"]) > 1:
-            kept.append(row)
-    return kept
 
 
 def _camera(entry: dict) -> Camera:

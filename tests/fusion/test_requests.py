@@ -48,7 +48,7 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
 def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
     twin = msgspec.structs.replace(ARENA.robots["a"], start_m=None)
     faults = {
-        b"\x00\xff": "no request for robots",
+        b"\x00\xff": "no RobotsRequest",
         b'{"colour": 1}': "colour",
         encode(RobotsRequest(remove=("b",))): "there is no robot 'b'",
         encode(RobotsRequest(define={"b/c": WIDE})): "can't name a robot",
@@ -67,7 +67,7 @@ def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
     with serving(settings) as (server, client):
         assert "nothing to undo" in ask(client, undo_key("test"))[1]
         moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
-        server._messages.put(lambda: server.calibration.correct("cam1", moved))
+        server.link.put(lambda: server.calibration.correct("cam1", moved))
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
         reply, _ = ask(client, undo_key("test"))
         assert reply is not None

@@ -2,7 +2,6 @@
 """The live server and its client over Zenoh on loopback."""
 
 import asyncio
-import socket
 import subprocess
 import sys
 import threading
@@ -23,17 +22,12 @@ from fusion.client import Arena as Client
 from fusion.config import ArenaConfig
 from fusion.server import Server
 from fusion.tracker import Limits
+from tests.conftest import free_port
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
@@ -44,7 +38,7 @@ def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
     rig = str(folder / "rig.yaml") if with_rig else None
     return ArenaConfig(
         arena="test",
-        listen=(free_endpoint(),),
+        listen=(f"tcp/127.0.0.1:{free_port()}",),
         rig=rig,
         robots=str(folder / "robots.yaml"),
         limits=Limits(lateness_ms=5000),  # frames are sent in one burst: every instant waits to be complete
@@ -122,6 +116,28 @@ def test_what_is_no_detection_is_counted_and_skipped(tmp_path):
             "wrong image size": 1,
         }
         until(lambda: status.next().faults == expected)
+
+
+def test_an_instant_without_a_solution_costs_the_robots_but_not_the_server(tmp_path):
+    with serving(config(tmp_path)) as (server, client):
+        send(server, live(ARENA.messages(12)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        assert server._tracker is not None
+        tracker = server._tracker
+        server.link.put(lambda: tracker.states.P.fill(np.nan))
+        status = client.status(DEADLINE_S)
+        send(server, live(ARENA.messages(12), ago_ns=5 * 10**8))
+        until(lambda: status.next().faults == {"instant that could not be solved": 1})
+        send(server, live(ARENA.messages(12), ago_ns=4 * 10**8))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+
+
+def test_a_clock_that_is_set_back_begins_everything_anew(tmp_path, caplog):
+    with serving(config(tmp_path)) as (server, _):
+        before = server._tracker
+        server.link.put(lambda: setattr(server, "_now_ns", time.time_ns() + 3600 * 10**9))
+        until(lambda: server._tracker is not before)
+    assert "clock was set back" in caplog.text
 
 
 def test_a_calibration_that_arrives_is_applied_and_a_bad_one_is_not(tmp_path):

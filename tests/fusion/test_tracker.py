@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Properties of tracking: exact without noise, honest with it, nobody swapped, nothing guessed."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -99,6 +101,33 @@ def test_a_hidden_robot_coasts_is_lost_and_comes_back(run_arena):
     grown = [np.trace(p.covariance_matrix[3:6, 3:6]) for p in lost]
     assert (np.diff(grown) > 0).all()
     assert np.abs(errors(arena, poses("a")[-5:])[:, 3:]).max() < 3e-3
+
+
+@pytest.mark.parametrize("cameras", [2, 4])
+def test_covariance_is_honest_from_the_first_instant_on(cameras):
+    """Of a robot that was just found, and of one found again: its speed is not known, so that free-running cameras
+    know its place to millimetres only, and say so. Chi-square with 6 degrees, mean 6 +- 4 sqrt(12 / 20)."""
+    squares = []
+    for seed in range(10):
+        arena = Arena(
+            {"a": TRIANGLE},
+            {"a": MOVING},
+            sigma_px=0.1,
+            seed=seed,
+            hidden=lambda robot, marker, t: 0.2 < t < 0.6,
+        )
+        frames = [f for f in arena.frames(26) if cameras == 4 or f.camera in ("cam0", "cam2")]
+        poses = [pose for fused in fuse(arena, frames, TIGHT) for pose in fused.poses]
+        first = [
+            b
+            for a, b in pairwise([None, *poses])
+            if b.state == "tracked" and (a is None or a.state == "lost")
+        ]
+        assert len(first) == 2
+        for pose in first:
+            e, P = errors(arena, [pose])[0], pose.covariance_matrix[:6, :6]
+            squares.append(e @ np.linalg.solve(P, e))
+    assert np.mean(squares) == pytest.approx(6, abs=4 * np.sqrt(12 / 20))
 
 
 def test_two_visible_markers_keep_a_constellation_tracked(run_arena):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """An arena that a test plays by hand: a real Zenoh router on loopback, and real messages."""
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 
@@ -17,7 +16,9 @@ from camera_node.network import open_client, open_router
 from camera_node.pose import Pose, look_at
 from camera_node.roundels import Roundels
 from fusion.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, State
+from tests.conftest import free_port
 from web.feed import Feed
+from web.subscription import Subscription
 
 DEADLINE_S = 20.0
 
@@ -30,17 +31,13 @@ def wait_for(condition: Callable[[], object], deadline_s: float = DEADLINE_S) ->
         time.sleep(0.01)
 
 
-class Played:
-    """What cameras and server of the arena "test" would publish."""
+class Said:
+    """What cameras and server of the arena "test" would publish, to wherever `put` carries it."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
-        self.keys = Keys("test")
-        self.session = open_router([endpoint])
-        self.rig_queries = 0
+    keys = Keys("test")
 
     def put(self, key: str, data: bytes) -> None:
-        self.session.put(key, data)
+        raise NotImplementedError
 
     def pose(
         self, robot: str, position: tuple[float, float, float], state: State = "tracked", key: str = ""
@@ -113,6 +110,21 @@ class Played:
         )
         self.put(self.keys.fusion_status, encode(message))
 
+    def rig(self, rig: Rig) -> None:
+        self.put(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+
+
+class Played(Said):
+    """Over Zenoh, now."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self.session = open_router([endpoint])
+        self.rig_queries = 0
+
+    def put(self, key: str, data: bytes) -> None:
+        self.session.put(key, data)
+
     def serve_rig(self, rig: Rig) -> zenoh.Queryable:
         """Answer late joiners, as the server does."""
 
@@ -131,11 +143,6 @@ def four_cameras() -> Rig:
     return Rig(cameras={name: Camera(**lens, T_world_cam=pose) for name, pose in poses.items()})
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 @pytest.fixture
 def played() -> Iterator[Played]:
     arena = Played(f"tcp/127.0.0.1:{free_port()}")
@@ -144,16 +151,22 @@ def played() -> Iterator[Played]:
 
 
 @pytest.fixture
-def feed(played: Played) -> Iterator[Feed]:
+def subscription(played: Played) -> Iterator[Subscription]:
     """A feed of that arena, connected: what is published from now on arrives."""
     session = open_client([played.endpoint])
-    feed = Feed(session, "test")
+    subscription = Subscription(session, Feed("test"))
 
     def reached() -> bool:
         played.markers([(0, 0, 0)])
-        return feed.latest().markers is not None
+        return subscription.feed.latest().markers is not None
 
     wait_for(reached)
-    yield feed
-    feed.close()
+    yield subscription
+    subscription.close()
     session.close()
+
+
+@pytest.fixture
+def feed(subscription: Subscription) -> Feed:
+    """What the connected feed knows."""
+    return subscription.feed

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The feed keeps the latest of everything, asks for the rig when it joins late, and survives any bytes."""
 
-import numpy as np
 import pytest
 
 from camera_node.messages import encode
-from camera_node.network import open_client
-from tests.web.conftest import Played, four_cameras, wait_for
+from tests.web.conftest import Played, wait_for
 from web.feed import MAX_REASONS, Feed
 from web.messages import Progress, progress_key
 
@@ -26,24 +24,6 @@ def test_what_is_published_is_kept(played: Played, feed: Feed):
     assert latest.coverage["north"].share == 2 / 64
     assert latest.received["frames north"] == 1
     assert not latest.faults
-
-
-def test_a_late_joiner_gets_the_rig(played: Played):
-    """A feed that starts after calibration asks for the rig as soon as it sees the server."""
-    queryable = played.serve_rig(four_cameras())
-    token = played.session.liveliness().declare_token(played.keys.fusion_alive)
-    session = open_client([played.endpoint])
-    late = Feed(session, "test")
-    wait_for(lambda: played.status() or late.latest().rig)  # it asks again with every status
-    rig = late.latest().rig
-    assert rig is not None
-    assert set(rig.placed()) == {"north", "east", "south", "west"}
-    assert late.latest().server_alive
-    token.undeclare()
-    wait_for(lambda: not late.latest().server_alive)
-    queryable.undeclare()
-    late.close()
-    session.close()
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"not a message", b"\x81\xa1a" * 50, bytes(1000)])
@@ -103,17 +83,3 @@ def test_latest_is_a_copy(played: Played, feed: Feed):
     played.pose("rover", (0, 0, 0))
     wait_for(lambda: feed.latest().poses)
     assert not before.poses
-
-
-def test_snapshot_of_a_camera_that_is_away(feed: Feed):
-    """Nobody answers: None, and soon."""
-    assert feed.snapshot("nowhere", timeout_s=0.2) is None
-
-
-def test_snapshot_is_what_the_camera_sends(played: Played, feed: Feed):
-    """The bytes of the queryable, unchanged."""
-    key = played.keys.snapshot("north")
-    data = np.arange(256, dtype=np.uint8).tobytes()
-    queryable = played.session.declare_queryable(key, lambda query: query.reply(key, data))
-    wait_for(lambda: feed.snapshot("north", timeout_s=0.5) == data)
-    queryable.undeclare()

@@ -10,7 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.web.conftest import free_port, wait_for
+from tests.conftest import free_port
+from tests.web.conftest import wait_for
 from web.errors import WebError
 from web.processes import Processes, ProgramFailed, ended_by_signals
 

@@ -4,8 +4,11 @@
 import time
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
+from camera_node.messages import CameraStatus
+from fusion.messages import CameraHealth, FusionStatus
 from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen
@@ -23,6 +26,46 @@ def test_the_tables_show_what_was_sent(played: Played, feed: Feed):
     assert tabulate_robots(latest).rows == [("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")]
     cells = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1", "too dark")
     assert tabulate_cameras(latest).rows == [cells]
+
+
+def test_a_camera_that_does_not_count_is_told():
+    """Silent, not placed, or moved; else what its node advises."""
+    health = CameraHealth(
+        fps=30.0, lateness_ms=5.0, residual_px=None, used=0, unused=0, late=0, calibrated=True, aside=True
+    )
+    own = CameraStatus(
+        camera="north",
+        t_ns=0,
+        width=640,
+        height=480,
+        fps=30.0,
+        frames=1,
+        dropped=0,
+        detect_ms=0.5,
+        roundels=0.0,
+        threshold=128.0,
+        saturated=0.0,
+        advice="too dark",
+    )
+
+    def advice(health: CameraHealth, now: float = 0.0) -> str:
+        status = FusionStatus(
+            t_ns=0,
+            instants_per_s=30.0,
+            latency_ms=None,
+            cpu=0.1,
+            memory_mb=100.0,
+            cameras={"north": health},
+            robots={},
+            faults={},
+        )
+        latest = Latest(now=now, cameras={"north": Seen(own, 0.0)}, status=Seen(status, 0.0))
+        return tabulate_cameras(latest).rows[0][-1]
+
+    assert advice(health) == "moved: set aside until it is placed anew"
+    assert advice(msgspec.structs.replace(health, calibrated=False)) == "not placed"
+    assert advice(msgspec.structs.replace(health, aside=False)) == "too dark"
+    assert advice(health, now=2 * STALE_S) == "away"
 
 
 def test_names_are_escaped():
@@ -98,6 +141,14 @@ def test_trails_are_bounded_and_end_at_the_robot():
     assert segments[LENGTH - 2, 1].tolist() == [5 * LENGTH - 1, 0.0, 0.0]
     assert (segments[1 : LENGTH - 1, 0] == segments[: LENGTH - 2, 1]).all(), "a trail is one line"
     assert (segments[LENGTH - 1 :] == [0.0, 1.0, 0.0]).all()
+
+
+def test_a_robot_that_is_put_elsewhere_leaves_no_line():
+    """All of its trail is where it is now."""
+    trails = Trails()
+    for place in ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 2.0, 0.0)):
+        trails.add("rover", place)
+    assert (trails.segments(["rover"]) == [0.5, 2.0, 0.0]).all()
 
 
 def test_fading_ends_in_the_robots_colour():

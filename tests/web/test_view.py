@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
-from tests.web.conftest import Played, four_cameras, free_port, wait_for
+from tests.conftest import free_port
+from tests.web.conftest import Played, four_cameras, wait_for
+from web.controls import LiveControls, decode_jpeg
 from web.drawing import puck
 from web.errors import WebError
 from web.feed import Feed
 from web.messages import Progress, progress_key
-from web.panel import decode_jpeg
+from web.subscription import Subscription
 from web.view import View, check_port, frame
 
 CHROMIUM = shutil.which("chromium")
@@ -35,9 +37,10 @@ FLAGS = [
 
 
 @pytest.fixture
-def view(feed: Feed) -> Iterator[View]:
+def view(subscription: Subscription) -> Iterator[View]:
     """A view that draws."""
-    view, stop = View(feed, port=free_port()), threading.Event()
+    view, stop = View(subscription.feed, port=free_port()), threading.Event()
+    view.add(LiveControls(view.server, subscription))
     thread = threading.Thread(target=view.run, args=(stop,))
     thread.start()
     yield view
@@ -103,7 +106,7 @@ def test_a_browser_shows_the_arena(played: Played, view: View, page: Page):
     key = played.keys.snapshot("east")
     camera = played.session.declare_queryable(key, lambda query: query.reply(key, jpeg))
     with playing(played):
-        for text in ("rover", "coasting", "north", "30 instants/s"):
+        for text in ("rover", "coasting", "north", "30 instants/s", "latency ms: camera 3.0, network 0.2"):
             page.get_by_text(text).first.wait_for(timeout=20_000)
     page.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === 'east')")
     for _ in range(4):  # a busy machine may take longer than the two seconds after which the view gives up
@@ -113,6 +116,8 @@ def test_a_browser_shows_the_arena(played: Played, view: View, page: Page):
         if "64 x 48" in answer.inner_text():
             break
     page.get_by_text("east, 64 x 48").wait_for(timeout=20_000)
+    page.get_by_role("button", name="Undo the last correction").click()
+    page.get_by_text("the server did not answer within 2 s").wait_for(timeout=20_000)
     page.get_by_role("button", name="Frame the arena").click()
     picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None

@@ -11,13 +11,14 @@ from rich.console import Console
 
 from camera_node.detector import Detector
 from camera_node.errors import ConfigError
-from tests.benchmarks.detector import accuracy, negatives, pose, recall, speed
+from tests.benchmarks.detector import accuracy, motion, negatives, pose, recall, speed
 from tests.benchmarks.detector.table import Run, print_verdicts
 
 PARTS = {
     "speed": speed.measure,
     "accuracy": accuracy.measure,
     "recall": recall.measure,
+    "motion": motion.measure,
     "false_positives": negatives.measure,
     "pose": pose.measure,
 }
@@ -28,7 +29,7 @@ class Benchmark:
     """Measure detectors against the goals of the issue. Everything is seeded; times are those of this machine."""
 
     parts: Annotated[
-        tuple[Literal["speed", "accuracy", "recall", "false_positives", "pose", "all"], ...],
+        tuple[Literal["speed", "accuracy", "recall", "motion", "false_positives", "pose", "all"], ...],
         tyro.conf.Positional,
     ] = ("all",)
     """What to measure."""

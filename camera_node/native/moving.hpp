@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <optional>
+
+#include "image.hpp"
+#include "settings.hpp"
+#include "tracks.hpp"
+
+namespace roundel {
+
+/// A roundel of the last frame that is not to be seen sharp in this one: tried with the motion that it had
+/// then, and wherever around its expected place it looks smeared.
+std::optional<Fit> follow_moving(const ImageView& image, const Tracks::Expected& expected,
+                                 const Settings& settings, double noise);
+
+}  // namespace roundel

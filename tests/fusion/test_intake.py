@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a network may bring: counted, never fatal, and bounded in time and memory."""
+
+import time
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from camera_node.messages import MAX_ROUNDELS, Detections, Keys, encode
+from camera_node.roundels import Roundels
+from fusion.health import MAX_STRANGERS, Health
+from fusion.instants import Frame, Instants
+from fusion.intake import Intake
+from fusion.report import Fused
+from fusion.tracker import Tracker
+from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
+
+ARENA = Arena(
+    {"a": TRIANGLE, "c": SINGLE},
+    {"a": line((0.2, 0.1, 0.2), (0.3, 0, 0)), "c": line((-0.5, 0, 0.2))},
+    sigma_px=0.05,
+)
+KEYS = Keys("x")
+NS = 10**9
+
+
+class Path:
+    """A message's way through the server, without a network."""
+
+    def __init__(self, arena: Arena = ARENA) -> None:
+        self.arena, self.health = arena, Health(150.0)
+        self.intake, self.instants = Intake(KEYS, self.health), Instants(PERIOD_NS)
+        self.tracker = Tracker(arena.cameras, arena.robots)
+
+    def take(self, message: Detections, received_ns: int) -> list[Fused]:
+        """The instants that were complete then."""
+        frame = self.intake.receive(
+            encode(message), KEYS.detections(message.camera), received_ns, self.arena.cameras
+        )
+        if frame is not None:
+            self.instants.add(frame)
+        fused = [self.tracker.fuse(instant) for instant in self.instants.take(received_ns)]
+        self.tracker.inspect()
+        return fused
+
+    @property
+    def faults(self) -> dict[str, int]:
+        status = self.health.status(time.time_ns(), set(), {}, set())
+        assert status is not None
+        return status.faults
+
+
+def play(path: Path, messages: list[Detections]) -> list[Fused]:
+    """All messages, each 5 ms after its exposure."""
+    ordered = sorted(messages, key=lambda message: message.t_ns)
+    return [fused for m in ordered for fused in path.take(m, m.t_ns + 5_000_000)]
+
+
+def states(fused: list[Fused], robot: str = "a") -> list[str]:
+    return [pose.state for f in fused for pose in f.poses if pose.robot == robot]
+
+
+odd = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-45, 1e30, 3e38, 8.0, 400.0])
+columns = st.lists(st.tuples(*[odd] * 8), max_size=6)
+
+
+def strange(rows: list, **header) -> Detections:
+    """A message whose columns hold just these numbers."""
+    table = np.array(rows, float).reshape(-1, 8)
+    n, none = len(table), np.full(len(table), -1, np.int32)
+    cov = np.zeros((n, 2, 2))
+    cov[:, 0, 0], cov[:, 1, 1] = table[:, 2], table[:, 3]
+    with np.errstate(over="ignore"):
+        seen = Roundels(table[:, :2], cov, table[:, 4:6], table[:, 6], table[:, 7], table[:, 7], none, none)
+        return Detections.pack(seen, width=800, height=600, **header)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    columns,
+    st.sampled_from([0, 1, -1, START_NS, START_NS + NS, START_NS + 3600 * NS, 2**62]),
+    st.sampled_from(["cam0", "cam3", "other", ""]),
+)
+def test_numbers_of_any_kind_are_counted_or_harmless(rows, t_ns, camera):
+    """Between good frames, and in good frames of the same camera; the robot's poses stay finite."""
+    path = Path()
+    good = sorted(ARENA.messages(10), key=lambda message: message.t_ns)
+    fused = play(path, good[:30])
+    fused += path.take(strange(rows, camera=camera, seq=3, t_ns=t_ns), START_NS + NS // 10)
+    near = strange(rows, camera="cam1", seq=900, t_ns=good[30].t_ns + 1)
+    fused += path.take(near, good[30].t_ns + 2)
+    fused += play(path, good[30:])
+    for f in fused:
+        for pose in f.poses:
+            pose.check()
+            assert np.isfinite(pose.covariance_matrix).all()
+        f.markers.check()
+
+
+def test_frames_full_of_roundels_cost_no_more_than_their_number():
+    """4096 in each of four cameras, at random places: a search among them would take minutes."""
+    path, rng = Path(), np.random.default_rng(2)
+    flood = []
+    for k, message in enumerate(ARENA.messages(12)):
+        uv = rng.uniform([0, 0], [800, 600], (MAX_ROUNDELS, 2))
+        full = Detections.pack(
+            Roundels.from_points(uv, 0.3), camera=message.camera, seq=k, t_ns=0, width=800, height=600
+        )
+        flood.append(msgspec.structs.replace(full, t_ns=message.t_ns) if k % 12 >= 6 else message)
+    begun = time.process_time()
+    fused = play(path, flood)
+    assert len(fused) > 9
+    assert time.process_time() - begun < 5.0
+
+
+def test_ten_thousand_names_leave_room_for_the_cameras_of_the_rig():
+    path = Path()
+    message = ARENA.messages(1)[0]
+    for k in range(10_000):
+        path.take(msgspec.structs.replace(message, camera=f"ghost{k}"), message.t_ns)
+    assert "tracked" in states(play(path, ARENA.messages(12)))
+    status = path.health.status(time.time_ns(), set(), {}, set())
+    assert status is not None
+    assert len(status.cameras) == MAX_STRANGERS + len(ARENA.cameras)
+    assert status.faults["too many cameras"] == 10_000 - MAX_STRANGERS
+
+
+@pytest.mark.parametrize("jump_ns", [-3600 * NS, 3600 * NS, NS])
+def test_a_camera_whose_clock_jumps_does_not_disturb_the_others(jump_ns):
+    """One of four cameras, from its tenth frame on: refused, and robots stay tracked by the other three."""
+    path, arrivals = Path(), []
+    for message in ARENA.messages(30):
+        jumps = message.camera == "cam2" and message.t_ns > START_NS + 10 * PERIOD_NS
+        stamp = message.t_ns + (jump_ns if jumps else 0)
+        arrivals.append((message.t_ns + 5_000_000, msgspec.structs.replace(message, t_ns=stamp)))
+    arrivals.sort(key=lambda arrival: arrival[0])
+    fused = [f for now_ns, message in arrivals for f in path.take(message, now_ns)]
+    assert sum(path.faults.values()) == 19
+    assert set(states(fused)[2:]) == {"tracked"}
+    late = [f for f in fused if f.t_ns > START_NS + 12 * PERIOD_NS]
+    assert len(late) > 8
+    assert all(len(pose.cameras) == 3 for f in late for pose in f.poses if pose.robot == "a")
+
+
+def test_a_frame_that_comes_twice_counts_once():
+    path, twice = Path(), [m for message in ARENA.messages(10) for m in (message, message)]
+    fused = play(path, twice)
+    assert path.faults == {"frame that came twice": 40}
+    once = play(Path(), ARENA.messages(10))
+    assert [f.poses for f in fused] == [f.poses for f in once]
+
+
+@pytest.mark.parametrize(("second", "shared"), [(False, False), (True, True)])
+def test_two_nodes_of_one_name_are_noticed_and_a_restarted_one_is_not(second, shared, caplog):
+    path = Path()
+    mine = [m for m in ARENA.messages(20) if m.camera == "cam0"]
+    for k, message in enumerate(mine):
+        restarted = 0 if k >= 10 else 5000
+        path.take(msgspec.structs.replace(message, seq=restarted + k), message.t_ns)
+        if second:
+            other = msgspec.structs.replace(message, t_ns=message.t_ns + 7_000_000, seq=100 + k)
+            path.take(other, other.t_ns)
+    status = path.health.status(time.time_ns(), set(), {}, set())
+    assert status is not None
+    assert status.cameras["cam0"].shared == shared
+    assert ("two nodes publish as camera cam0" in caplog.text) == shared
+
+
+def test_what_cannot_be_an_outline_is_unknown():
+    message = strange([[400, 300, 1, 1, 8.0, 9.0, 0.1, 0.6]], camera="cam0", seq=0, t_ns=START_NS)
+    frame = Path().intake.receive(encode(message), KEYS.detections("cam0"), START_NS, ARENA.cameras)
+    assert isinstance(frame, Frame)
+    assert np.isnan(frame.roundels.axes_px).all()

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The table of a lens's inverse against the lens itself."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from camera_node.lens import Lens
+from fusion.undistortion import TOLERANCE_PX, TOLERANCE_SCALE, table_of, undistort
+
+SIZE = {"width": 800, "height": 600, "cx": 402.0, "cy": 297.0}
+LENSES = {
+    "none": Lens(**SIZE, fx=650.0, fy=651.0),
+    "usual": Lens(**SIZE, fx=650.0, fy=651.0, distortion=(-0.1, 0.02, 0.0003, -0.0002, 0.0)),
+    "wide": Lens(**SIZE, fx=380.0, fy=381.0, distortion=(-0.2, 0.04, 0.001, -0.0005, -0.003)),
+    "no inverse in the corners": Lens(**SIZE, fx=400.0, fy=400.0, distortion=(-0.45, 0.0, 0.0, 0.0)),
+    "rational": Lens(**SIZE, fx=420.0, fy=421.0, distortion=(0.3, 0.1, 0.0, 0.0, 0.01, 0.6, 0.2, 0.02)),
+    "fisheye": Lens(**SIZE, fx=270.0, fy=271.0, distortion=(-0.02, 0.005, -0.002, 0.0003), model="fisheye"),
+}
+
+
+def pixels(lens: Lens, n: int = 4000) -> np.ndarray:
+    """All over the image and some way beyond its edges."""
+    return np.random.default_rng(4).uniform([-40, -40], [lens.width + 40, lens.height + 40], (n, 2))
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_the_table_is_the_lens(lens):
+    """Cells are accepted by 9 points each, so that between these some error may be twice as large."""
+    uv = pixels(lens)
+    xy, scale = undistort(lens, uv)
+    exact = lens.normalise(uv)
+    known = np.isfinite(exact[:, 0])
+    assert (np.isfinite(xy[0]) == known).all()
+    points = np.column_stack([exact[known], np.ones(known.sum())])
+    by_xy = lens.project_with_jacobian(points)[1][:, :, :2].transpose(1, 2, 0)
+    off_px = np.einsum("ijn,jn->in", by_xy, xy[:, known] - exact[known].T)
+    assert np.abs(off_px).max() < 2 * TOLERANCE_PX
+    size = np.abs(by_xy).max((0, 1))
+    assert (np.abs(scale[..., known] - by_xy) / size).max() < 2 * TOLERANCE_SCALE
+
+
+@pytest.mark.parametrize("name", ["none", "usual", "wide", "rational"])
+def test_in_the_image_of_a_usual_lens_hardly_anything_is_left_to_iterate(name):
+    """At most a corner's cell that juts out to where the lens has no inverse."""
+    lens = LENSES[name]
+    inside = pixels(lens)
+    inside = inside[((inside > -0.5) & (inside < [lens.width - 0.5, lens.height - 0.5])).all(1)]
+    assert np.isfinite(table_of(lens).look_up(inside)[0][0]).mean() > 0.98
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(-1e5, 1e5)] * 2), max_size=5))
+def test_no_pixel_is_too_far_away(uv):
+    """Whatever a message may say of a centre has coordinates or none."""
+    lens = LENSES["usual"]
+    xy, scale = undistort(lens, np.array(uv).reshape(-1, 2))
+    assert xy.shape == (2, len(uv))
+    assert (np.isfinite(scale).all((0, 1)) == np.isfinite(xy[0])).all()
