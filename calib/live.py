@@ -20,19 +20,25 @@ from camera_node.messages import Detections, Keys, MessageError, decode, encode
 
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
 LOOK_EVERY_S = 0.2
+SILENT_S = 2.0  # without a frame: a camera that is lost
 
 
 @dataclass(slots=True)
 class Heard:
-    """What came so far: messages; by camera the frames with roundels and where in its image they were; and how many
-    messages were none."""
+    """What came so far: messages; by camera the frames with roundels and where in its image they were, and when
+    it was heard last, seconds; and how many messages were none."""
 
     messages: list[Detections] = field(default_factory=list)
     frames: Counter[str] = field(default_factory=Counter)
     coverage: dict[str, Coverage] = field(default_factory=dict)
+    latest: dict[str, float] = field(default_factory=dict)
     bad: int = 0
 
-    def take(self, data: bytes) -> None:
+    def silent(self, now: float) -> list[str]:
+        """Cameras that sent messages and stopped: a camera sends one every frame, with roundels or without."""
+        return sorted(name for name, last in self.latest.items() if now - last > SILENT_S)
+
+    def take(self, data: bytes, now: float) -> None:
         """Count and keep a message, or count what is none."""
         try:
             message = decode(data, Detections)
@@ -40,6 +46,7 @@ class Heard:
             self.bad += 1
             return
         self.messages.append(message)
+        self.latest[message.camera] = now
         if not len(message):
             return
         self.frames[message.camera] += 1
@@ -55,7 +62,7 @@ def listen(
 
     Args:
         session, arena: where cameras publish.
-        seconds: how long at the most.
+        seconds: how long at the most; Ctrl-C ends it before, and keeps what came.
         look: called a few times a second, from this thread, with what came and the seconds that passed; ends it by
             the reason that it returns, and goes on where that is empty.
 
@@ -84,14 +91,17 @@ def _follow(
     arrived: queue.SimpleQueue[bytes], seconds: float, look: Callable[[Heard, float], str]
 ) -> tuple[Heard, str]:
     heard, begun, looked = Heard(), time.monotonic(), 0.0
-    while (passed := time.monotonic() - begun) < seconds:
-        with suppress(queue.Empty):
-            heard.take(arrived.get(timeout=min(seconds - passed, LOOK_EVERY_S)))
-        if passed - looked < LOOK_EVERY_S:
-            continue
-        looked = passed
-        if why := look(heard, passed):
-            return heard, why
+    try:
+        while (passed := time.monotonic() - begun) < seconds:
+            with suppress(queue.Empty):
+                heard.take(arrived.get(timeout=min(seconds - passed, LOOK_EVERY_S)), passed)
+            if passed - looked < LOOK_EVERY_S:
+                continue
+            looked = passed
+            if why := look(heard, passed):
+                return heard, why
+    except KeyboardInterrupt:
+        return heard, "Ctrl-C; what was seen until then counts"
     return heard, f"{seconds:g} s are over"
 
 

@@ -10,6 +10,7 @@ holds the GIL. Covariances shrink with the number of frames, so what all frames 
 """
 
 import os
+import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -136,17 +137,26 @@ def progress(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> 
     """What to tell a person."""
     covered = {name: coverage.share() for name, coverage in sorted(heard.coverage.items())}
     return Progress(
-        passed, dict(sorted(heard.frames.items())), covered, trial, enough, _advise(heard, trial, enough)
+        passed,
+        dict(sorted(heard.frames.items())),
+        covered,
+        trial,
+        enough,
+        _advise(heard, passed, trial, enough),
     )
 
 
-def _advise(heard: Heard, trial: Trial | None, enough: bool) -> str:
+def _advise(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> str:
     if enough:
         return "that is enough"
+    if lost := heard.silent(passed):
+        return _name_lost(lost, len(heard.latest))
     if not heard.frames:
         return "waiting for roundels" if heard.messages else "waiting for cameras"
-    if trial is None:
-        return "wave the wand where two cameras or more see it"
+    return _advise_on(trial) if trial is not None else "wave the wand where two cameras or more see it"
+
+
+def _advise_on(trial: Trial) -> str:
     if trial.fault:
         return trial.fault
     if trial.unplaced:
@@ -159,12 +169,24 @@ def _advise(heard: Heard, trial: Trial | None, enough: bool) -> str:
     return f"go on, most before '{weakest}'"
 
 
+def _name_lost(lost: list[str], cameras: int) -> str:
+    if len(lost) == cameras:
+        return "no camera sends any more: does the server run?"
+    return f"{' and '.join(map(repr, lost))}: no frames any more; does its program run?"
+
+
+def _stand_back() -> None:
+    """In the trials' process: leave the processor to cameras, and Ctrl-C to who waves."""
+    os.nice(10)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class _Trials:
     """Trial solutions, one at a time, in a process of their own."""
 
     def __init__(self, rig: Rig, wand: Body, wanted: bool, every_s: float) -> None:
         self._rig, self._wand, self._every_s = rig, wand, every_s
-        self._pool = get_context("spawn").Pool(1, os.nice, (10,)) if wanted else None
+        self._pool = get_context("spawn").Pool(1, _stand_back) if wanted else None
         self._running: AsyncResult[Trial] | None = None
         self._latest: Trial | None = None
         self._due = every_s

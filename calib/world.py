@@ -19,6 +19,7 @@ from camera_node.pose import Pose
 
 Array = NDArray[np.float64]
 
+LEVEL = 0.7  # of a plane's normal that is upright: below, roundels hang on a wall
 MISFIT = 0.1  # of the survey's extent, that places may miss: beyond, names or units are wrong
 
 
@@ -123,6 +124,24 @@ def align_places(
             f"is {scale:.3f} times as large as the rig; are names, metres and the wand's lengths right?"
         )
     return move(rig, T), dict(zip(names, miss.tolist(), strict=True))
+
+
+def require_above(rig: Rig, places: Mapping[str, ArrayLike]) -> None:
+    """Raise CalibrationError where cameras would see roundels that lie level from below: of three places, a mirrored
+    arrangement fits as well, with the world upside down.
+
+    Args:
+        rig: with placed cameras, in the world of the places.
+        places: (3,) metres by name, of roundels whose printed sides look up.
+    """
+    points = np.array(list(places.values()), float)
+    normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
+    heights = np.array([c.matrix()[2, 3] for c in rig.placed().values()]) - points[:, 2].mean()
+    if abs(normal[2]) > LEVEL and np.median(heights) < 0:
+        raise CalibrationError(
+            "the places are mirrored: the cameras would stand below the floor; x, y and z must be right-handed, z up "
+            "(x to the east and y to the north, not the other way round)"
+        )
 
 
 def _extent(points: Array) -> float:

@@ -18,12 +18,13 @@ from calib.errors import CalibrationError
 from calib.landmarks import is_line, locate_places, still_roundels
 from calib.live import collect
 from calib.rig import Rig, load_rig
-from calib.world import align, align_places, read_positions, stand
+from calib.world import align, align_places, read_positions, require_above, stand
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
 
+UPSIDE_DOWN = 0.3  # of the images' downward axes, that points up, on average
 Places = Mapping[str, NDArray[np.float64]]
 
 
@@ -75,7 +76,10 @@ class World:
 
     def _move(self, rig: Rig, console: Console) -> tuple[Rig, dict[str, float]]:
         if self.positions is not None:
-            return align(rig, read_positions(self.positions))
+            moved, misses = align(rig, read_positions(self.positions))
+            if np.mean([camera.matrix()[2, 1] for camera in moved.placed().values()]) > UPSIDE_DOWN:
+                say(console, "warning: most cameras hang upside down in this world; are x and y swapped?")
+            return moved, misses
         file = self.points or self.frame or self.standing
         assert file is not None
         body = None if self.points else load_yaml(file, Body)
@@ -89,7 +93,9 @@ class World:
             )
         if self.standing is not None:
             return stand(rig, np.array(list(found.values())), self.foot), {}
-        return align_places(rig, found, places, "roundel")
+        moved, misses = align_places(rig, found, places, "roundel")
+        require_above(moved, places)
+        return moved, misses
 
     def _look(self, rig: Rig, body: Body | None) -> list[Detections]:
         if (self.frames is not None) + (self.observations is not None) + self.live != 1:

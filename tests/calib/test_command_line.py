@@ -161,6 +161,10 @@ def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     for name, camera in load_rig(tmp_path / "world.yaml").cameras.items():
         assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+    mirrored = {name: [y, x, z] for name, (x, y, z) in L_FRAME.items()}
+    (tmp_path / "m.yaml").write_text(f"diameter_m: 0.1\nmarkers: {list(mirrored.values())}\n")
+    done = calib("world", "--frame", tmp_path / "m.yaml", *options, tmp_path / "none.yaml")
+    assert (done.returncode, "the places are mirrored" in done.stderr) == (2, True)
     (tmp_path / "line.csv").write_text("name,x,y,z\na,0,0,0\nb,1,0,0\nc,2,0,0\n")
     done = calib("world", "--points", tmp_path / "line.csv", *options, tmp_path / "none.yaml")
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)

@@ -29,7 +29,7 @@ def sending(messages: list[Detections]) -> Iterator[tuple[zenoh.Session, Callabl
         sender.declare_matching_listener(lambda status: listening.set())
 
         def send() -> None:
-            assert listening.wait(20)
+            assert listening.wait(60)
             for payload in [b"no message", *map(encode, messages)]:
                 sender.put(payload)
 
@@ -65,6 +65,30 @@ def test_it_is_ended_by_time_or_by_hand():
         assert why == "ended by hand"
         with pytest.raises(CalibrationError, match="no detections on test/"):
             wave(client, "test", arena.intrinsics, arena.wand, 0.1, trials=False)
+
+
+def test_ctrl_c_keeps_what_came():
+    arena = ring(2)
+
+    def interrupt(told: Progress) -> None:
+        if sum(told.frames.values()):
+            raise KeyboardInterrupt
+
+    with sending(record(arena, 1.0)) as (client, done):
+        heard, why = wave(client, "test", arena.intrinsics, arena.wand, 60.0, interrupt, trials=False)
+        done()
+    assert heard.messages
+    assert why.startswith("Ctrl-C")
+
+
+def test_cameras_that_stop_sending_are_named():
+    """By when each was heard last, with roundels or without."""
+    heard = Heard()
+    for message in record(ring(2), 1.0):
+        heard.take(encode(message), 5.0 if message.camera == "cam0" else 1.0)
+    assert heard.silent(2.9) == []
+    assert progress(heard, 5.0, None, False).advice == "'cam1': no frames any more; does its program run?"
+    assert progress(heard, 8.0, None, False).advice == "no camera sends any more: does the server run?"
 
 
 def test_the_rule():

@@ -10,7 +10,9 @@ import pytest
 from calib.errors import CalibrationError
 from calib.landmarks import locate_places, still_roundels
 from calib.rig import Rig
-from calib.world import align, align_places, move, read_positions, rescale, stand
+from calib.world import align, align_places, move, read_positions, require_above, rescale, stand
+from camera_node.body import Body
+from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
 from camera_node.pose import rotation_from_vector
@@ -141,3 +143,17 @@ def test_a_broken_survey_names_the_fault(tmp_path: Path, text: str, fault: str):
     path.write_text(text)
     with pytest.raises(ConfigError, match=fault):
         read_positions(path)
+
+
+def test_the_frame_that_is_shipped_fixes_a_world():
+    """`configs/l.yaml`: an L whose legs differ, as far as a turn is concerned."""
+    frame = load_yaml(Path(__file__).resolve().parents[2] / "configs" / "l.yaml", Body)
+    places = {str(k): point for k, point in enumerate(frame.points)}
+    arena = ring()
+    seen = still_roundels(lie_still(arena, {name: list(at) for name, at in places.items()}))
+    rig = elsewhere(arena.truth)
+    moved, misses = align_places(rig, locate_places(rig.placed(), seen, places), places, "roundel")
+    assert max(misses.values()) < 1e-3
+    require_above(moved, places)
+    for name, camera in moved.cameras.items():
+        assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
