@@ -23,7 +23,10 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 GATE = 13.8  # chi-square with 2 degrees: one detection in a thousand is lost to it
 SLACK_PX = 0.7  # what a calibration may be off, added to the gate
-SIZE_RATIO = 1.35  # between the measured and the predicted major axis
+SIZE_RATIO = 1.35  # between the measured and the predicted major axis, at the most
+SIZE_SIGMA = (
+    0.1  # of the ratio's logarithm: diameters as they were declared, and distances while nothing is seen
+)
 GRAZING = 0.1  # cosine between the line of sight and the normal under which a print is not read
 UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
 TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
@@ -159,7 +162,8 @@ def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sight
     size = np.abs(np.log(sightings.axes_px[0, j] / major_px))
     fits = (d2 < GATE) & ~(size > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
     i, j, det, focal = i[fits], j[fits], det[fits], focal[fits]
-    return _Pairs(i, j, d2[fits] + np.log(det * focal**4))
+    unlike = np.nan_to_num(size[fits] / SIZE_SIGMA) ** 2
+    return _Pairs(i, j, d2[fits] + unlike + np.log(det * focal**4))
 
 
 def noise_xy(sightings: Sightings, slack_px: float) -> Array:

@@ -15,8 +15,8 @@ constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, w
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
 constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
 constexpr double kShows = 0.06;  // likewise: where a cover would show on a fit that passes all other gates
-constexpr int kMostHidden = 22, kMostOfBoth = 36;       // sectors of 32, of an edge and of both
-constexpr double kLeastKnown = 12, kLeastNew = 16;      // pixels: smaller ones tell too little
+constexpr int kMostHidden = 22, kMostOfBoth = 36;   // sectors of 32, of an edge and of both
+constexpr double kLeastKnown = 12, kLeastNew = 16;  // pixels: smaller ones tell too little
 constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
 constexpr double kInked = 0.12;             // likewise, of a thin stroke
 constexpr double kBright = 0.3;             // likewise, of a place in the ring that is no ink, and

@@ -4,10 +4,14 @@
 import numpy as np
 import pytest
 
-from fusion.association import _Expected
+from camera_node.roundels import Roundels
+from fusion.association import Association, _Expected
+from fusion.instants import Frame, Instant
+from fusion.optics import Optics
+from fusion.robots import Robot
 from fusion.sightings import Catalogue
 from fusion.state import States, exp_so3
-from tests.fusion.synthetic import WIDE
+from tests.fusion.synthetic import WIDE, ring
 
 
 def place(states: States, marker: np.ndarray, tau: float) -> np.ndarray:
@@ -35,3 +39,27 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
             ]
         )
         np.testing.assert_allclose(found[:, :, k], J @ states.P[0] @ J.T, atol=1e-7)
+
+
+@pytest.mark.parametrize("measured", [0, 1])
+def test_of_two_that_stand_in_line_the_one_of_the_measured_size_is_seen(measured: int):
+    """One robot hides the other from the camera: what is seen is as large as it is, a third apart, though the other was
+    expected where the roundel is and this one 1.5 px aside."""
+    camera = ring(1)["cam0"]
+    optics = Optics({"cam0": camera})
+    catalogue = Catalogue.of([Robot(diameter_m=d, markers=((0.0, 0.0, 0.0),)) for d in (0.10, 0.13)])
+    T = camera.matrix()
+    at = np.array([0.0, 0.0, 2.0])
+    aside = 1.5 / camera.fx * at[2] * np.eye(3)[0]
+    seen_from = [at + aside, at] if measured == 0 else [at, at + aside]
+    p = np.array([T[:3, :3] @ point + T[:3, 3] for point in seen_from])
+    toward = np.tile(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]), (2, 1, 1))  # their normals look at the camera
+    states = States.at_rest(toward, p, (0.01, 0.001, 0.01, 0.01))
+    major = 2 * camera.fx * catalogue.radius[measured] / at[2]
+    seen = Roundels.from_points(camera.project([at]), 0.05)
+    seen = Roundels(
+        seen.uv, seen.cov, np.full((1, 2), major), np.zeros(1), seen.ratio, seen.contrast, seen.id, seen.track
+    )
+    association = Association(optics, catalogue, states, np.ones(2, bool), 0, 0.1)
+    matches = association.whole(Instant(0, (Frame.measure("cam0", 0, seen, camera),)))[1]
+    assert catalogue.robot[matches.disc].tolist() == [measured]
