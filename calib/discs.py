@@ -105,15 +105,20 @@ def _misfit(Pn: Array, lacking: Array) -> Array:
 
 
 def _try_directions(count: int, knot: Index, P: Array, lacking: Array, toward: Array) -> Array:
-    k = np.arange(DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    level = np.sqrt(1 - z**2)
-    tried = np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
+    tried = fibonacci_sphere(DIRECTIONS)
     off = (_misfit((P @ tried.T).swapaxes(1, 2), lacking[:, None]) ** 2).sum(axis=2) / SHAPE_SIGMA**2
     cost = np.minimum(off, SHAPE_LIMIT) + SHAPE_LIMIT * (toward @ tried.T < 0)
     total = np.zeros((count, DIRECTIONS))
     np.add.at(total, knot, cost)
     return tried[total.argmin(axis=1)]
+
+
+def fibonacci_sphere(n: int) -> Array:
+    """(n, 3) unit vectors spread evenly (Gonzalez 2010)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    level = np.sqrt(1 - z**2)
+    return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
 
 
 def _refine(normals: Array, knot: Index, P: Array, lacking: Array) -> Array:

@@ -4,6 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.discs import fibonacci_sphere
 from fusion.estimator import AXIS_SIGMA_PX, shears
 from fusion.grouping import Marker
 from fusion.optics import Optics, measured_outlines, outlines
@@ -39,14 +40,6 @@ def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: fl
     best = int(np.argmin(chi2))
     elsewhere = chi2[normals @ normals[best] < ELSEWHERE]
     return normals[best] if not len(elsewhere) or elsewhere.min() > chi2[best] + CLEARLY else None
-
-
-def fibonacci_sphere(n: int) -> Array:
-    """(n, 3) unit vectors spread evenly (Gonzalez 2010)."""
-    k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    r = np.sqrt(1 - z * z)
-    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
 def rotation_to(normal: Array) -> Array:

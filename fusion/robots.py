@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.alignment import rigid_motions
 from camera_node.body import Body
 from camera_node.config import is_name, load_yaml
 from camera_node.errors import ConfigError
@@ -161,10 +162,8 @@ def distances(points: Array) -> Array:
 
 def align(a: Array, b: Array) -> tuple[Array, Array]:
     """The rotation (3, 3) and translation (3,) that bring points a (M, 3) nearest to b (Kabsch 1976)."""
-    mean_a, mean_b = a.mean(0), b.mean(0)
-    U, _, Vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return R, mean_b - R @ mean_a
+    T = rigid_motions(a, b)
+    return T[:3, :3], T[:3, 3]
 
 
 def _likeness(small: Robot, large: Robot) -> str | None:
