@@ -24,9 +24,7 @@ Index = NDArray[np.intp]
 GATE = 13.8  # chi-square with 2 degrees: one detection in a thousand is lost to it
 SLACK_PX = 0.7  # what a calibration may be off, added to the gate
 SIZE_RATIO = 1.35  # between the measured and the predicted major axis, at the most
-SIZE_SIGMA = (
-    0.1  # of the ratio's logarithm: diameters as they were declared, and distances while nothing is seen
-)
+SIZE_SIGMA = 0.1  # of the logarithm of that: diameters as declared, distances while nothing is seen
 GRAZING = 0.1  # cosine between the line of sight and the normal under which a print is not read
 UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
 TOGETHER = 150  # contested pairs that are assigned in one go, frames and all

@@ -11,6 +11,7 @@ from web.feed import Latest, Seen
 
 STALE_S = 2.0  # a robot or a camera that was silent for so long is away
 NONE = "–"
+HUE_OF = {"tracked": "ok", "coasting": "warn"}  # of a robot's state; else bad
 HUES = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b"}
 
 
@@ -42,14 +43,17 @@ def robot_state(latest: Latest, robot: str) -> str:
 
 def tabulate_robots(latest: Latest) -> Table:
     """One row a robot: state, position (m), speed (m/s) and one standard deviation of the position (mm)."""
+    misfits = latest.status.message.misfits if latest.status else {}
     rows, hues = [], []
     for name, seen in sorted(latest.poses.items()):
         pose: RobotPose = seen.message
         state = robot_state(latest, name)
         place = " ".join(f"{x:+.2f}" for x in pose.position)
         speed, sigma = float(np.linalg.norm(pose.velocity)), position_sigma_mm(pose)
-        rows.append((name, state, place, f"{speed:.2f}", f"{sigma:.1f}", str(pose.n_markers)))
-        hues.append({"tracked": "ok", "coasting": "warn"}.get(state, "bad"))
+        misfit = misfits.get(name)
+        told = f"{state}, markers off by {misfit:.1f} px" if misfit is not None else state
+        rows.append((name, told, place, f"{speed:.2f}", f"{sigma:.1f}", str(pose.n_markers)))
+        hues.append("warn" if misfit is not None and state == "tracked" else HUE_OF.get(state, "bad"))
     return Table(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, hues)
 
 
@@ -96,6 +100,8 @@ def _advise(latest: Latest, seen: Seen | None, health: CameraHealth | None) -> s
         return "not placed"
     if health is not None and health.aside:
         return "moved: set aside until it is placed anew"
+    if health is not None and health.shared:
+        return "two nodes have this name"
     return seen.message.advice
 
 

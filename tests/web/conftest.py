@@ -94,7 +94,7 @@ class Said:
         message = Detections.pack(roundels, camera=name, seq=0, t_ns=time.time_ns(), width=640, height=480)
         self.put(self.keys.detections(name), encode(message))
 
-    def status(self, cameras: tuple[str, ...] = ("north",)) -> None:
+    def status(self, cameras: tuple[str, ...] = ("north",), misfits: dict[str, float] | None = None) -> None:
         health = CameraHealth(
             fps=29.97, lateness_ms=5.1, residual_px=0.08, used=200, unused=3, late=1, calibrated=True
         )
@@ -107,6 +107,7 @@ class Said:
             cameras=dict.fromkeys(cameras, health),
             robots={"rover": "tracked"},
             faults={"camera unknown": 4},
+            misfits=misfits or {},
         )
         self.put(self.keys.fusion_status, encode(message))
 

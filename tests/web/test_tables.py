@@ -64,6 +64,7 @@ def test_a_camera_that_does_not_count_is_told():
 
     assert advice(health) == "moved: set aside until it is placed anew"
     assert advice(msgspec.structs.replace(health, calibrated=False)) == "not placed"
+    assert advice(msgspec.structs.replace(health, aside=False, shared=True)) == "two nodes have this name"
     assert advice(msgspec.structs.replace(health, aside=False)) == "too dark"
     assert advice(health, now=2 * STALE_S) == "away"
 
@@ -74,6 +75,16 @@ def test_names_are_escaped():
     html = tabulate_cameras(Latest(cameras=status)).html()
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
+
+
+def test_a_robot_whose_markers_are_off_is_told(played: Played, feed: Feed):
+    """By how much, and not as one that is well."""
+    played.pose("rover", (0, 0, 0))
+    played.status(misfits={"rover": 2.34})
+    wait_for(lambda: (x := feed.latest()).poses and x.status)
+    table = tabulate_robots(feed.latest())
+    assert table.rows[0][1] == "tracked, markers off by 2.3 px"
+    assert table.hues == ["warn"]
 
 
 def test_a_silent_robot_is_away(played: Played, feed: Feed):
