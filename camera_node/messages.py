@@ -11,6 +11,7 @@ from camera_node.roundels import Roundels
 
 VERSION = 1
 MAX_ROUNDELS = 4096  # in one frame; a message that claims more is not one of ours
+MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate: what is known no better tells nothing
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -105,7 +106,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def check(self) -> None:
-        """Raise MessageError unless sizes agree, centres are finite and covariances are positive definite."""
+        """Raise MessageError unless sizes agree, centres are finite and covariances positive and small."""
         n, rest = divmod(len(self.uv), 16)
         if rest or n > MAX_ROUNDELS:
             raise MessageError(f"column uv of {len(self.uv)} bytes")
@@ -119,7 +120,10 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("an impossible time")
         cov = _column(self.cov, "<f4", 3)
         uu, uv, vv = np.where(np.isfinite(cov), cov, 0.0).T
-        if not (np.abs(_column(self.uv, "<f8", 2)) < 1e5).all() or not ((uu > 0) & (uu * vv > uv * uv)).all():
+        if (
+            not (np.abs(_column(self.uv, "<f8", 2)) < 1e5).all()
+            or not ((uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)).all()
+        ):
             raise MessageError("a centre or a covariance that is no number or out of range")
 
 

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.pose import skew
 from fusion.instants import Frame, Instant
-from fusion.optics import Discs, Exposures, Optics, Views
+from fusion.optics import Discs, Exposures, Optics, Views, outlines
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
 
@@ -24,10 +24,11 @@ Index = NDArray[np.intp]
 GATE = 13.8  # chi-square with 2 degrees: one detection in a thousand is lost to it
 SLACK_PX = 0.7  # what a calibration may be off, added to the gate
 SIZE_RATIO = 1.35  # between the measured and the predicted major axis, at the most
-SIZE_SIGMA = 0.1  # of the logarithm of that: diameters as declared, distances while nothing is seen
+SIZE_SIGMA = 0.05  # of the logarithm of that, where the distance is known: diameters as declared
 GRAZING = 0.1  # cosine between the line of sight and the normal under which a print is not read
 UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
 TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
+TINY_PX2 = 1e-6  # squared half axis: what is nearer than its own radius has no outline
 FRAME_STEP = 1e6  # keeps the frames' x apart on one sorted axis
 
 
@@ -127,23 +128,27 @@ class Association:
         rows = np.tile(markers, n_frames)
         discs = self._catalogue.discs(rows, np.repeat(np.arange(n_frames), len(markers)))
         views = self._optics.view(self._optics.pose(self._states, exposures), discs)
-        spread = _spread(self._optics, exposures, self._expected.covariance(exposures.tau), views)
-        pairs = _candidates(self._optics, discs, views, spread, sightings)
+        spread, depth = _spread(self._optics, exposures, self._expected.covariance(exposures.tau), views)
+        pairs = _candidates(self._optics, discs, views, spread, depth, sightings)
         chosen = _assign(pairs, discs.frame)
         return Matches.of(pairs.sighting[chosen], rows[pairs.marker[chosen]])
 
 
-def _spread(optics: Optics, exposures: Exposures, C: Array, views: Views) -> Array:
-    """(2, 2, F * M) covariance, in the undistorted plane, of places with covariances C (3, 3, F * M) in the world."""
+def _spread(optics: Optics, exposures: Exposures, C: Array, views: Views) -> tuple[Array, Array]:
+    """Of places with covariances C (3, 3, F * M) in the world: (2, 2, F * M) covariance in the undistorted plane, and
+    (F * M,) variance of the depth's logarithm."""
     R = optics.R_cam_world[exposures.camera]
     n_markers = C.shape[2] // len(R)
     across = np.repeat(R[:, :2, :].transpose(1, 2, 0), n_markers, axis=2)
     along = np.repeat(R[:, 2].T, n_markers, axis=1)
     g = (across - views.xy[:, None] * along) / views.centre[2]
-    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C), g)
+    depth = np.einsum("in,ijn,jn->n", along, C, along) / views.centre[2] ** 2
+    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C), g), depth
 
 
-def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sightings: Sightings) -> _Pairs:
+def _candidates(
+    optics: Optics, discs: Discs, views: Views, spread: Array, depth: Array, sightings: Sightings
+) -> _Pairs:
     """Detections within the gates of visible markers, found along x and then tested."""
     noise = noise_xy(sightings, SLACK_PX)
     visible = np.flatnonzero((views.facing > GRAZING) & np.isfinite(views.xy[0]))
@@ -155,13 +160,16 @@ def _candidates(optics: Optics, discs: Discs, views: Views, spread: Array, sight
     u, v = sightings.xy[:, j] - views.xy[:, i]
     det = S[0, 0] * S[1, 1] - S[0, 1] ** 2
     d2 = (S[1, 1] * u * u - 2 * S[0, 1] * u * v + S[0, 0] * v * v) / det
-    focal = optics.focal[sightings.camera[j]]
-    major_px = 2 * focal * discs.radius[i] / views.centre[2, i]
-    size = np.abs(np.log(sightings.axes_px[0, j] / major_px))
-    fits = (d2 < GATE) & ~(size > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
-    i, j, det, focal = i[fits], j[fits], det[fits], focal[fits]
-    unlike = np.nan_to_num(size[fits] / SIZE_SIGMA) ** 2
-    return _Pairs(i, j, d2[fits] + unlike + np.log(det * focal**4))
+    near = d2 < GATE
+    i, j, d2, det = i[near], j[near], d2[near], det[near]
+    shape = outlines(views.centre[:, i], views.normal[:, i], discs.radius[i], sightings.scale[..., j])
+    major_px = 2 * np.sqrt(np.maximum(np.linalg.eigvalsh(shape)[:, 1], TINY_PX2))
+    size = np.log(sightings.axes_px[0, j] / major_px)
+    fits = ~(np.abs(size) > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
+    i, j, variance = i[fits], j[fits], SIZE_SIGMA**2 + depth[i[fits]]
+    unlike = np.nan_to_num(size[fits]) ** 2 / variance
+    cost = d2[fits] + unlike + np.log(det[fits] * optics.focal[sightings.camera[j]] ** 4 * variance)
+    return _Pairs(i, j, cost)
 
 
 def noise_xy(sightings: Sightings, slack_px: float) -> Array:

@@ -21,13 +21,16 @@ from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
 from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.state import POSITION, States, exp_so3
+from fusion.state import POSITION, THETA, States, exp_so3
 from fusion.watch import Watch
 
 Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
+FOLLOWED_RAD = (
+    0.15  # likewise of its turn: a constellation turned further looks as if its markers were swapped
+)
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -195,8 +198,9 @@ class Tracker:
         One that was seen just now is, in the camera that saw it, however badly its range is known.
         """
         alive = np.array([status in ("tracked", "coasting") for status in self.status])
-        sigma2 = np.einsum("nii->n", states.P[:, POSITION, POSITION]) / 3
-        return alive & ((sigma2 < FOLLOWED_M**2) | self._seen)
+        place2, turn2 = (np.einsum("nii->n", states.P[:, part, part]) / 3 for part in (POSITION, THETA))
+        turned = (turn2 > FOLLOWED_RAD**2) & ~self.estimator.single
+        return alive & ((place2 < FOLLOWED_M**2) & ~turned | self._seen)
 
     def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
         """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""

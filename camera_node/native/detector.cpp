@@ -17,6 +17,7 @@ namespace {
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
 constexpr int kMaxFits = 512;          // to new places of a frame
+constexpr size_t kMaxSmeared = 8;      // lost roundels of a frame that are looked for smeared
 constexpr double kNoiseSpan = 8.5;     // standard deviations
 
 }  // namespace
@@ -42,16 +43,21 @@ void Detector::follow(const ImageView& image) {
             lost_.push_back(expected);
 }
 
-/// Those that were in the last frame, and are not to be seen sharp in this one.
+/// Those that were in the last frame, and are not to be seen sharp in this one; the fastest, where a light
+/// that went out took all of them.
 void Detector::follow_smeared(const ImageView& image) {
-    for (const auto& expected : lost_) {
+    const auto speed = [](const Tracks::Expected& e) { return std::hypot(e.vx, e.vy); };
+    const auto last = lost_.begin() + std::ptrdiff_t(std::min(lost_.size(), kMaxSmeared));
+    std::partial_sort(lost_.begin(), last, lost_.end(),
+                      [&](const auto& a, const auto& b) { return speed(a) > speed(b); });
+    for (auto expected = lost_.begin(); expected != last; ++expected) {
         const auto is_it = [&](const Roundel& r) {
-            const double apart =
-                std::hypot(r.fit.outer.x - double(expected.seed.x), r.fit.outer.y - double(expected.seed.y));
+            const double apart = std::hypot(r.fit.outer.x - double(expected->seed.x),
+                                            r.fit.outer.y - double(expected->seed.y));
             return r.track < 0 && apart < r.fit.outer.major;
         };
         if (std::none_of(found_.begin(), found_.end(), is_it))
-            keep(image, follow_moving(image, expected, settings_, noise_), expected.track);
+            keep(image, follow_moving(image, *expected, settings_, noise_), expected->track);
     }
 }
 

@@ -15,6 +15,18 @@ constexpr int kPixels = 1500;  // that are looked at, about
 constexpr double kChance = 4;  // standard deviations
 constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
 
+/// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse,
+/// takes a sixth of the time of the exact one.
+float direction(float x, float y) {
+    const float across = std::abs(x), up = std::abs(y),
+                t = std::min(across, up) / std::max({across, up, 1e-9f});
+    const float tt = t * t;
+    float angle = t + t * tt * (-0.327622764f + tt * (0.15931422f - tt * 0.0464964749f));
+    if (up > across) angle = float(std::numbers::pi / 2) - angle;
+    if (x < 0) angle = float(std::numbers::pi) - angle;
+    return y < 0 ? -angle : angle;
+}
+
 /// Which edge a pixel belongs to, and which sector of it.
 class Compass {
   public:
@@ -29,7 +41,7 @@ class Compass {
     };
     Place locate(float x, float y) const {
         const float dx = x - x_, dy = y - y_, qx = xx_ * dx + xy_ * dy, qy = xy_ * dx + yy_ * dy;
-        const float turn = std::atan2(qy, qx) * float(kSectors / (2 * std::numbers::pi));
+        const float turn = direction(qx, qy) * float(kSectors / (2 * std::numbers::pi));
         return {qx * qx + qy * qy < between_, int(turn + kSectors) % kSectors};
     }
 
