@@ -52,8 +52,10 @@ def test_curvature_and_perspective_do_not_bend_the_size(tilt_deg: float, blur: f
 @pytest.mark.parametrize("level", [20.0, 240.0])
 @pytest.mark.parametrize("share", [0.1, 0.2])
 def test_what_covers_a_part_does_not_move_the_rest(level: float, share: float):
-    """A straight edge over a part of the diameter: if it is found, it is where its own covariance says, which for what is
-    left of it is no more than 0.02 px; one in a thousand may be off by more than chi-square's 13.8."""
+    """A straight edge over a part of the diameter: if it is found, it is where its own covariance says.
+
+    What is left of it tells its place to 0.02 px; one in a thousand is off by more than chi-square's 13.8.
+    """
     disc = Disc((80.3, 60.6), 32, 0.3, turn=0.5)
     clean, (centre, axes) = render([disc]), outer_conic(disc, PRINCIPAL)
     clean[:, int(centre[0] + axes[1] * (0.5 - share)) :] = level
