@@ -66,6 +66,12 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         super().__post_init__()
         if len(self.markers) > MAX_MARKERS:
             raise ValueError(f"a robot has {MAX_MARKERS} markers at the most")
+        for (i, a), (j, b) in combinations(enumerate(self.markers), 2):
+            if math.dist(a, b) < self.diameter_m:
+                raise ValueError(
+                    f"markers {i} and {j} are {math.dist(a, b):.4g} m apart and {self.diameter_m:.4g} m across: "
+                    "their discs would overlap; all lengths are in metres"
+                )
         if len(self.markers) > 1 and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2:
             raise ValueError(
                 "markers on one line (or only two) leave the turn about it unknown; "
