@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 import yaml
 
 from camera_node.errors import ConfigError
@@ -102,6 +103,13 @@ def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
     return [name for f in info.fields if f.encode_name == steps[0] for name in _fields(f.type, steps[1:])]
 
 
+def dump_yaml(data: msgspec.Struct) -> str:
+    """A file's text, short lists on one line; fields at their defaults are left out if the struct says so."""
+    return yaml.dump(
+        msgspec.to_builtins(data), Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True
+    )
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Write a file so that a reader sees the old text or the new one, never a part.
 
@@ -122,3 +130,17 @@ def write_atomically(path: Path, text: str) -> None:
             raise
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}; is its folder there?") from None
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers stand on one line, as a person would write them."""
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:
+    flat = all(isinstance(x, (int, float, str)) for x in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_Dumper.add_representer(list, _represent_list)
+_Dumper.add_representer(tuple, _represent_list)
+_Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))

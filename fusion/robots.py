@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calib.alignment import rigid_motions
 from camera_node.body import Body
-from camera_node.config import is_name, load_yaml
+from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from fusion.errors import FusionError
 
@@ -99,11 +99,22 @@ def load_robots(path: Path) -> dict[str, Robot]:
         ConfigError: the file is missing or broken, or declares no robot.
         FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
     """
-    robots = load_yaml(path, _Robots).robots
+    robots = load_kept_robots(path)
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
+    return robots
+
+
+def load_kept_robots(path: Path) -> dict[str, Robot]:
+    """As `load_robots`; there may be none, where all were removed over the network."""
+    robots = load_yaml(path, _Robots).robots
     require_trackable(robots, str(path))
     return robots
+
+
+def save_robots(robots: dict[str, Robot], path: Path) -> None:
+    """Write robots as a `robots.yaml`, atomically; ConfigError where the folder can't be written to."""
+    write_atomically(path, dump_yaml(_Robots(robots)))
 
 
 def require_trackable(robots: dict[str, Robot], where: str) -> None:
