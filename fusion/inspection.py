@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """After an instant was told: frames are compared with what robots seen by two other cameras should look like.
 
-A camera that stands is looked at in turn, just often enough that a move is named within a second; one that is set aside,
-in every instant.
+A camera that stands is looked at in turn, just often enough that a move is named within a second; one that is set
+aside, in every instant.
 """
 
 from typing import Protocol
