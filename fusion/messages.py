@@ -52,8 +52,10 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     latency: Latency | None = None  # None offline
 
     def check(self) -> None:
-        """Raise MessageError unless the numbers are finite and the covariance has its size."""
+        """Raise MessageError unless the numbers are finite, the quaternion is one and the covariance has its size."""
         numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
+        if not any(self.quaternion_wxyz):
+            raise MessageError("a pose whose quaternion is zero")
         if len(self.covariance) != 576 or not all(map(math.isfinite, numbers)):
             raise MessageError("a pose that is not finite, or a covariance that is not 12 x 12")
 

@@ -141,3 +141,29 @@ def test_every_field_is_documented():
                 assert section, f"{name} has no section"
                 missing = [field for field in kind.__struct_fields__ if f"| `{field}` |" not in section]
                 assert not missing, f"{name} lacks {missing}"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("quaternion_wxyz", (0.0, 0.0, 0.0, 0.0)),
+        ("position", (np.nan, 0.0, 0.0)),
+        ("covariance", bytes(575)),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(field: str, value: object):
+    good = {
+        "robot": "a",
+        "t_ns": 1,
+        "state": "tracked",
+        "position": (0.0, 0.0, 0.0),
+        "quaternion_wxyz": (1.0, 0.0, 0.0, 0.0),
+        "velocity": (0.0, 0.0, 0.0),
+        "angular_velocity": (0.0, 0.0, 0.0),
+        "covariance": bytes(576),
+        "n_markers": 3,
+        "cameras": (),
+    }
+    assert decode(msgspec.msgpack.encode(good), RobotPose).robot == "a"
+    with pytest.raises(MessageError):
+        decode(msgspec.msgpack.encode({**good, field: value}), RobotPose)
