@@ -36,10 +36,14 @@ AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added."""
+    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added.
+
+    `information` (N, 12, 12) is the inverse of the states' covariance: made here, before the last detection is there.
+    """
 
     before: Array  # (N, 12, 12) covariance at the last instant
     states: States
+    information: Array
     F: Array
     Q: Array
 
@@ -79,9 +83,9 @@ class _System:
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
         """(B, 12, 12) information and (B, 12) right sides, by weights (B, S)."""
-        B = len(weights)
-        flat = self._table.reshape(B, -1, 13)
-        product = (self._table * weights[:, :, None, None]).reshape(B, -1, 13).transpose(0, 2, 1) @ flat
+        flat = self._table.reshape(len(weights), -1, 13)
+        weighted = (self._table * weights[:, :, None, None]).reshape(flat.shape)
+        product = weighted.transpose(0, 2, 1) @ flat
         return product[:, :12, :12], product[:, :12, 12]
 
     def remainder(self, step: Array) -> Array:
@@ -132,8 +136,9 @@ class Estimator:
     def predict(self, states: States, dt: Array) -> Prediction:
         """All robots, `dt` (N,) seconds later."""
         moved, F, Q = predict(states, dt, self.densities, self.single)
-        moved.P[self.single] = forget_turn(moved.P[self.single])
-        return Prediction(states.P, moved, F, Q)
+        if self.single.any():
+            moved.P[self.single] = forget_turn(moved.P[self.single])
+        return Prediction(states.P, moved, np.asarray(np.linalg.inv(moved.P), float), F, Q)
 
     def update(
         self, prediction: Prediction, observations: Observations, small: float = SMALL
@@ -153,8 +158,8 @@ class Estimator:
         if not len(seen):
             return states, np.empty((2, 0))
         observations = self._loosened(states, observations)
-        prior, shaped = np.asarray(np.linalg.inv(states.P[seen]), float), _shaped(observations)
-        solve = partial(self._solve, observations, shaped, seen, prior)
+        prior = prediction.information[seen]
+        solve = partial(self._solve, observations, _shaped(observations), seen, prior)
         solution = solve(states, np.zeros((n, 12)), None)
         for _ in range(ITERATIONS - 1):
             if np.max(np.abs(solution.step[:, :6])) < small:
@@ -162,7 +167,8 @@ class Estimator:
             solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
         P = states.P.copy()
         P[seen] = np.linalg.inv(solution.information)
-        P[self.single] = forget_turn(P[self.single])
+        if self.single.any():
+            P[self.single] = forget_turn(P[self.single])
         return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)
 
     def _solve(
@@ -183,7 +189,7 @@ class Estimator:
         weights = np.ones(system.shape) if weights is None else weights
         for _ in range(REWEIGHTINGS):
             H, right = system.normal_equations(weights)
-            step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]
+            step = np.asarray(np.linalg.solve(prior + H, (right - displaced)[:, :, None]), float)[:, :, 0]
             before, weights = weights, _weights(system.remainder(step))
             if np.max(np.abs(weights - before), initial=0) < SETTLED:
                 break
