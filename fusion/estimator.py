@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Optics, measured_outlines, outlines
+from fusion.optics import Optics, Poses, Views, measured_outlines, outlines, shears
 from fusion.sightings import Observations
 from fusion.state import OMEGA, States, forget_turn, predict
 
@@ -75,9 +75,8 @@ class _System:
         size = int(count.max())
         self._at = np.empty(len(order), np.intp)
         self._at[order] = rows.body[order] * size + place
-        table = np.zeros((n_bodies * size, 2, 13))
-        table[self._at, :, :12] = rows.A.transpose(2, 0, 1)
-        table[self._at, :, 12] = rows.b.T
+        table = np.zeros((n_bodies * size, 26))
+        table[self._at] = np.concatenate([rows.A, rows.b[:, None]], 1).reshape(26, -1).T
         self._table = table.reshape(n_bodies, size, 2, 13)
         self.shape = (n_bodies, size)
 
@@ -236,24 +235,9 @@ class Estimator:
             A[..., unseen] = b[:, unseen] = 0
             shaped = shaped[~unseen[shaped]]
         rows = _Rows(discs.body, A, b)
-        return (
-            rows.joined(self._linearise_shapes(states, observations.select(shaped))) if len(shaped) else rows
-        )
-
-    def _linearise_shapes(self, states: States, observations: Observations) -> _Rows:
-        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
-        seen, discs = observations.seen, observations.discs
-        poses = self.optics.pose(states, seen.exposures)
-        R, views = poses.R_cam[..., poses.columns(discs)], self.optics.view(poses, discs)
-        measured = measured_outlines(seen.axes_px, seen.angle_rad)
-        turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
-        at, about_x, about_y = (
-            shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
-        )
-        A = np.zeros((2, 12, len(discs)))
-        A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
-        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-        return _Rows(discs.body, A / sigma, at / sigma)
+        if not len(shaped):
+            return rows
+        return rows.joined(_linearise_shapes(observations.select(shaped), poses, views.select(shaped)))
 
 
 def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
@@ -266,6 +250,21 @@ def misfit(observations: Observations, remainder: Array, slack_px: float) -> Arr
 def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
     """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
     return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
+
+
+def _linearise_shapes(observations: Observations, poses: Poses, views: Views) -> _Rows:
+    """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
+    seen, discs = observations.seen, observations.discs
+    R = poses.R_cam[..., poses.columns(discs)]
+    measured = measured_outlines(seen.axes_px, seen.angle_rad)
+    turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
+    at, about_x, about_y = (
+        shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
+    )
+    A = np.zeros((2, 12, len(discs)))
+    A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
+    sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+    return _Rows(discs.body, A / sigma, at / sigma)
 
 
 def _eliminate(information: Array, right: Array) -> Array:
@@ -294,17 +293,3 @@ def _shaped(observations: Observations) -> Index:
     body[discs.row] = discs.body
     kinds = np.bincount(body[body >= 0], minlength=1)
     return np.flatnonzero((kinds[discs.body] < 3) & np.isfinite(observations.seen.axes_px[1]))
-
-
-def shears(measured: Array, expected: Array) -> Array:
-    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
-
-    The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
-    """
-    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
-    l10 = expected[:, 1, 0] / l00
-    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
-    a = measured[:, 0, 0] / l00**2
-    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
-    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
-    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))
