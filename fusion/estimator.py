@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Optics, measured_outlines, outlines
+from fusion.optics import Optics, Poses, Views, measured_outlines, outlines, shears
 from fusion.sightings import Observations
 from fusion.state import OMEGA, States, forget_turn, predict
 
@@ -36,10 +36,14 @@ AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added."""
+    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added.
+
+    `information` (N, 12, 12) is the inverse of the states' covariance: made here, before the last detection is there.
+    """
 
     before: Array  # (N, 12, 12) covariance at the last instant
     states: States
+    information: Array
     F: Array
     Q: Array
 
@@ -71,17 +75,16 @@ class _System:
         size = int(count.max())
         self._at = np.empty(len(order), np.intp)
         self._at[order] = rows.body[order] * size + place
-        table = np.zeros((n_bodies * size, 2, 13))
-        table[self._at, :, :12] = rows.A.transpose(2, 0, 1)
-        table[self._at, :, 12] = rows.b.T
+        table = np.zeros((n_bodies * size, 26))
+        table[self._at] = np.concatenate([rows.A, rows.b[:, None]], 1).reshape(26, -1).T
         self._table = table.reshape(n_bodies, size, 2, 13)
         self.shape = (n_bodies, size)
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
         """(B, 12, 12) information and (B, 12) right sides, by weights (B, S)."""
-        B = len(weights)
-        flat = self._table.reshape(B, -1, 13)
-        product = (self._table * weights[:, :, None, None]).reshape(B, -1, 13).transpose(0, 2, 1) @ flat
+        flat = self._table.reshape(len(weights), -1, 13)
+        weighted = (self._table * weights[:, :, None, None]).reshape(flat.shape)
+        product = weighted.transpose(0, 2, 1) @ flat
         return product[:, :12, :12], product[:, :12, 12]
 
     def remainder(self, step: Array) -> Array:
@@ -132,8 +135,9 @@ class Estimator:
     def predict(self, states: States, dt: Array) -> Prediction:
         """All robots, `dt` (N,) seconds later."""
         moved, F, Q = predict(states, dt, self.densities, self.single)
-        moved.P[self.single] = forget_turn(moved.P[self.single])
-        return Prediction(states.P, moved, F, Q)
+        if self.single.any():
+            moved.P[self.single] = forget_turn(moved.P[self.single])
+        return Prediction(states.P, moved, np.asarray(np.linalg.inv(moved.P), float), F, Q)
 
     def update(
         self, prediction: Prediction, observations: Observations, small: float = SMALL
@@ -153,8 +157,8 @@ class Estimator:
         if not len(seen):
             return states, np.empty((2, 0))
         observations = self._loosened(states, observations)
-        prior, shaped = np.asarray(np.linalg.inv(states.P[seen]), float), _shaped(observations)
-        solve = partial(self._solve, observations, shaped, seen, prior)
+        prior = prediction.information[seen]
+        solve = partial(self._solve, observations, _shaped(observations), seen, prior)
         solution = solve(states, np.zeros((n, 12)), None)
         for _ in range(ITERATIONS - 1):
             if np.max(np.abs(solution.step[:, :6])) < small:
@@ -162,7 +166,8 @@ class Estimator:
             solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
         P = states.P.copy()
         P[seen] = np.linalg.inv(solution.information)
-        P[self.single] = forget_turn(P[self.single])
+        if self.single.any():
+            P[self.single] = forget_turn(P[self.single])
         return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)
 
     def _solve(
@@ -183,7 +188,7 @@ class Estimator:
         weights = np.ones(system.shape) if weights is None else weights
         for _ in range(REWEIGHTINGS):
             H, right = system.normal_equations(weights)
-            step = np.linalg.solve(prior + H, (right - displaced)[:, :, None])[:, :, 0]
+            step = np.asarray(np.linalg.solve(prior + H, (right - displaced)[:, :, None]), float)[:, :, 0]
             before, weights = weights, _weights(system.remainder(step))
             if np.max(np.abs(weights - before), initial=0) < SETTLED:
                 break
@@ -230,24 +235,9 @@ class Estimator:
             A[..., unseen] = b[:, unseen] = 0
             shaped = shaped[~unseen[shaped]]
         rows = _Rows(discs.body, A, b)
-        return (
-            rows.joined(self._linearise_shapes(states, observations.select(shaped))) if len(shaped) else rows
-        )
-
-    def _linearise_shapes(self, states: States, observations: Observations) -> _Rows:
-        """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
-        seen, discs = observations.seen, observations.discs
-        poses = self.optics.pose(states, seen.exposures)
-        R, views = poses.R_cam[..., poses.columns(discs)], self.optics.view(poses, discs)
-        measured = measured_outlines(seen.axes_px, seen.angle_rad)
-        turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
-        at, about_x, about_y = (
-            shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
-        )
-        A = np.zeros((2, 12, len(discs)))
-        A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
-        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-        return _Rows(discs.body, A / sigma, at / sigma)
+        if not len(shaped):
+            return rows
+        return rows.joined(_linearise_shapes(observations.select(shaped), poses, views.select(shaped)))
 
 
 def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
@@ -260,6 +250,21 @@ def misfit(observations: Observations, remainder: Array, slack_px: float) -> Arr
 def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
     """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
     return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
+
+
+def _linearise_shapes(observations: Observations, poses: Poses, views: Views) -> _Rows:
+    """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
+    seen, discs = observations.seen, observations.discs
+    R = poses.R_cam[..., poses.columns(discs)]
+    measured = measured_outlines(seen.axes_px, seen.angle_rad)
+    turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
+    at, about_x, about_y = (
+        shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
+    )
+    A = np.zeros((2, 12, len(discs)))
+    A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
+    sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+    return _Rows(discs.body, A / sigma, at / sigma)
 
 
 def _eliminate(information: Array, right: Array) -> Array:
@@ -288,17 +293,3 @@ def _shaped(observations: Observations) -> Index:
     body[discs.row] = discs.body
     kinds = np.bincount(body[body >= 0], minlength=1)
     return np.flatnonzero((kinds[discs.body] < 3) & np.isfinite(observations.seen.axes_px[1]))
-
-
-def shears(measured: Array, expected: Array) -> Array:
-    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
-
-    The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
-    """
-    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
-    l10 = expected[:, 1, 0] / l00
-    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
-    a = measured[:, 0, 0] / l00**2
-    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
-    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
-    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))

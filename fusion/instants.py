@@ -3,7 +3,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -44,10 +44,12 @@ class Frame:
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "Frame":
         """The frame that a message of a calibrated camera tells of."""
-        t_ns = message.t_ns + round(camera.time_offset_ms * 1e6)
-        measured = cls.measure(message.camera, t_ns, message.unpack(), camera)
-        return replace(
-            measured,
+        roundels = message.unpack()
+        return cls(
+            message.camera,
+            message.t_ns + round(camera.time_offset_ms * 1e6),
+            roundels,
+            *undistort(camera, roundels.uv),
             sent_ns=message.sent_ns,
             received_ns=received_ns,
             exposure_us=message.exposure_us,

@@ -5,9 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.discs import fibonacci_sphere
-from fusion.estimator import AXIS_SIGMA_PX, shears
+from fusion.estimator import AXIS_SIGMA_PX
 from fusion.grouping import Marker
-from fusion.optics import Optics, measured_outlines, outlines
+from fusion.optics import Optics, measured_outlines, outlines, shears
 from fusion.sightings import Sightings
 
 Array = NDArray[np.float64]

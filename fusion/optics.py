@@ -86,6 +86,10 @@ class Views:
     q: Array
     xy: Array
 
+    def select(self, rows: NDArray) -> "Views":
+        """The columns that a mask or an index array names."""
+        return Views(*(getattr(self, name)[..., rows] for name in self.__slots__))
+
     @property
     def facing(self) -> Array:
         """(N,) cosine between the normal and the direction to the camera: above 0 if the print is visible."""
@@ -158,7 +162,10 @@ class Optics:
         R = _take(poses.R_cam, at)
         h, k = np.einsum("ain,ijn->ajn", by_centre, R), np.einsum("ain,ijn->ajn", by_normal, R)
         J = np.empty((2, 12, len(at)))
-        J[:, THETA] = np.stack([_cross(discs.marker, row) for row in h])  # h (w x m) = (m x h) w
+        x, y, z = discs.marker
+        J[:, 0] = y * h[:, 2] - z * h[:, 1]  # h (w x m) = (m x h) w
+        J[:, 1] = z * h[:, 0] - x * h[:, 2]
+        J[:, 2] = x * h[:, 1] - y * h[:, 0]
         J[:, 0] -= k[:, 1]
         J[:, 1] += k[:, 0]
         R_cw = _take(self._R_cw, exposures.camera[discs.frame])
@@ -209,6 +216,20 @@ def measured_outlines(axes_px: Array, angle_rad: Array) -> Array:
     return U @ (U.transpose(0, 2, 1) * (axes_px.T[:, :, None] / 2) ** 2)
 
 
+def shears(measured: Array, expected: Array) -> Array:
+    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
+
+    The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
+    """
+    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
+    l10 = expected[:, 1, 0] / l00
+    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
+    a = measured[:, 0, 0] / l00**2
+    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
+    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
+    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))
+
+
 def _rotations(R: Array) -> Array:
     """(..., 3, 3) -> (3, 3, K), memory along K."""
     return np.ascontiguousarray(R.reshape(-1, 3, 3).transpose(1, 2, 0))
@@ -216,8 +237,3 @@ def _rotations(R: Array) -> Array:
 
 def _take(A: Array, columns: Index) -> Array:
     return np.take(A, columns, axis=-1)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """(3, N) cross products of columns."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
