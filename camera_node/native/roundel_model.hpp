@@ -13,6 +13,7 @@ namespace roundel {
 ///
 /// The pose stands last, so that its covariance is the last block of a Cholesky factor.
 enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
+constexpr double kCardRatio = 9.0 / 7;  // of the card's diameter to the outer one, where it was not fitted
 constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
 using Parameters = Vector<kCount>;
 using Matrix = std::array<Parameters, kCount>;
