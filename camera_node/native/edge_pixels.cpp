@@ -129,8 +129,8 @@ ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, co
 
 }  // namespace
 
-int select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
-                  EdgePixels& pixels) {
+void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+                   EdgePixels& pixels) {
     const Strips narrow(p, band.narrow, band.card), wide(p, band.wide, band.card);
     const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
     pixels.used = pixels.expected = 0;
@@ -138,7 +138,6 @@ int select_pixels(const ImageView& image, const Parameters& p, const Band& band,
     const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
     append_rows(image, narrow, wide, step, pixels);
     pixels.fill_up();
-    return step;
 }
 
 }  // namespace roundel

@@ -13,7 +13,6 @@ struct Ellipse {
 struct Symmetric {
     double xx, xy, yy;
     double det() const { return xx * yy - xy * xy; }
-    Symmetric scaled(double by) const { return {by * xx, by * xy, by * yy}; }
 };
 
 /// Eigenvalues, the larger first, and the direction of its eigenvector in (-pi/2, pi/2].

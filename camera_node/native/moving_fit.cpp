@@ -7,6 +7,7 @@
 #include "cholesky.hpp"
 #include "moving_sums.hpp"
 #include "pose_outputs.hpp"
+#include "starting_point.hpp"
 
 namespace roundel {
 
@@ -16,11 +17,11 @@ constexpr int kCoarsePixels = 240, kFinePixels = 1200;
 constexpr double kCoarseSpacing = 1.5, kFineSpacing = 1;  // of the exposure's instants, pixels
 constexpr int kCoarseSteps = 14, kFineSteps = 5;
 constexpr double kArrived = 0.1, kDone = 0.01;  // greatest moves of a step, pixels
-constexpr double kMinBlur = 0.29, kStartBlur = 0.9;
-constexpr double kCardRatio = 9.0 / 7;
+constexpr double kStartBlur = 0.9;
+// Standard deviations before a pixel is seen: less than in `refine`, as a motion hides both.
+constexpr double kAnyRatio = 0.05, kAnyBlur = 0.5;
 constexpr double kLeastMotion = 0.1;  // of the minor axis: what moves less is still
 constexpr double kHopeless = 0.15;    // residuals over the contrast that no more steps will mend
-constexpr double kShortestFocal = 400;
 constexpr double kBeyond = 100;       // grey levels off the scale
 constexpr double kLeastSpread = 0.2;  // of the ground, grey levels
 constexpr double kMostSpread = 100;
@@ -28,28 +29,12 @@ constexpr double kPatch = 64;  // pixels of the ground that are off together
 
 double square(double x) { return x * x; }
 
-MovingParameters begin(const MovingStart& s, const MovingPixels& frame) {
-    const Ellipse& e = s.still.outer;
-    const double c = std::cos(e.angle), n = std::sin(e.angle), a = e.major / 2, b = e.minor / 2;
+/// A motion and a still picture's parameters.
+MovingParameters join(double x, double y, const Parameters& picture) {
     MovingParameters p{};
-    double* q = p.data() + kStill;
-    q[kX] = e.x - frame.origin_x, q[kY] = e.y - frame.origin_y;
-    q[kAxx] = a * c * c + b * n * n, q[kAxy] = (a - b) * c * n, q[kAyy] = a * n * n + b * c * c;
-    q[kRatio] = s.still.ratio, q[kCard] = kCardRatio, q[kBlur] = kStartBlur;
-    q[kDark] = s.still.dark, q[kBright] = q[kGround] = s.still.bright;
-    p[kMotionX] = s.motion_x, p[kMotionY] = s.motion_y;
+    p[kMotionX] = x, p[kMotionY] = y;
+    std::copy(picture.begin(), picture.end(), p.begin() + kStill);
     return p;
-}
-
-/// Information (1 / variance) before a pixel is seen: as in `refine`, and tighter for the blur and the ratio,
-/// which a motion hides.
-MovingParameters prior_information(const MovingStart& s) {
-    MovingParameters w{};
-    double* q = w.data() + kStill;
-    q[kRatio] = 1 / square(0.05), q[kCard] = 1 / square(0.05);
-    q[kGround] = 1 / square(100), q[kBlur] = 1 / square(0.5);
-    q[kGx] = q[kGy] = square(kShortestFocal / (s.still.outer.major / 2));
-    return w;
 }
 
 /// Gauss-Newton on the pixels that a moving roundel passes.
@@ -58,8 +43,9 @@ class MovingFitter {
     MovingFitter(const ImageView& image, const MovingStart& start) : image_(image) {
         pixels_.origin_x = int(std::lround(start.still.outer.x));
         pixels_.origin_y = int(std::lround(start.still.outer.y));
-        p_ = start_ = begin(start, pixels_);
-        prior_ = prior_information(start);
+        p_ = start_ = join(start.motion_x, start.motion_y,
+                           starting_point(start.still, pixels_.origin_x, pixels_.origin_y, kStartBlur));
+        prior_ = join(0, 0, prior_information(start.still.outer.major, kAnyRatio, kAnyBlur));
     }
 
     bool solve() {
@@ -138,19 +124,10 @@ class MovingFitter {
 };
 
 Fit MovingFitter::fit() const {
-    const Parameters p = still(p_);
-    const CircleImage outer = circle_image(p, 1);
-    const Eigen axes = eigen(outer.shape);
-    Fit fit{};
-    fit.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
-                 2 * std::sqrt(axes.second), axes.angle};
-    fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
-    fit.p = p, fit.p[kX] += pixels_.origin_x, fit.p[kY] += pixels_.origin_y;
-    fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
     auto pose = factor_->inverse_tail<kPoseCount>();
     for (auto& row : pose)
         for (double& value : row) value *= square(noise_);
-    fit.C = output_covariance(p, pose);
+    Fit fit = fit_of(still(p_), pose, pixels_.origin_x, pixels_.origin_y);
     fit.motion_x = p_[kMotionX], fit.motion_y = p_[kMotionY];
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = noise_;

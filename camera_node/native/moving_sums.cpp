@@ -5,6 +5,7 @@
 #include <cmath>
 #include <numbers>
 
+#include "gram.hpp"
 #include "simd.hpp"
 
 namespace roundel {
@@ -15,18 +16,14 @@ constexpr int kColumns = kMovingCount + 1;  // the gradient and the residual
 constexpr double kMargin = 2.5;             // pixels around the disc's way
 
 struct LaneSums {
-    Lanes gram[kColumns][kColumns];
+    Gram<kColumns> gram;
     Lanes w, ring, ring_rr, ground, ground_rr, ground_ground;
 };
 
-using Columns = Lanes[kColumns][kChunk];
-
 ROUNDEL_INLINE void weigh(const MovingGradient& model, const Lanes& level, float spread, int k,
-                          Columns& columns, LaneSums& sums) {
+                          Columns<kColumns>& columns, LaneSums& sums) {
     const Lanes r = level - model.level[k], share = model.by[kStill + kGround][k], gg = share * share;
-    const Bits clipped = ((level > 254.5f) & (model.level[k] > 255.0f)) |
-                         ((level < 0.5f) & (level >= 0.0f) & (model.level[k] < 0.0f));
-    const Bits counts = (level >= 0.0f) & ~clipped;
+    const Bits counts = ~is_silent(level, model.level[k]);
     const Lanes w = counts ? 1.0f / (1.0f + spread * gg) : all(0);
     const Lanes root = w > 0.0f ? w * inverse_sqrt(w > 0.0f ? w : all(1)) : all(0);
     const Lanes &bx = model.by[kStill + kX][k], &by = model.by[kStill + kY][k];
@@ -38,25 +35,16 @@ ROUNDEL_INLINE void weigh(const MovingGradient& model, const Lanes& level, float
     sums.ground += seen, sums.ground_rr += seen * r * r, sums.ground_ground += seen * gg;
 }
 
-ROUNDEL_INLINE void multiply(const Columns& columns, int count, LaneSums& sums) {
-    for (int i = 0; i < kColumns; ++i)
-        for (int j = i; j < kColumns; ++j) {
-            Lanes s = sums.gram[i][j];
-            for (int k = 0; k < count; ++k) s += columns[i][k] * columns[j][k];
-            sums.gram[i][j] = s;
-        }
-}
-
 ROUNDEL_CLONES void add_up(const MovingPixels& pixels, const MovingModel& model, float spread,
                            LaneSums& sums) {
     MovingGradient gradient;
-    Columns columns;
+    Columns<kColumns> columns;
     for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
         const int count = std::min(kChunk, (pixels.count - begin) / kLanes);
         model.evaluate(pixels.x + begin, pixels.y + begin, count, gradient);
         for (int k = 0; k < count; ++k)
             weigh(gradient, load(pixels.level + begin + k * kLanes), spread, k, columns, sums);
-        multiply(columns, count, sums);
+        multiply_all<kColumns>(columns, count, sums.gram);
     }
 }
 
@@ -106,8 +94,7 @@ void select_moving(const ImageView& image, const MovingParameters& p, int limit,
     for (int y = int(y0 - half_h); y <= int(y0 + half_h); y += step)
         for (int x = int(x0 - half_w); x <= int(x0 + half_w); x += step)
             if (way.distance(x, y) < reach) append(image, x, y, pixels);
-    pixels.count = (pixels.used + kLanes - 1) / kLanes * kLanes;
-    for (int k = pixels.used; k < pixels.count; ++k) pixels.x[k] = pixels.y[k] = 0, pixels.level[k] = -1;
+    pixels.fill_up();
 }
 
 MovingSums accumulate(const MovingPixels& pixels, const MovingParameters& p, double spacing, double spread) {

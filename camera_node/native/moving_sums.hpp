@@ -2,19 +2,12 @@
 #pragma once
 #include "image.hpp"
 #include "moving_model.hpp"
+#include "pixel_columns.hpp"
 
 namespace roundel {
 
-/// Pixels that a moving roundel passes, as columns, in a frame of their own near it. What fills the last
-/// eight has level -1 and does not count.
-struct MovingPixels {
-    static constexpr int kMax = 2048;
-    int origin_x = 0, origin_y = 0;  // of the frame, pixels of the image
-    int count = 0;                   // whole lanes
-    int used = 0;                    // pixels inside the image
-    int expected = 0;                // and outside
-    alignas(4 * kLanes) float x[kMax], y[kMax], level[kMax];
-};
+/// Pixels that a moving roundel passes.
+using MovingPixels = PixelColumns<2048>;
 
 /// Fills `pixels` by about `limit` of those that the disc passes, and a margin around its way.
 void select_moving(const ImageView& image, const MovingParameters& p, int limit, MovingPixels& pixels);

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "gram.hpp"
 #include "simd.hpp"
 
 namespace roundel {
@@ -10,36 +11,8 @@ namespace roundel {
 namespace {
 
 constexpr int kColumns = kCount + 1;  // the gradient and the residual
-constexpr int kHigh = 2, kWide = 4;   // products of so many columns stay in registers
 constexpr int kSample = 24;           // lanes
 constexpr int kHalvings = 10;         // of 256 grey levels
-
-using Columns = Lanes[kColumns][kChunk];
-using Gram = Lanes[kColumns][kColumns];
-
-/// Products of columns i .. i + m with columns j .. j + n.
-template <int i, int j, int m, int n>
-ROUNDEL_INLINE void multiply(const Columns& columns, int count, Gram& gram) {
-    Lanes s[m][n];
-    for (int a = 0; a < m; ++a)
-        for (int b = 0; b < n; ++b) s[a][b] = gram[i + a][j + b];
-    for (int k = 0; k < count; ++k)
-        for (int a = 0; a < m; ++a)
-            for (int b = 0; b < n; ++b) s[a][b] += columns[i + a][k] * columns[j + b][k];
-    for (int a = 0; a < m; ++a)
-        for (int b = 0; b < n; ++b) gram[i + a][j + b] = s[a][b];
-}
-
-/// All products of the columns, tile by tile, the upper triangle only.
-template <int i, int j>
-ROUNDEL_INLINE void multiply_all(const Columns& columns, int count, Gram& gram) {
-    constexpr int m = std::min(kHigh, kColumns - i), n = std::min(kWide, kColumns - j);
-    multiply<i, j, m, n>(columns, count, gram);
-    if constexpr (j + n < kColumns)
-        multiply_all<i, j + n>(columns, count, gram);
-    else if constexpr (i + m < kColumns)
-        multiply_all<i + m, i + m>(columns, count, gram);
-}
 
 /// The root of Tukey's weight of residuals that are `t` cuts.
 ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
@@ -53,8 +26,8 @@ ROUNDEL_CLONES void evaluate_all(const EdgePixels& pixels, const Model& model, G
                        std::min(kChunk, (pixels.count - begin) / kLanes), *chunks++);
 }
 
-ROUNDEL_CLONES void add_up(const Gradient* chunks, int lanes, float per_cut, Gram& gram) {
-    Columns columns;
+ROUNDEL_CLONES void add_up(const Gradient* chunks, int lanes, float per_cut, Gram<kColumns>& gram) {
+    Columns<kColumns> columns;
     for (; lanes > 0; lanes -= kChunk, ++chunks) {
         const int count = std::min(kChunk, lanes);
         for (int k = 0; k < count; ++k) {
@@ -62,7 +35,7 @@ ROUNDEL_CLONES void add_up(const Gradient* chunks, int lanes, float per_cut, Gra
             for (int i = 0; i < kCount; ++i) columns[i][k] = root * chunks->by[i][k];
             columns[kCount][k] = root * chunks->residual[k];
         }
-        multiply_all<0, 0>(columns, count, gram);
+        multiply_all<kColumns>(columns, count, gram);
     }
 }
 
@@ -136,7 +109,7 @@ void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
 double Linearisation::median_residual() const { return double(median_of(chunks_, count_)); }
 
 NormalEquations Linearisation::accumulate(double scale) const {
-    Gram gram{};
+    Gram<kColumns> gram{};
     add_up(chunks_, count_, float(1 / (kTukey * scale)), gram);
     NormalEquations e;
     for (int i = 0; i < kCount; ++i) {

@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <cmath>
+
 #include "refine.hpp"
 #include "roundel_model.hpp"
 
@@ -28,6 +30,22 @@ inline PoseCovariance output_covariance(const Parameters& p,
         for (int b = 0; b < kPoseCount; ++b)
             for (int j = 0; j < kPoseCount; ++j) whole[a][b] += half[a][j] * T[b][j];
     return whole;
+}
+
+/// A fit of what the parameters say, in the image's frame: `p` is in one of origin x, y, and `pose` the
+/// covariance of its pose.
+inline Fit fit_of(const Parameters& p, const std::array<Vector<kPoseCount>, kPoseCount>& pose, int origin_x,
+                  int origin_y) {
+    const CircleImage outer = circle_image(p, 1);
+    const Eigen axes = eigen(outer.shape);
+    Fit fit{};
+    fit.outer = {outer.x + origin_x, outer.y + origin_y, 2 * std::sqrt(axes.first),
+                 2 * std::sqrt(axes.second), axes.angle};
+    fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
+    fit.C = output_covariance(p, pose);
+    fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
+    fit.p = p, fit.p[kX] += origin_x, fit.p[kY] += origin_y;
+    return fit;
 }
 
 }  // namespace roundel

@@ -8,6 +8,7 @@
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
 #include "pose_outputs.hpp"
+#include "starting_point.hpp"
 
 namespace roundel {
 
@@ -23,39 +24,15 @@ constexpr double kConverged = 0.4;         // standard deviations that may be le
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
-constexpr double kMinBlur = 0.29;  // pixels: a pixel's own width alone
 constexpr double kStartBlur = 0.8;
-constexpr double kCardRatio = 9.0 / 7;
+constexpr double kAnyRatio = 0.3, kAnyBlur = 1;  // standard deviations before a pixel is seen
 constexpr double kBeyond = 64;     // grey levels off the scale that a small or clipped roundel may need
 constexpr double kPrint = 0.002;   // standard deviation of ratios among prints of one kind
 constexpr double kOtherPrint = 3;  // standard deviations
 constexpr double kStrict = 0.5;    // of it at first, when the model still bends to what it disagrees with
 constexpr double kSlack = 1.3;     // of a median of few, over the deviation it stands for
-constexpr double kShortestFocal = 400;  // pixels: no lens shows more perspective
-
-/// Starting values: A is the symmetric square root that maps the unit circle to the ellipse.
-Parameters begin(const Start& s, const EdgePixels& frame) {
-    const double c = std::cos(s.outer.angle), n = std::sin(s.outer.angle);
-    const double a = s.outer.major / 2, b = s.outer.minor / 2;
-    Parameters p{};
-    p[kX] = s.outer.x - frame.origin_x, p[kY] = s.outer.y - frame.origin_y;
-    p[kAxx] = a * c * c + b * n * n, p[kAxy] = (a - b) * c * n, p[kAyy] = a * n * n + b * c * c;
-    p[kRatio] = s.ratio, p[kCard] = kCardRatio, p[kBlur] = kStartBlur;
-    p[kDark] = s.dark, p[kBright] = p[kGround] = s.bright;
-    return p;
-}
 
 double square(double x) { return x * x; }
-
-/// What is known before a pixel is seen, as information (1 / variance): wide, only to hold what the pixels
-/// don't tell.
-Parameters prior_information(double major) {
-    Parameters w{};
-    w[kRatio] = 1 / square(0.3), w[kCard] = 1 / square(0.05);
-    w[kGround] = 1 / square(100), w[kBlur] = 1 / square(1);
-    w[kGx] = w[kGy] = square(kShortestFocal / (major / 2));  // g = r / f sin(tilt)
-    return w;
-}
 
 /// Gauss-Newton on the pixels near one roundel's edges.
 class Fitter {
@@ -63,8 +40,8 @@ class Fitter {
     Fitter(const ImageView& image, const Start& start) : image_(image), hidden_(start.hidden) {
         pixels_.origin_x = int(std::lround(start.outer.x));
         pixels_.origin_y = int(std::lround(start.outer.y));
-        p = start_ = begin(start, pixels_);
-        prior_ = prior_information(start.outer.major);
+        p = start_ = starting_point(start, pixels_.origin_x, pixels_.origin_y, kStartBlur);
+        prior_ = prior_information(start.outer.major, kAnyRatio, kAnyBlur);
     }
 
     bool solve() {
@@ -84,7 +61,7 @@ class Fitter {
     Parameters p;
 
   private:
-    PoseCovariance covariance() const;
+    std::array<Vector<kPoseCount>, kPoseCount> pose_covariance() const;
 
     bool select(const Band& band, int limit) {
         select_pixels(image_, p, band, limit, pixels_);
@@ -194,32 +171,20 @@ void Fitter::learn_print(double ratio) {
     for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
 }
 
-PoseCovariance Fitter::covariance() const {
+std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= known_[i] * known_[j];
     for (auto& row : inverse)
         for (double& value : row) value *= square(noise_);
-    return output_covariance(p, inverse);
+    return inverse;
 }
 
 Fit Fitter::fit() const {
-    const CircleImage outer = circle_image(p, 1);
-    const Eigen axes = eigen(outer.shape);
-    Parameters in_image = p;
-    in_image[kX] += pixels_.origin_x, in_image[kY] += pixels_.origin_y;
-    return {.outer = {outer.x + pixels_.origin_x, outer.y + pixels_.origin_y, 2 * std::sqrt(axes.first),
-                      2 * std::sqrt(axes.second), axes.angle},
-            .offset_x = p[kX] - outer.x,
-            .offset_y = p[kY] - outer.y,
-            .C = covariance(),
-            .ratio = p[kRatio],
-            .dark = p[kDark],
-            .bright = p[kBright],
-            .blur = p[kBlur],
-            .edge_residual = std::sqrt(left_.ring_rr / left_.ring),
-            .support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected,
-            .p = in_image};
+    Fit fit = fit_of(p, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
+    fit.edge_residual = std::sqrt(left_.ring_rr / left_.ring);
+    fit.support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected;
+    return fit;
 }
 
 }  // namespace

@@ -13,6 +13,7 @@ namespace roundel {
 ///
 /// The pose stands last, so that its covariance is the last block of a Cholesky factor.
 enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
+constexpr double kCardRatio = 9.0 / 7;  // of the card's diameter to the outer one, where it was not fitted
 constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
 using Parameters = Vector<kCount>;
 using Matrix = std::array<Parameters, kCount>;
@@ -38,6 +39,13 @@ constexpr int kChunk =
     31;  // lanes at a time: columns fit the first cache, and odd, so that they share no bank
 
 constexpr float kAbsent = 1e9f;  // a residual that does not count
+
+/// Pixels that do not count: absent ones (level -1), and clipped ones, which tell no more than that the
+/// modelled `level` is beyond the scale.
+ROUNDEL_INLINE Bits is_silent(const Lanes& seen, const Lanes& level) {
+    const Bits clipped = ((seen > 254.5f) & (level > 255.0f)) | ((seen < 0.5f) & (level < 0.0f));
+    return (seen < 0.0f) | clipped;
+}
 
 /// Of a chunk of pixels: the gradient of the grey levels by the parameters, what the ring's two edges have in
 /// their change with the distance, and the residuals.
@@ -145,11 +153,8 @@ class Model {
         return bright_ + fall_ * dark + drop_ * ground;
     }
 
-    /// The residual. What is clipped tells no more than that the level is beyond the scale, and does not
-    /// count.
     ROUNDEL_INLINE static Lanes compare(const Lanes& seen, const Lanes& level) {
-        const Bits clipped = ((seen > 254.5f) & (level > 255.0f)) | ((seen < 0.5f) & (level < 0.0f));
-        return (seen < 0.0f) | clipped ? all(kAbsent) : seen - level;
+        return is_silent(seen, level) ? all(kAbsent) : seen - level;
     }
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;

@@ -16,11 +16,10 @@ constexpr double kExtent = 1.15;             // of the grid, outer radii
 constexpr int kInstants = 12;                // of the exposure
 constexpr int kDirections = 6;
 constexpr double kLengths[] = {0.35, 0.7};  // of the motion, diameters
-constexpr double kCard = 9.0 / 7;
-constexpr double kSteps = 7;     // to a minor axis
-constexpr int kMost = 3;         // places to be fitted
-constexpr double kUnlike = 0.3;  // of the contrast: RMS of what is no roundel
-constexpr double kApart = 0.3;   // of the minor axis, from one place to the next
+constexpr double kSteps = 7;                // to a minor axis
+constexpr int kMost = 3;                    // places to be fitted
+constexpr double kUnlike = 0.3;             // of the contrast: RMS of what is no roundel
+constexpr double kApart = 0.3;              // of the minor axis, from one place to the next
 
 struct Point {
     double x, y;
@@ -74,7 +73,7 @@ class Appearance {
             for (int n = 0; n < kInstants; ++n) {
                 const double share = (n + 0.5) / kInstants - 0.5,
                              r = radius(at[k].x - share * x, at[k].y - share * y);
-                dark += r < 1 && r > fit_.ratio, ground += r > kCard;
+                dark += r < 1 && r > fit_.ratio, ground += r > kCardRatio;
             }
             t.level[k] = float(fit_.bright + (fit_.dark - fit_.bright) * dark / kInstants);
             t.ground[k] = float(ground / kInstants), t.ground_ground += t.ground[k] * t.ground[k];
