@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
-import yaml
 
 from calib.camera import Camera
 from calib.errors import CalibrationError
 from calib.history import keep
-from camera_node.config import load_yaml, write_atomically
+from camera_node.config import dump_yaml, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 
 T = TypeVar("T")
@@ -92,19 +90,4 @@ def save_rig(rig: Rig, path: Path) -> Path | None:
 
 def dump_rig(rig: Rig) -> str:
     """The rig as YAML text, short lists on one line."""
-    plain = msgspec.to_builtins(rig)
-    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True)
-
-
-class _Dumper(yaml.SafeDumper):
-    """Lists of numbers stand on one line, as a person would write them."""
-
-
-def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:
-    flat = all(isinstance(x, (int, float, str)) for x in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
-
-
-_Dumper.add_representer(list, _represent_list)
-_Dumper.add_representer(tuple, _represent_list)
-_Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))
+    return dump_yaml(rig)

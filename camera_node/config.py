@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Files that people write: YAML in, checked against a msgspec Struct; text out, atomically."""
 
+import difflib
 import os
 import re
 import tempfile
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 import yaml
 
 from camera_node.errors import ConfigError
@@ -44,7 +46,8 @@ def load_yaml(path: Path, kind: type[T]) -> T:
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {_name_entry(data, kind, str(error))}") from None
+        fault = _name_entry(data, kind, str(error))
+        raise ConfigError(f"{path}: {fault}{_suggest(kind, fault)}") from None
 
 
 def _require_single(node: yaml.Node | None) -> None:
@@ -77,6 +80,36 @@ def _name_entry(data: Any, kind: type, fault: str) -> str:
     return fault
 
 
+def _suggest(kind: type, fault: str) -> str:
+    """Where the fault is a field that does not exist: those that do, the one that was meant first if it shows."""
+    told = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
+    known = _fields(msgspec.inspect.type_info(kind), (told[2] or "").split(".")[1:]) if told else []
+    if not told or not known:
+        return ""
+    meant = difflib.get_close_matches(told[1], known, 1)
+    return f"; did you mean `{meant[0]}`?" if meant else f"; it may hold {', '.join(known)}"
+
+
+def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
+    """Names of the fields of the struct that lies some steps into a type."""
+    if isinstance(info, msgspec.inspect.UnionType):
+        return [name for kind in info.types for name in _fields(kind, steps)]
+    if isinstance(info, msgspec.inspect.DictType):
+        return _fields(info.value_type, steps[1:])
+    if not isinstance(info, msgspec.inspect.StructType):
+        return []
+    if not steps:
+        return [field.encode_name for field in info.fields]
+    return [name for f in info.fields if f.encode_name == steps[0] for name in _fields(f.type, steps[1:])]
+
+
+def dump_yaml(data: msgspec.Struct) -> str:
+    """A file's text, short lists on one line; fields at their defaults are left out if the struct says so."""
+    return yaml.dump(
+        msgspec.to_builtins(data), Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True
+    )
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Write a file so that a reader sees the old text or the new one, never a part.
 
@@ -97,3 +130,17 @@ def write_atomically(path: Path, text: str) -> None:
             raise
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}; is its folder there?") from None
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers stand on one line, as a person would write them."""
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:
+    flat = all(isinstance(x, (int, float, str)) for x in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_Dumper.add_representer(list, _represent_list)
+_Dumper.add_representer(tuple, _represent_list)
+_Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))

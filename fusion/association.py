@@ -135,49 +135,63 @@ class Association:
 
 
 def _spread(optics: Optics, exposures: Exposures, C: Array, views: Views) -> tuple[Array, Array]:
-    """Of places with covariances C (3, 3, F * M) in the world: (2, 2, F * M) covariance in the undistorted plane, and
-    (F * M,) variance of the depth's logarithm."""
+    """Of places with covariances C (3, 3, F * M) in the world: (3, F * M) variance of x, covariance, and variance of y
+    in the undistorted plane, and (F * M,) variance of the depth's logarithm."""
     R = optics.R_cam_world[exposures.camera]
     n_markers = C.shape[2] // len(R)
-    across = np.repeat(R[:, :2, :].transpose(1, 2, 0), n_markers, axis=2)
-    along = np.repeat(R[:, 2].T, n_markers, axis=1)
-    g = (across - views.xy[:, None] * along) / views.centre[2]
-    depth = np.einsum("in,ijn,jn->n", along, C, along) / views.centre[2] ** 2
-    return np.einsum("ain,bin->abn", np.einsum("ain,ijn->ajn", g, C), g), depth
+    R = np.repeat(R.transpose(1, 2, 0), n_markers, axis=2)
+    g = (R[:2] - views.xy[:, None] * R[2]) / views.centre[2]
+    x, y, along = (np.einsum("in,ijn->jn", row, C) for row in (g[0], g[1], R[2]))
+    spread = np.stack([_dot(x, g[0]), _dot(x, g[1]), _dot(y, g[1])])
+    return spread, _dot(along, R[2]) / views.centre[2] ** 2
 
 
 def _candidates(
     optics: Optics, discs: Discs, views: Views, spread: Array, depth: Array, sightings: Sightings
 ) -> _Pairs:
     """Detections within the gates of visible markers, found along x and then tested."""
-    noise = noise_xy(sightings, SLACK_PX)
+    noise = _noise(sightings)
     visible = np.flatnonzero((views.facing > GRAZING) & np.isfinite(views.xy[0]))
-    worst = np.array([[np.max(noise[0, 0])], [np.max(noise[1, 1])]])
-    reach = np.sqrt(GATE * (spread[[0, 1], [0, 1]][:, visible] + worst))
-    i, j = _windows(discs.frame[visible], views.xy[:, visible], reach, sightings)
+    worst = np.fmax.reduce(noise[[0, 2]], axis=1)[:, None]  # NaN where the lens has no inverse
+    xy, reach = views.xy.take(visible, 1), np.sqrt(GATE * (spread[[0, 2]].take(visible, 1) + worst))
+    i, j = _windows(discs.frame[visible], xy, reach, sightings)
+    u, v = sightings.xy.take(j, 1) - xy.take(i, 1)
     i = visible[i]
-    S = spread[:, :, i] + noise[:, :, j]
-    u, v = sightings.xy[:, j] - views.xy[:, i]
-    det = S[0, 0] * S[1, 1] - S[0, 1] ** 2
-    d2 = (S[1, 1] * u * u - 2 * S[0, 1] * u * v + S[0, 0] * v * v) / det
-    near = d2 < GATE
+    xx, xy, yy = spread.take(i, 1) + noise.take(j, 1)
+    det = xx * yy - xy * xy
+    d2 = (yy * u * u - 2 * xy * u * v + xx * v * v) / det
+    near = np.flatnonzero(d2 < GATE)
     i, j, d2, det = i[near], j[near], d2[near], det[near]
-    shape = outlines(views.centre[:, i], views.normal[:, i], discs.radius[i], sightings.scale[..., j])
-    major_px = 2 * np.sqrt(np.maximum(np.linalg.eigvalsh(shape)[:, 1], TINY_PX2))
-    size = np.log(sightings.axes_px[0, j] / major_px)
-    fits = ~(np.abs(size) > np.log(SIZE_RATIO))  # an unknown size, NaN, excludes nothing
+    size = np.log(sightings.axes_px[0, j] / _major_px(discs, views, sightings, i, j))
+    fits = np.flatnonzero(~(np.abs(size) > np.log(SIZE_RATIO)))  # an unknown size, NaN, excludes nothing
     i, j, variance = i[fits], j[fits], SIZE_SIGMA**2 + depth[i[fits]]
     unlike = np.nan_to_num(size[fits]) ** 2 / variance
     cost = d2[fits] + unlike + np.log(det[fits] * optics.focal[sightings.camera[j]] ** 4 * variance)
     return _Pairs(i, j, cost)
 
 
-def noise_xy(sightings: Sightings, slack_px: float) -> Array:
-    """(2, 2, N) the detections' noise in the undistorted plane; `slack_px` is added to it."""
+def _major_px(discs: Discs, views: Views, sightings: Sightings, i: Index, j: Index) -> Array:
+    """(N,) full major axes that discs i would have where j were detected."""
+    scale = sightings.scale.take(j, 2)
+    shape = outlines(views.centre.take(i, 1), views.normal.take(i, 1), discs.radius[i], scale)
+    a, b, c = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    largest = (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)) / 2  # eigenvalue
+    return 2 * np.sqrt(np.maximum(largest, TINY_PX2))
+
+
+def _noise(sightings: Sightings) -> Array:
+    """(3, N) the detections' noise in the undistorted plane, with the calibration's: as `_spread` tells it."""
     (a, b), (c, d) = sightings.scale
-    inverse = np.stack([np.stack([d, -b]), np.stack([-c, a])]) / (a * d - b * c)
-    cov = sightings.cov + slack_px**2 * np.eye(2)[:, :, None]
-    return np.nan_to_num(np.einsum("ian,abn,jbn->ijn", inverse, cov, inverse))
+    p, q, r = sightings.cov[0, 0] + SLACK_PX**2, sightings.cov[0, 1], sightings.cov[1, 1] + SLACK_PX**2
+    xx = d * d * p - 2 * d * b * q + b * b * r
+    xy = (a * d + b * c) * q - c * d * p - a * b * r
+    yy = c * c * p - 2 * c * a * q + a * a * r
+    return np.stack([xx, xy, yy]) / (a * d - b * c) ** 2
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """(N,) products of columns (3, N)."""
+    return np.einsum("in,in->n", a, b)
 
 
 def _windows(frame: Index, xy: Array, reach: Array, sightings: Sightings) -> tuple[Index, Index]:
@@ -185,15 +199,15 @@ def _windows(frame: Index, xy: Array, reach: Array, sightings: Sightings) -> tup
     known = np.flatnonzero(np.isfinite(sightings.xy[0]))
     key = sightings.frame[known] * FRAME_STEP + sightings.xy[0, known]
     order = np.argsort(key)
-    key = key[order]
+    key, known = key[order], known[order]
     x, reach_x = frame * FRAME_STEP + xy[0], np.minimum(reach[0], FRAME_STEP / 10)
     first = np.searchsorted(key, x - reach_x)
     count = np.searchsorted(key, x + reach_x) - first
     i = np.repeat(np.arange(len(x)), count)
-    within = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count)
-    j = known[order[np.repeat(first, count) + within]]
-    near = np.abs(sightings.xy[1, j] - xy[1, i]) < reach[1, i]
-    return i[near], j[near]
+    place = np.arange(len(i)) + np.repeat(first - np.cumsum(count) + count, count)
+    off = sightings.xy[1].take(known).take(place) - xy[1].take(i)
+    near = np.flatnonzero(np.abs(off) < reach[1].take(i))
+    return i[near], known[place[near]]
 
 
 def _assign(pairs: _Pairs, frame: Index) -> Index:

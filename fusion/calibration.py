@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The rig in force: where it comes from, what corrects it, and how that is taken back and kept."""
 
-import logging
 import time
 from pathlib import Path
 
@@ -10,12 +9,10 @@ import yaml
 
 from calib.camera import Camera
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.errors import RoundelError
+from calib.rig import Rig, dump_rig, load_rig
 from camera_node.messages import MessageError, decode
 from fusion.errors import FusionError
-
-log = logging.getLogger("fusion")
+from fusion.kept import Kept
 
 
 def parse_rig(data: bytes) -> Rig:
@@ -33,7 +30,7 @@ def parse_rig(data: bytes) -> Rig:
 class Calibration:
     """The rig in force, None until there is one; its corrections can be undone one by one."""
 
-    def __init__(self, rig: Path | None, kept: Path | None) -> None:
+    def __init__(self, rig: Path | None, kept: Kept[Rig]) -> None:
         """The newer of the file that a person gave and the one in which a published rig was kept.
 
         Raises:
@@ -41,29 +38,15 @@ class Calibration:
         """
         self._kept = kept
         self._corrected: list[tuple[str, Camera]] = []  # cameras before their corrections
-        self.rig = self._load_kept(rig)
+        self.rig = kept.newer_than(rig)
         if self.rig is None and rig is not None:
             self.rig = load_rig(rig)
-
-    def _load_kept(self, rig: Path | None) -> Rig | None:
-        if self._kept is None or not self._kept.exists():
-            return None
-        if rig is not None and rig.exists() and rig.stat().st_mtime >= self._kept.stat().st_mtime:
-            log.info("%s is newer than %s, which is left alone", rig, self._kept)
-            return None
-        try:
-            kept = load_rig(self._kept)
-        except RoundelError as error:
-            log.warning("the kept rig is not used: %s", error)
-            return None
-        log.info("the rig that was last published is in force: %s", self._kept)
-        return kept
 
     def replace(self, rig: Rig) -> str | None:
         """Another rig is in force, and kept; the camera in which alone it differs from the old one, if it does."""
         old, self.rig = self.rig, rig
         self._corrected.clear()
-        self._keep()
+        self._kept.keep(rig)
         if old is None or rig.placed().keys() != old.placed().keys():
             return None
         moved = [name for name in rig.cameras if rig.cameras[name] != old.cameras.get(name)]
@@ -97,12 +80,4 @@ class Calibration:
     def _place(self, name: str, camera: Camera) -> None:
         assert self.rig is not None
         self.rig = msgspec.structs.replace(self.rig, cameras={**self.rig.cameras, name: camera})
-        self._keep()
-
-    def _keep(self) -> None:
-        if self._kept is None or self.rig is None:
-            return
-        try:
-            save_rig(self.rig, self._kept)
-        except RoundelError as error:
-            log.warning("the rig is in force, but is not kept over a restart: %s", error)
+        self._kept.keep(self.rig)

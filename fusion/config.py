@@ -21,6 +21,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         kept_rig: where a rig that was published, or corrected after a bump, is kept over a restart; the newer of this
             file and `rig` is in force. Not kept unless given.
         robots: robots.yaml.
+        kept_robots: the same for robots that were defined, renamed or removed while the server ran.
         rate_hz: instants a second; without it those of the fastest camera.
         limits: see `Limits`.
         shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
@@ -32,6 +33,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     rig: str | None = None
     kept_rig: str | None = None
     robots: str = "robots.yaml"
+    kept_robots: str | None = None
     rate_hz: float | None = None
     limits: Limits = Limits()
     shard: str = "1/1"
@@ -54,7 +56,7 @@ def load_arena(path: Path) -> ArenaConfig:
     config = load_yaml(path, ArenaConfig)
     found = {
         name: str(path.parent / value)
-        for name in ("rig", "kept_rig", "robots", "zenoh")
+        for name in ("rig", "kept_rig", "robots", "kept_robots", "zenoh")
         if (value := getattr(config, name))
     }
     return override(config, **found)

@@ -86,7 +86,9 @@ class _System:
 
     def remainder(self, step: Array) -> Array:
         """(B, S, 2) whitened: what steps (B, 12) leave of b."""
-        return -np.einsum("bsak,bk->bsa", self._table, np.column_stack([step, -np.ones(len(step))]))
+        B, S = self.shape
+        by = np.concatenate([-step, np.ones((B, 1))], 1)[:, :, None]
+        return (self._table.reshape(B, 2 * S, 13) @ by).reshape(B, S, 2)
 
     def remainder_of_rows(self, step: Array) -> Array:
         """(2, N) the same, in the order of the rows."""
@@ -109,7 +111,8 @@ class _Solution:
 
 def _weights(remainder: Array) -> Array:
     """(B, S) Cauchy weights, scaled so that Gaussian noise keeps its information."""
-    return 1 / (1 + np.sum(remainder**2, -1) / CAUCHY**2) / NOMINAL_WEIGHT
+    x, y = remainder[..., 0], remainder[..., 1]
+    return 1 / (NOMINAL_WEIGHT + (NOMINAL_WEIGHT / CAUCHY**2) * (x * x + y * y))
 
 
 class Estimator:
@@ -151,12 +154,12 @@ class Estimator:
             return states, np.empty((2, 0))
         observations = self._loosened(states, observations)
         prior, shaped = np.asarray(np.linalg.inv(states.P[seen]), float), _shaped(observations)
-        solve = partial(self._solve, states, observations, shaped, seen, prior)
-        solution = solve(np.zeros((n, 12)), None)
+        solve = partial(self._solve, observations, shaped, seen, prior)
+        solution = solve(states, np.zeros((n, 12)), None)
         for _ in range(ITERATIONS - 1):
             if np.max(np.abs(solution.step[:, :6])) < small:
                 break
-            solution = solve(solution.delta, solution.weights)
+            solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
         P = states.P.copy()
         P[seen] = np.linalg.inv(solution.information)
         P[self.single] = forget_turn(P[self.single])
@@ -164,19 +167,19 @@ class Estimator:
 
     def _solve(
         self,
-        states: States,
         observations: Observations,
         shaped: Index,
         seen: Index,
         prior: Array,
+        at: States,
         delta: Array,
         weights: Array | None,
     ) -> "_Solution":
-        """Linearise once about the states displaced by `delta` (N, 12), weigh and eliminate."""
-        row = np.cumsum(np.bincount(seen, minlength=len(states))) - 1
-        rows = self._linearise(states.moved(delta), observations, shaped)
+        """Linearise once about the states `at`, which are displaced by `delta` (N, 12), weigh and eliminate."""
+        row = np.cumsum(np.bincount(seen, minlength=len(at))) - 1
+        rows = self._linearise(at, observations, shaped)
         system = _System(replace(rows, body=row[rows.body]), len(seen))
-        displaced = np.einsum("nij,nj->ni", prior, delta[seen])
+        displaced = (prior @ delta[seen, :, None])[:, :, 0]
         weights = np.ones(system.shape) if weights is None else weights
         for _ in range(REWEIGHTINGS):
             H, right = system.normal_equations(weights)
@@ -220,7 +223,8 @@ class Estimator:
         views = self.optics.view(poses, discs)
         A = self.optics.derive(poses, seen.exposures, discs, views, observations.whiten)
         A[:, OMEGA, self.single[discs.body]] = 0  # one marker's turning rate would but fit its noise
-        b = np.einsum("abn,bn->an", observations.whiten, seen.xy - views.xy)
+        x, y = seen.xy - views.xy
+        b = observations.whiten[:, 0] * x + observations.whiten[:, 1] * y
         unseen = ~np.isfinite(b[0])
         if unseen.any():
             A[..., unseen] = b[:, unseen] = 0
@@ -269,10 +273,12 @@ def _eliminate(information: Array, right: Array) -> Array:
 
 def _in_pixels(observations: Observations, whitened: Array) -> Array:
     """(2, N) of whitened remainders of the observations, which come first (2, N...)."""
-    whitened = whitened[:, : len(observations)]
-    (a, b), (c, d) = observations.whiten
-    error = np.stack([d * whitened[0] - b * whitened[1], a * whitened[1] - c * whitened[0]]) / (a * d - b * c)
-    return np.einsum("abn,bn->an", observations.seen.scale, error)
+    x, y = whitened[:, : len(observations)]
+    cov = observations.seen.cov
+    u = np.sqrt(cov[0, 0])  # whitened is L^-1 of pixels, L L^T the covariance
+    v = cov[0, 1] / u
+    error = np.stack([u * x, v * x + np.sqrt(cov[1, 1] - v * v) * y])
+    return np.where(np.isfinite(observations.whiten[0, 0]), error, np.nan)
 
 
 def _shaped(observations: Observations) -> Index:

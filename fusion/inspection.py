@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""After an instant was told: frames are compared with what robots seen by two other cameras should look like."""
+"""After an instant was told: frames are compared with what robots seen by two other cameras should look like.
+
+A camera that stands is looked at in turn, just often enough that a move is named within a second; one that is set
+aside, in every instant.
+"""
 
 from typing import Protocol
 
@@ -17,7 +21,8 @@ from fusion.state import States
 from fusion.watch import Expected, Watch
 
 Array = NDArray[np.float64]
-WATCHED = 40  # markers that are compared with their images in one instant, about
+WATCHED = 20  # markers, at the most, that are compared with their images in one look
+LOOK_NS = 250_000_000  # between looks at a camera of so many markers; of fewer, more often
 WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
 
 
@@ -40,6 +45,7 @@ class Inspection:
     def __init__(self, tracker: Inspected) -> None:
         self.tracker = tracker
         self._watched = 0
+        self._turns: dict[str, int] = {}  # of each camera, the last in which it was looked at
 
     def inspect(self, instant: Instant, sightings: Sightings, matches: Matches) -> tuple[Move, ...]:
         """Place cameras anew that were moved; says which were, and where they stand."""
@@ -47,22 +53,27 @@ class Inspection:
         seen = np.zeros((len(tracker.status), len(tracker.optics.names)), bool)
         seen[tracker.catalogue.robot[matches.disc], sightings.camera[matches.sighting]] = True
         steady = np.array([status == "tracked" for status in tracker.status])
-        for frame in self._turn(instant.frames):
+        n_steady = int(steady[tracker.catalogue.robot].sum())
+        for frame in (frame for frame in instant.frames if self._is_due(frame, n_steady)):
             camera = tracker.optics.index[frame.camera]
             others = seen.sum(1) - seen[:, camera]
             markers = np.flatnonzero((steady & (others >= 2))[tracker.catalogue.robot])
             markers = np.roll(markers, -self._watched)[:WATCHED]
+            self._watched += WATCHED + 1
             points = self._expect(frame, camera, (frame.t_ns - instant.t_ns) * 1e-9, markers)
             if points.shape[1]:
                 tracker.watch.note(tracker.optics.cameras[camera], Expected(frame, points))
         return self._heal()
 
-    def _turn(self, frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
-        """Some of the frames, others in the next instant, so that watching costs the same in a large arena."""
-        n = max(1, WATCHED // max(len(self.tracker.catalogue.robot), 1))
-        first = self._watched % max(len(frames), 1)
-        self._watched += n
-        return (frames + frames)[first : first + min(n, len(frames))]
+    def _is_due(self, frame: Frame, n_markers: int) -> bool:
+        """Whether it is the camera's turn, which comes at other times than the other cameras'."""
+        optics = self.tracker.optics
+        interval_ns = LOOK_NS * min(n_markers, WATCHED) / WATCHED
+        if frame.camera in self.tracker.watch.bumped or not interval_ns:
+            return True
+        turn = int(frame.t_ns / interval_ns + optics.index[frame.camera] / len(optics.names))
+        was, self._turns[frame.camera] = self._turns.get(frame.camera), turn
+        return turn != was
 
     def _expect(self, frame: Frame, camera: int, tau: float, markers: NDArray[np.intp]) -> Array:
         """(3, N) points in the world whose projections are the outlines' centres that the frame should show."""

@@ -12,6 +12,7 @@ import numpy as np
 from rich.progress import track
 
 from calib.camera import Camera
+from calib.recording import RecordingWriter, iterate
 from calib.rig import load_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
@@ -19,7 +20,7 @@ from camera_node.messages import Detections, Keys, encode
 from camera_node.observations import detect_frames, read_observations
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose
-from fusion.recording import RecordingWriter, iterate, read_recording
+from fusion.recording import read_recording
 from fusion.report import Fused, Move
 from fusion.robots import Robot, load_robots
 from fusion.smoothing import Smoother

@@ -8,21 +8,16 @@ clock. The rig in force and the robots are asked of the server at the start.
 import contextlib
 import logging
 import queue
-import struct
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 import msgspec
 import zenoh
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
-from mcap.writer import Writer
 
 from calib.messages import RigMessage
+from calib.recording import RecordingWriter, iterate
 from calib.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections, Keys, MessageError, decode
@@ -32,44 +27,7 @@ from fusion.robots import Robot
 
 log = logging.getLogger("fusion.recording")
 QUEUE = 20_000
-MAGIC = 8  # bytes that every MCAP begins with
-CHUNK = 1 << 16  # bytes, compressed together: what is lost of a recording that is cut off
 ASK_S = 1.0  # for the server to tell of its rig and robots; they are asked for again while they are not there
-
-
-class RecordingWriter:
-    """Writes an arena's messages; a context manager. A recording that was cut off can be read to where it ends.
-
-    Raises, at entry:
-        ConfigError: the file can't be written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.counts: Counter[str] = Counter()
-        self._channels: dict[str, int] = {}
-
-    def __enter__(self) -> "RecordingWriter":
-        try:
-            self._file: IO[bytes] = self.path.open("wb")
-        except OSError as error:
-            raise ConfigError(
-                f"{self.path} can't be written: {error.strerror}; is its folder there?"
-            ) from None
-        self._writer = Writer(self._file, chunk_size=CHUNK)
-        self._writer.start(profile="roundel", library="roundel")
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._writer.finish()
-        self._file.close()
-
-    def put(self, key: str, data: bytes, received_ns: int) -> None:
-        """A message that arrived on a key."""
-        if key not in self._channels:
-            self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
-        self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
-        self.counts[key] += 1
 
 
 @dataclass
@@ -109,26 +67,6 @@ def read_recording(path: Path) -> Recording:
     if not recording.detections:
         raise ConfigError(f"{path} holds no detections; record with python -m fusion record {path}")
     return recording
-
-
-def iterate(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[str, bytes, int]]:
-    """Key, bytes and time of arrival (ns) of each message, in the order of arrival.
-
-    Raises:
-        ConfigError: the file is missing, or no MCAP.
-    """
-    try:
-        with path.open("rb") as file:
-            reader = NonSeekingReader(file)
-            try:
-                for _, channel, message in reader.iter_messages(log_time_order=False):
-                    yield channel.topic, message.data, message.log_time
-            except (McapError, EOFError, struct.error) as error:
-                if faults is None or file.tell() <= MAGIC:
-                    raise ConfigError(f"{path} is no MCAP recording: {error}") from None
-                faults["end: the recording was cut off"] += 1
-    except OSError as error:
-        raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
 
 def record(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calib.alignment import rigid_motions
 from camera_node.body import Body
-from camera_node.config import is_name, load_yaml
+from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from fusion.errors import FusionError
 
@@ -66,6 +66,12 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         super().__post_init__()
         if len(self.markers) > MAX_MARKERS:
             raise ValueError(f"a robot has {MAX_MARKERS} markers at the most")
+        for (i, a), (j, b) in combinations(enumerate(self.markers), 2):
+            if math.dist(a, b) < self.diameter_m:
+                raise ValueError(
+                    f"markers {i} and {j} are {math.dist(a, b):.4g} m apart and {self.diameter_m:.4g} m across: "
+                    "their discs would overlap; all lengths are in metres"
+                )
         if len(self.markers) > 1 and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2:
             raise ValueError(
                 "markers on one line (or only two) leave the turn about it unknown; "
@@ -93,11 +99,22 @@ def load_robots(path: Path) -> dict[str, Robot]:
         ConfigError: the file is missing or broken, or declares no robot.
         FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
     """
-    robots = load_yaml(path, _Robots).robots
+    robots = load_kept_robots(path)
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
+    return robots
+
+
+def load_kept_robots(path: Path) -> dict[str, Robot]:
+    """As `load_robots`; there may be none, where all were removed over the network."""
+    robots = load_yaml(path, _Robots).robots
     require_trackable(robots, str(path))
     return robots
+
+
+def save_robots(robots: dict[str, Robot], path: Path) -> None:
+    """Write robots as a `robots.yaml`, atomically; ConfigError where the folder can't be written to."""
+    write_atomically(path, dump_yaml(_Robots(robots)))
 
 
 def require_trackable(robots: dict[str, Robot], where: str) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import zenoh
 
 from calib.camera import Camera
+from calib.rig import load_rig, save_rig
 from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.requests import encode_reply, parse_request, payload_of
 from fusion.calibration import Calibration, parse_rig
@@ -24,10 +25,11 @@ from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Instant, Instants
 from fusion.intake import FAR_NS, Intake
+from fusion.kept import Kept
 from fusion.link import Link, open_session
 from fusion.messages import Latency, RobotPose, Robots, RobotsRequest, State, robots_key, undo_key
 from fusion.report import Move, latency_of
-from fusion.robots import changed, load_robots
+from fusion.robots import changed, load_kept_robots, load_robots, save_robots
 from fusion.shards import Shard
 from fusion.tracker import Tracker
 
@@ -48,11 +50,14 @@ class Server:
         self.config = config
         self.keys = Keys(config.arena)
         self.shard = Shard.parse(config.shard)
-        self.robots = load_robots(Path(config.robots))
+        given = Path(config.robots)
+        self._kept_robots = Kept("robots", config.kept_robots, load_kept_robots, save_robots)
+        kept = self._kept_robots.newer_than(given)
+        self.robots = load_robots(given) if kept is None else kept
         self.health = Health(config.limits.lateness_ms)
         self._intake = Intake(self.keys, self.health)
-        kept = Path(config.kept_rig) if config.kept_rig else None
-        self.calibration = Calibration(Path(config.rig) if config.rig else None, kept)
+        kept_rig = Kept("rig", config.kept_rig, load_rig, save_rig)
+        self.calibration = Calibration(Path(config.rig) if config.rig else None, kept_rig)
         self._tracker: Tracker | None = None
         self._now_ns = 0
         self._start()
@@ -192,6 +197,7 @@ class Server:
             for name in self.robots.keys() - robots.keys():
                 self.link.forget(self.keys.robot_pose(name))
             self.robots = robots
+            self._kept_robots.keep(robots)
             log.info("robots: %s", ", ".join(robots) or "none")
             if self._tracker is not None:
                 self._tracker = self._tracker.with_robots(robots, request.rename)

@@ -52,8 +52,11 @@ class Sightings:
 
     def select(self, rows: NDArray) -> "Sightings":
         """The columns that a mask or an index array names."""
-        columns = (self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale)
-        return Sightings(self.exposures, self.frame[rows], *(column[..., rows] for column in columns))
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        columns = (self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale)
+        return Sightings(
+            self.exposures, *(column.take(rows, -1) for column in columns)
+        )  # memory along columns
 
     @classmethod
     def of(cls, instant: Instant, optics: Optics, floor_px: float) -> "Sightings":
@@ -108,7 +111,7 @@ class Catalogue:
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """Markers `rows`, each in a frame."""
-        return Discs(frame, self.robot[rows], rows, self.marker[:, rows], self.radius[rows])
+        return Discs(frame, self.robot[rows], rows, self.marker.take(rows, 1), self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +195,8 @@ class Observations:
 
     def select(self, rows: NDArray) -> "Observations":
         """The columns that a mask or an index array names."""
-        return Observations(self.discs.select(rows), self.seen.select(rows), self.whiten[..., rows])
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        return Observations(self.discs.select(rows), self.seen.select(rows), self.whiten.take(rows, 2))
 
 
 def _whiten(seen: Sightings) -> Array:

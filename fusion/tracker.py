@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.pose import rotation_from_wxyz
 from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.inspection import Inspection
@@ -21,7 +20,7 @@ from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
 from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.state import POSITION, THETA, States, exp_so3
+from fusion.state import POSITION, THETA, States, exp_so3, rotations_of
 from fusion.watch import Watch
 
 Array = NDArray[np.float64]
@@ -31,6 +30,7 @@ FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is s
 FOLLOWED_RAD = (
     0.15  # likewise of its turn: a constellation turned further looks as if its markers were swapped
 )
+TOLD = "position", "quaternion_wxyz", "velocity", "angular_velocity"  # of another shard's robot
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -261,9 +261,9 @@ class Tracker:
     def follow(self, pose: RobotPose) -> None:
         """Another shard's robot is there: its detections are its own, and not for ours."""
         k = self._row.get(pose.robot)
-        if k is None or self.owned[k] or not np.isfinite(pose.covariance_matrix).all():
+        if k is None or self.owned[k] or pose.t_ns <= self._seen_ns[k]:
             return
-        if pose.t_ns > self._seen_ns[k]:
+        if np.isfinite(np.frombuffer(pose.covariance, "<f4")).all():
             self._others[k] = pose
             self._seen_ns[k] = pose.t_ns
 
@@ -274,9 +274,8 @@ class Tracker:
         rows, poses = np.array(list(self._others)), list(self._others.values())
         self._others = {}
         dt = (self._t_ns - np.array([pose.t_ns for pose in poses]))[:, None] * 1e-9
-        omega, v = (np.array([getattr(p, name) for p in poses]) for name in ("angular_velocity", "velocity"))
-        R = np.array([rotation_from_wxyz(pose.quaternion_wxyz) for pose in poses])
-        p, P = np.array([pose.position for pose in poses]), np.array([q.covariance_matrix for q in poses])
+        p, wxyz, v, omega = (np.array([getattr(pose, name) for pose in poses]) for name in TOLD)
+        R, P = rotations_of(wxyz), np.array([pose.covariance_matrix for pose in poses])
         there = States(exp_so3(omega * dt) @ R, p + v * dt, omega, v, P)
         self.states = self.states.with_rows(rows, there)
         for k, pose in zip(rows, poses, strict=True):

@@ -64,7 +64,7 @@ def _table_of(lens: Lens) -> "Table":
 
 
 class Table:
-    """A lens's cells: `coefficients` (6, 10, cells) of x, y and their derivatives by u and by v.
+    """A lens's cells: `coefficients` (cells, 20) of x and y, a cell's side by side: memory that is far away costs most.
 
     They are NaN in empty cells and in a row of cells all around the image.
     """
@@ -75,20 +75,23 @@ class Table:
         if near < ENOUGH:
             self.cell_px = FINE_CELL_PX
             fitted, near = _fit(lens, self.cell_px)
-        self.rows, self.columns = fitted.shape[:2]
-        derived = [fitted, fitted @ BY_S * (2 / self.cell_px), fitted @ BY_T * (2 / self.cell_px)]
+        self._outside = np.array([[fitted.shape[1]], [fitted.shape[0]]], float)  # column and row
         around = ((1, 1), (1, 1), (0, 0), (0, 0))
-        whole = np.pad(np.concatenate(derived, 2), around, constant_values=np.nan)
-        self.coefficients = np.ascontiguousarray(whole.reshape(-1, 6, len(POWERS)).transpose(1, 2, 0))
+        self.coefficients = np.pad(fitted, around, constant_values=np.nan).reshape(-1, 2 * len(POWERS))
+        per_px = 2 / self.cell_px
+        self._slopes = np.concatenate([np.eye(len(POWERS)), BY_S * per_px, BY_T * per_px])
 
     def look_up(self, uv: Array) -> tuple[Array, Array]:
         """(2, N) undistorted coordinates of pixels (N, 2), and their derivatives (2, 2, N); NaN in empty cells."""
         place = (uv.T + 0.5) / self.cell_px
         corner = np.floor(place)
-        column, row = np.clip(corner, -1, [[self.columns], [self.rows]]).astype(np.intp) + 1
-        coefficients = self.coefficients.take(row * (self.columns + 2) + column, 2)
-        values = np.einsum("kcn,cn->kn", coefficients, _monomials(2 * (place - corner) - 1))
-        return values[:2], values[2:].reshape(2, 2, -1).transpose(1, 0, 2)
+        column, row = np.minimum(np.maximum(corner, -1), self._outside) + 1
+        cell = row * (self._outside[0] + 2) + column
+        of_cells = self.coefficients.take(cell.astype(np.intp), 0)
+        coefficients = np.ascontiguousarray(of_cells.T).reshape(2, len(POWERS), -1)
+        basis = (self._slopes @ _monomials(2 * (place - corner) - 1)).reshape(3, len(POWERS), -1)
+        values = np.einsum("kcn,dcn->kdn", coefficients, basis)
+        return values[:, 0], values[:, 1:]
 
 
 def _monomials(st: Array) -> Array:

@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from calib.recording import iterate
 from camera_node.errors import ConfigError
-from fusion.recording import iterate
 from web.feed import Feed
 
 LEAD_S = 2.0  # told at once before a moment that is jumped to: a status of everybody

@@ -37,6 +37,8 @@ class Check:
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
     """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    recording: Path | None = None
+    """Or take what calib wand --live kept, or python -m fusion record wrote (MCAP)."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels."""
     maps: Path | None = None
@@ -46,12 +48,12 @@ class Check:
 
     def execute(self, console: Console) -> None:
         """Calibrate anew, whole and in halves, and compare."""
-        if (self.frames is None) == (self.observations is None):
-            raise ConfigError("give one of --frames FOLDER and --observations CSV")
+        if sum(way is not None for way in (self.frames, self.observations, self.recording)) != 1:
+            raise ConfigError("give one of --frames FOLDER, --observations CSV and --recording MCAP")
         if self.out is not None:
             check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
-        messages = read_recording(rig, self.frames, self.observations, wand)
+        messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
         said = self._judge(rig, wand, messages, console)
         if self.out is not None:
             told = {**rig.calibration, "check": {**provenance(), **said}}

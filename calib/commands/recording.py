@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Recordings as the subcommands take them: frames or observations of a rig's cameras."""
+"""Recordings as the subcommands take them: frames, observations or messages of a rig's cameras."""
 
 from pathlib import Path
 
 from calib.errors import CalibrationError
+from calib.recording import read_wave
 from calib.rig import Rig
 from camera_node.body import Body
 from camera_node.messages import Detections
@@ -11,9 +12,13 @@ from camera_node.observations import detect_frames, read_observations
 
 
 def read_recording(
-    rig: Rig, frames: Path | None, observations: Path | None, body: Body | None = None
+    rig: Rig,
+    frames: Path | None,
+    observations: Path | None,
+    body: Body | None = None,
+    recording: Path | None = None,
 ) -> list[Detections]:
-    """The detections of a folder of frames, or of a CSV, that was recorded with the cameras of a rig.
+    """The detections of a folder of frames, a CSV or an MCAP file, that was recorded with the cameras of a rig.
 
     Raises:
         ConfigError, CameraError, CalibrationError: nothing usable is there, or a camera is not of the rig.
@@ -21,6 +26,8 @@ def read_recording(
     if frames is not None:
         _check_folders(frames, rig)
         return detect_frames(frames, **({"inner_ratios": (body.inner_ratio,)} if body else {}))
+    if recording is not None:
+        return read_wave(recording)
     assert observations is not None
     sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
     return read_observations(observations, sizes)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`calib wand`: where cameras stand, by a wand waved before them."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.live import Heard
+from calib.recording import save_wave
 from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.waving import wave
@@ -39,8 +41,10 @@ class Wand:
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
     """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    recording: Path | None = None
+    """Or take what --live kept, or python -m fusion record wrote (MCAP)."""
     live: bool = False
-    """Or subscribe to the running cameras, and hand them the result."""
+    """Or subscribe to the running cameras, and hand them the result; the wave is kept beside --out (rig.wave.mcap)."""
     seconds: float | None = None
     """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
     only: str | None = None
@@ -54,15 +58,16 @@ class Wand:
     def execute(self, console: Console) -> None:
         """Nothing is written unless two cameras or more were placed."""
         check_folder(self.out)
-        if (self.frames is not None) + (self.observations is not None) + self.live != 1:
-            raise ConfigError("give one of --frames FOLDER, --observations CSV and --live")
+        if sum(way is not None for way in (self.frames, self.observations, self.recording)) + self.live != 1:
+            raise ConfigError("give one of --frames FOLDER, --observations CSV, --recording MCAP and --live")
         if self.seconds is not None and not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
         if self.live:
             self._run_live(rig, wand, console)
         else:
-            self._place(rig, wand, read_recording(rig, self.frames, self.observations, wand), console)
+            messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
+            self._place(rig, wand, messages, console)
 
     def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
         from calib.trust import assess
@@ -107,7 +112,32 @@ class Wand:
         say(console, f"the wave ended: {why}")
         if heard.bad:
             say(console, f"warning: {heard.bad} messages were none and were skipped")
-        self.server.hand_over(self._place(rig, wand, heard.messages, console), self.out, console)
+        kept = self._keep(heard.messages, console)
+        try:
+            placed = self._place(rig, wand, heard.messages, console)
+        except BaseException:
+            if kept is not None:
+                say(console, f"the wave is kept; to try it again: {self._again(kept)}")
+            raise
+        self.server.hand_over(placed, self.out, console)
+
+    def _keep(self, messages: Sequence[Detections], console: Console) -> Path | None:
+        """Write the wave before it is solved, so that nothing that goes wrong there can lose it."""
+        path = self.out.with_name(f"{self.out.stem}.wave.mcap")
+        try:
+            before = save_wave(path, self.server.arena, messages)
+        except ConfigError as error:
+            say(console, f"warning: the wave is not kept: {error}")
+            return None
+        say(console, f"the wave is kept as {path}" + (f"; the one before as {before.name}" if before else ""))
+        return path
+
+    def _again(self, recording: Path) -> str:
+        """The command that solves a kept wave with the options of this one."""
+        options = {"recording": recording, "wand": self.wand, "rig": self.rig, "out": self.out}
+        options |= {"only": self.only, "height": self.height, "maps": self.maps}
+        words = [(f"--{name}", str(value)) for name, value in options.items() if value is not None]
+        return shlex.join(["python", "-m", "calib", "wand", *(word for pair in words for word in pair)])
 
     def _wave(self, session: Session, rig: Rig, wand: Body, console: Console) -> tuple[Heard, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.

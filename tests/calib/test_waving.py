@@ -1,27 +1,38 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wave before running cameras tells how far it is, and ends when more would not help."""
 
+import io
+import shlex
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import zenoh
+from rich.console import Console
 
+from calib.__main__ import execute
+from calib.commands.connection import Connection
+from calib.commands.wand import Wand
 from calib.errors import CalibrationError
 from calib.live import Heard
+from calib.recording import read_wave
+from calib.rig import load_rig, save_rig
 from calib.waving import IDLE_S, Progress, Rule, Trial, progress, thin, wave
 from camera_node.messages import Detections, Keys, encode
 from camera_node.network import open_client, open_router
-from tests.calib.synthetic import record, ring
+from tests.calib.synthetic import errors, record, ring
 from tests.conftest import free_port
 
 
 @contextmanager
-def sending(messages: list[Detections]) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
+def sending(
+    messages: list[Detections], endpoint: str | None = None
+) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
     """A client of a router that publishes messages, and junk, as soon as somebody listens."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = endpoint or f"tcp/127.0.0.1:{free_port()}"
     listening = threading.Event()
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         block = zenoh.CongestionControl.BLOCK  # so fast, nothing must be dropped
@@ -116,6 +127,30 @@ def test_the_rule():
         "'c' has no place yet: never saw the wand; wave before it",
         "it failed",
     ]
+
+
+def test_a_wave_whose_solution_fails_is_kept_and_the_command_told_tries_it_again(
+    tmp_path: Path, endpoint: str
+):
+    """By a wand file with a wrong length nothing is placed; once it is mended, the wave need not be waved again."""
+    arena, sent = ring(3), record(ring(3), 6.0)
+    save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
+    (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
+    server, told = Connection(connect=(endpoint,), arena="test"), io.StringIO()
+    paths = {name: tmp_path / f"{name}.yaml" for name in ("wand", "out")}
+    command = Wand(rig=tmp_path / "lenses.yaml", live=True, seconds=4.0, server=server, **paths)
+    with sending(sent, endpoint) as (_, done):
+        with pytest.raises(CalibrationError, match="symmetric"):
+            command.execute(Console(file=told, width=200))
+        done()
+    kept = tmp_path / "out.wave.mcap"
+    assert sorted(m.t_ns for m in read_wave(kept)) == sorted(m.t_ns for m in sent)
+    assert sorted(tmp_path.glob(".*")) == []
+    again = shlex.split(told.getvalue().split("to try it again: ")[1])
+    (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.2, 0, 0], [0.5, 0, 0]]}")
+    assert again[:3] == ["python", "-m", "calib"]
+    execute(again[3:])
+    assert errors(load_rig(paths["out"]), arena.truth) < (2e-4, 2e-4)  # no noise
 
 
 def test_a_part_holds_whole_runs_of_all_cameras():

@@ -19,6 +19,8 @@ from camera_node.errors import ConfigError
         ("diameter_m: 0.1\ncolour: red", "colour"),
         ("diameter_m: 0.1\nmarkers: [[0, 0]]", r"\$\.markers\[0\]"),
         ("diameter_m: -1", "diameter"),
+        ("diameter_m: 0.1\nmarker: [[0, 0, 0]]", "did you mean `markers`"),
+        ("diameter_m: 0.1\nzzz: 1", "it may hold diameter_m, markers, inner_ratio, surround_ratio"),
         ("{}", "diameter_m"),
         ("[1, 2", "not valid YAML"),
         ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' is there twice, in lines 1 and 2"),
@@ -60,9 +62,9 @@ def test_writing_into_a_missing_folder_says_so(tmp_path: Path):
 def test_the_entry_of_a_mapping_is_named(tmp_path: Path):
     """Of a rig with many cameras, the one with the fault."""
     path = tmp_path / "scene.yaml"
-    good, bad = "{diameter_m: 0.1}", "{diameter_m: 0.1, colour: red}"
+    good, bad = "{diameter_m: 0.1}", "{diameter: 0.1}"
     path.write_text(f"robots: {{a: {good}, b: {bad}, c: {good}}}")
-    with pytest.raises(ConfigError, match=r"colour.*\$\.robots\.b"):
+    with pytest.raises(ConfigError, match=r"\$\.robots\.b`; did you mean `diameter_m`"):
         load_yaml(path, _Robots)
 
 

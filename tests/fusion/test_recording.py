@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from calib.messages import RigMessage
+from calib.recording import RecordingWriter
 from calib.rig import Rig, dump_rig
 from camera_node.errors import ConfigError
 from camera_node.messages import encode
 from fusion.messages import Robots
 from fusion.offline import fuse_recording, replay
-from fusion.recording import RecordingWriter, read_recording, record
+from fusion.recording import read_recording, record
 from fusion.report import Fused
 from fusion.tracker import Limits
 from tests.fusion.conftest import errors, poses_of

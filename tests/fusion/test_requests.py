@@ -7,10 +7,11 @@ import os
 import msgspec
 
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig
+from calib.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.messages import decode, encode
 from camera_node.pose import Pose
 from fusion.calibration import Calibration
+from fusion.kept import Kept
 from fusion.messages import Robots, RobotsRequest, robots_key, undo_key
 from tests.fusion.synthetic import WIDE
 from tests.fusion.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
@@ -89,14 +90,33 @@ def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
 
 
 def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
-    given, kept = tmp_path / "rig.yaml", tmp_path / "rig.kept.yaml"
+    given, path = tmp_path / "rig.yaml", tmp_path / "rig.kept.yaml"
+    kept = Kept("rig", str(path), load_rig, save_rig)
     config(tmp_path)  # writes rig.yaml
     fewer = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
-    kept.write_text(dump_rig(fewer))
+    path.write_text(dump_rig(fewer))
     for age_ns, expected in ((-1, fewer), (1, Rig(cameras=ARENA.cameras))):
-        at = kept.stat().st_mtime_ns + age_ns * 10**9
+        at = path.stat().st_mtime_ns + age_ns * 10**9
         os.utime(given, ns=(at, at))
         assert Calibration(given, kept).rig == expected
-    kept.write_text("cameras: {")
+    path.write_text("cameras: {")
     os.utime(given, (0, 0))
     assert Calibration(given, kept).rig == Rig(cameras=ARENA.cameras)
+
+
+def test_robots_that_were_changed_are_in_force_after_a_restart(tmp_path):
+    """Down to none at all; a file that a person wrote later counts more."""
+    settings = msgspec.structs.replace(config(tmp_path), kept_robots=str(tmp_path / "robots.kept.yaml"))
+    requests = (RobotsRequest(define={"wide": WIDE}, rename={"a": "b"}), RobotsRequest(remove=("b", "wide")))
+    before = {"a"}
+    for request, after in zip(requests, ({"b", "wide"}, set()), strict=True):
+        with serving(settings) as (server, client):
+            assert set(server.robots) == before
+            assert set(robots_of(ask(client, robots_key("test"), encode(request))[0]).robots) == after
+        before = after
+    with serving(settings) as (server, _):
+        assert not server.robots
+    later = (tmp_path / "robots.kept.yaml").stat().st_mtime_ns + 10**9
+    os.utime(settings.robots, ns=(later, later))
+    with serving(settings) as (server, _):
+        assert set(server.robots) == {"a"}

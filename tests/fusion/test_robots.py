@@ -47,6 +47,10 @@ def test_a_mirror_symmetry_is_harmless_for_the_print_faces_one_way():
         ("robots: {a: {diameter_m: 0.1, colour: red}}", "colour"),
         ("robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [1, 0, 0]]}}", "third"),
         ("robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [1, 0, 0], [2, 0, 0]]}}", "one line"),
+        (
+            "robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [0.09, 0, 0], [0, 1, 0]]}}",
+            "0 and 1 .* overlap",
+        ),
         ("robots: {'a/b': {diameter_m: 0.1}}", "can't name a robot"),
     ],
 )

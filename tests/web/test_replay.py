@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from calib.recording import RecordingWriter
 from camera_node.errors import ConfigError
-from fusion.recording import RecordingWriter
 from tests.conftest import free_port
 from tests.web.conftest import Said, four_cameras, wait_for
 from web.__main__ import Options, replay

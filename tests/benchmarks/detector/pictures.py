@@ -5,14 +5,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.lens import Lens
-from tests.camera_node.tracing import Array, Sight, pixels_across, trace
+from tests.camera_node.tracing import Array, Sight, ellipse_of, pixels_across, trace
 
 Grey = NDArray[np.uint8]
-F = 600.0  # focal length of all pictures, pixels
+F = 600.0  # focal length of pictures of which nothing else is said, pixels
 NOISE = 3.0  # grey levels, of pictures of which nothing else is said
 PIECES = 4  # a pixel is cut into so many squared
 
@@ -48,33 +49,49 @@ class Card:
 
 
 def paste(
-    image: Array, cards: list[Card], blur: float = 0.7, *, dark: float = 40.0, bright: float = 190.0
+    image: Array,
+    cards: list[Card],
+    blur: float = 0.7,
+    *,
+    dark: float = 40.0,
+    bright: float = 190.0,
+    focal: float = F,
 ) -> Array:
     """The picture (h, w) blurred, with cards on it: each hides the ground in proportion to its part of a pixel."""
     h, w = image.shape
     out = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), float)
     for card in cards:
-        reach = int(0.75 * card.diameter + 4 * blur + 3)
-        u, v = (round(x) for x in card.uv)
-        box = (max(u - reach, 0), max(v - reach, 0), min(u + reach, w), min(v + reach, h))
-        light, cover = _layers(card, box, (w, h), blur, dark, bright)
+        sight = _sight(card, (w, h), focal)
+        box = _bound(sight, blur)
+        light, cover = _layers(replace(sight, blur=blur, dark=dark, bright=bright), box)
         part = out[box[1] : box[3], box[0] : box[2]]
         part += light - cover * part
     return out
 
 
+def _sight(card: Card, size: tuple[int, int], focal: float) -> Sight:
+    """A card in the picture (w, h)."""
+    w, h = size
+    lens = Lens(width=w, height=h, fx=focal, fy=focal, cx=(w - 1) / 2, cy=(h - 1) / 2)
+    distance = pixels_across(lens, 0.1, card.diameter)
+    return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0)
+
+
+def _bound(sight: Sight, blur: float) -> tuple[int, int, int, int]:
+    """What a card may touch of the picture, u0, v0, u1, v1: far off the axis it is seen larger than on it."""
+    (u, v), axes = ellipse_of(replace(sight, diameter_m=sight.card * sight.diameter_m))
+    reach, (w, h) = axes.max() / 2 + 4 * blur + 3, (sight.lens.width, sight.lens.height)
+    u0, v0 = max(int(u - reach), 0), max(int(v - reach), 0)
+    return u0, v0, min(int(u + reach) + 1, w), min(int(v + reach) + 1, h)
+
+
 @lru_cache(maxsize=256)  # the same cards are shown on several grounds
-def _layers(
-    card: Card, box: tuple[int, int, int, int], size: tuple[int, int], blur: float, dark: float, bright: float
-) -> tuple[Array, Array]:
-    """The light of a card in a box u0, v0, u1, v1 of the picture (w, h), and how much it covers of each pixel."""
-    x0, y0, x1, y1 = box
-    cx, cy = (size[0] - 1) / 2 - x0, (size[1] - 1) / 2 - y0
-    lens = Lens(width=x1 - x0, height=y1 - y0, fx=F, fy=F, cx=cx, cy=cy)
-    uv, distance = (card.uv[0] - x0, card.uv[1] - y0), pixels_across(lens, 0.1, card.diameter)
-    sight = Sight(lens, uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, blur=blur)
-    light = trace(replace(sight, dark=dark, bright=bright), PIECES)
-    return light, trace(replace(sight, dark=1.0, bright=1.0), PIECES)
+def _layers(sight: Sight, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
+    """The light of a card in a box u0, v0, u1, v1 of the picture, and how much it covers of each pixel."""
+    (u0, v0, u1, v1), lens, (u, v) = box, sight.lens, sight.uv
+    moved = msgspec.structs.replace(lens, width=u1 - u0, height=v1 - v0, cx=lens.cx - u0, cy=lens.cy - v0)
+    there = replace(sight, lens=moved, uv=(u - u0, v - v0))
+    return trace(there, PIECES), trace(replace(there, dark=1.0, bright=1.0), PIECES)
 
 
 def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:

@@ -11,6 +11,7 @@ from rich.console import Console
 from tests.benchmarks.detector.pictures import (
     NOISE,
     Card,
+    F,
     Grey,
     dead_leaves,
     expose,
@@ -76,7 +77,8 @@ class Times:
 def measure_frame(run: Run, ground: Array, there: list[Card], seconds: float) -> Times:
     """All of ours, and what it is compared with, in one picture."""
     rng = np.random.default_rng(len(there))
-    frames = [expose(paste(ground, cards), NOISE, rng) for cards in (there, moved(there))]
+    focal = F * ground.shape[1] / 640  # one lens before cameras that resolve it more or less
+    frames = [expose(paste(ground, cards, focal=focal), NOISE, rng) for cards in (there, moved(there))]
     image, scratch = frames[0], np.empty_like(frames[0])
     tracker, turns = run.make(), cycle(frames)
     return Times(
