@@ -2,8 +2,8 @@
 #include "bits.hpp"
 
 #include <algorithm>
+#include <array>
 #include <bit>
-#include <cstring>
 
 #include "simd.hpp"
 #if defined(__SSE2__) && !defined(ROUNDEL_SCALAR)
@@ -18,45 +18,89 @@ namespace {
 
 constexpr int kWord = 64;
 
-/// Bit k is set where pixel k of 16 is below its threshold.
+// Sixteen pixels at a time: the means of two rows and those of 32 pixels of a row two by two, both rounded
+// up, and which are below their thresholds (bit k is pixel k).
 #if defined(__SSE2__) && !defined(ROUNDEL_SCALAR)
-inline uint64_t below(const uint8_t* pixels, const uint8_t* theta) {
-    const __m128i x = _mm_loadu_si128(reinterpret_cast<const __m128i*>(pixels));
-    const __m128i t = _mm_loadu_si128(reinterpret_cast<const __m128i*>(theta));
-    const __m128i bright = _mm_cmpeq_epi8(_mm_subs_epu8(t, x), _mm_setzero_si128());
+using Pixels = __m128i;
+inline Pixels load(const uint8_t* from) { return _mm_loadu_si128(reinterpret_cast<const __m128i*>(from)); }
+inline Pixels mean(Pixels a, Pixels b) { return _mm_avg_epu8(a, b); }
+inline Pixels mean_of_pairs(const uint8_t* from) {
+    const auto means = [](Pixels x) {
+        return _mm_avg_epu16(_mm_and_si128(x, _mm_set1_epi16(255)), _mm_srli_epi16(x, 8));
+    };
+    return _mm_packus_epi16(means(load(from)), means(load(from + 16)));
+}
+inline uint64_t below(Pixels x, Pixels theta) {
+    const __m128i bright = _mm_cmpeq_epi8(_mm_subs_epu8(theta, x), _mm_setzero_si128());
     return uint64_t(_mm_movemask_epi8(bright)) ^ 0xffff;
 }
 #elif defined(__ARM_NEON) && !defined(ROUNDEL_SCALAR)
-inline uint64_t below(const uint8_t* pixels, const uint8_t* theta) {
+using Pixels = uint8x16_t;
+inline Pixels load(const uint8_t* from) { return vld1q_u8(from); }
+inline Pixels mean(Pixels a, Pixels b) { return vrhaddq_u8(a, b); }
+inline Pixels mean_of_pairs(const uint8_t* from) {
+    const uint8x16x2_t pairs = vld2q_u8(from);
+    return vrhaddq_u8(pairs.val[0], pairs.val[1]);
+}
+inline uint64_t below(Pixels x, Pixels theta) {
     constexpr uint8_t kBits[16] = {1, 2, 4, 8, 16, 32, 64, 128, 1, 2, 4, 8, 16, 32, 64, 128};
-    const uint8x16_t dark = vandq_u8(vcltq_u8(vld1q_u8(pixels), vld1q_u8(theta)), vld1q_u8(kBits));
+    const uint8x16_t dark = vandq_u8(vcltq_u8(x, theta), vld1q_u8(kBits));
     return uint64_t(vaddv_u8(vget_low_u8(dark))) | uint64_t(vaddv_u8(vget_high_u8(dark))) << 8;
 }
 #else
-inline uint64_t below(const uint8_t* pixels, const uint8_t* theta) {
+using Pixels = std::array<uint8_t, 16>;
+inline Pixels load(const uint8_t* from) {
+    Pixels x;
+    std::copy_n(from, x.size(), x.begin());
+    return x;
+}
+inline Pixels mean(const Pixels& a, const Pixels& b) {
+    Pixels x;
+    for (size_t k = 0; k < x.size(); ++k) x[k] = uint8_t((a[k] + b[k] + 1) >> 1);
+    return x;
+}
+inline Pixels mean_of_pairs(const uint8_t* from) {
+    Pixels x;
+    for (size_t k = 0; k < x.size(); ++k) x[k] = uint8_t((from[2 * k] + from[2 * k + 1] + 1) >> 1);
+    return x;
+}
+inline uint64_t below(const Pixels& x, const Pixels& theta) {
     uint64_t dark = 0;
-    for (int k = 0; k < 16; ++k) dark |= uint64_t(pixels[k] < theta[k]) << k;
+    for (size_t k = 0; k < x.size(); ++k) dark |= uint64_t(x[k] < theta[k]) << k;
     return dark;
 }
 #endif
 
-inline uint64_t below_word(const uint8_t* pixels, const uint8_t* theta) {
-    return below(pixels, theta) | below(pixels + 16, theta + 16) << 16 |
-           below(pixels + 32, theta + 32) << 32 | below(pixels + 48, theta + 48) << 48;
+/// `words` of the mean of two rows.
+ROUNDEL_CLONES void binarise_rows(const uint8_t* a, const uint8_t* b, const uint8_t* theta, int words,
+                                  uint64_t* to) {
+    for (int k = 0; k < words; ++k) {
+        uint64_t word = 0;
+        for (int x = 0; x < kWord; x += 16, a += 16, b += 16, theta += 16)
+            word |= below(mean(load(a), load(b)), load(theta)) << x;
+        to[k] = word;
+    }
 }
 
-/// The pixels of one line; all three have room for whole words.
-ROUNDEL_CLONES void binarise_line(const uint8_t* levels, const uint8_t* theta, int words, uint64_t* to) {
-    for (int k = 0; k < words; ++k) to[k] = below_word(levels + k * kWord, theta + k * kWord);
+/// `words` of the means of a row's pixels two by two.
+ROUNDEL_CLONES void binarise_pairs(const uint8_t* row, const uint8_t* theta, int words, uint64_t* to) {
+    for (int k = 0; k < words; ++k) {
+        uint64_t word = 0;
+        for (int x = 0; x < kWord; x += 16, row += 32, theta += 16)
+            word |= below(mean_of_pairs(row), load(theta)) << x;
+        to[k] = word;
+    }
 }
 
-ROUNDEL_CLONES void mean_of_rows(const uint8_t* a, const uint8_t* b, int n, uint8_t* to) {
-    for (int x = 0; x < n; ++x) to[x] = uint8_t((a[x] + b[x] + 1) >> 1);
-}
-
-ROUNDEL_CLONES void mean_of_pairs(const uint8_t* row, int n, uint8_t* to) {
-    for (int x = 0; x < n; ++x) to[x] = uint8_t((row[2 * x] + row[2 * x + 1] + 1) >> 1);
-}
+/// What is left of a row after whole words, as long as two of them; beyond the image's edge all is bright.
+struct Tail {
+    std::array<uint8_t, 2 * kWord> levels;
+    Tail(const uint8_t* row, int begin, int end) {
+        levels.fill(255);
+        std::copy(row + begin, row + end, levels.begin());
+        if (end % 2) levels[size_t(end - begin)] = row[end - 1];  // an odd row's last pixel is its own pair
+    }
+};
 
 /// Transposes 64 x 64 bits in place by exchanging ever smaller quarters (Warren, Hacker's Delight, 7-3).
 ROUNDEL_CLONES void transpose_block(uint64_t* a) {
@@ -97,22 +141,26 @@ int BitImage::run_begin(int k, int at) const {
 
 void binarise(const ImageView& image, const ThresholdMap& threshold, BitImage& rows, BitImage& columns) {
     static thread_local BitImage halved;  // each row of the image, half as long
-    const int w = image.width, h = image.height;
+    const int w = image.width, h = image.height, whole = w / kWord, pairs = w / (2 * kWord);
     rows.reset((h + 1) / 2, w), halved.reset(h, (w + 1) / 2);
-    // Levels beyond the image's edge are bright.
-    std::vector<uint8_t> whole(size_t(rows.words) * kWord, 255), half(size_t(halved.words) * kWord, 255);
-    std::vector<uint8_t> theta(whole.size()), theta_half(half.size());
+    std::vector<uint8_t> theta(size_t(halved.words) * 2 * kWord), theta_half(theta.size() / 2);
     for (int y = 0; y < h; ++y) {
         if (threshold.changes(y)) {
             threshold.expand(y, w, theta.data());
-            mean_of_pairs(theta.data(), int(theta.size() / 2), theta_half.data());
+            for (size_t x = 0; x < theta_half.size(); ++x) theta_half[x] = theta[2 * x];  // tiles are even
         }
-        mean_of_pairs(image.row(y), w / 2, half.data());
-        if (w % 2) half[size_t(w) / 2] = image.row(y)[w - 1];
-        binarise_line(half.data(), theta_half.data(), halved.words, halved.line(y));
+        const uint8_t *row = image.row(y), *next = image.row(std::min(y + 1, h - 1));
+        binarise_pairs(row, theta_half.data(), pairs, halved.line(y));
+        if (pairs < halved.words)
+            binarise_pairs(Tail(row, pairs * 2 * kWord, w).levels.data(), &theta_half[size_t(pairs) * kWord],
+                           1, halved.line(y) + pairs);
         if (y % 2) continue;
-        mean_of_rows(image.row(y), image.row(std::min(y + 1, h - 1)), w, whole.data());
-        binarise_line(whole.data(), theta.data(), rows.words, rows.line(y / 2));
+        binarise_rows(row, next, theta.data(), whole, rows.line(y / 2));
+        if (whole < rows.words) {
+            const Tail a(row, whole * kWord, w), b(next, whole * kWord, w);
+            binarise_rows(a.levels.data(), b.levels.data(), &theta[size_t(whole) * kWord], 1,
+                          rows.line(y / 2) + whole);
+        }
     }
     transpose(halved, columns);
 }

@@ -6,7 +6,9 @@
 #include <cmath>
 
 #include "cholesky.hpp"
+#include "lanes.hpp"
 #include "ray.hpp"
+#include "simd.hpp"
 
 namespace roundel {
 
@@ -19,20 +21,20 @@ constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
 constexpr double kAbsolute = 0.5;   // so many pixels
 
-/// Where a ray crosses the edge of the disc or of the hole in it, from the ray's origin.
-struct Crossing {
-    double x, y;
-    bool outer;
-    float ratio;  // of the ray's inner distance to its outer one; 0 where it has one only
-    int ray;
-};
-
+/// Where rays cross the edge of the disc or of the hole in it, from the rays' origin, in units of `unit`
+/// pixels, as columns; those beyond `count` are 0.
 struct Crossings {
-    std::array<Crossing, 2 * kRays> list;
-    int count = 0;
-    void add(int ray, double at, bool outer, float ratio) {
-        const Direction direction = kDirections[size_t(ray)];
-        list[size_t(count++)] = {at * double(direction.x), at * double(direction.y), outer, ratio, ray};
+    static constexpr int kMost = 2 * kRays;
+    explicit Crossings(double length) : unit(length) {}
+    alignas(4 * kLanes) float x[kMost]{}, y[kMost]{}, inner[kMost]{};  // inner is 1 or 0
+    float ratio[kMost]{};  // of the ray's inner distance to its outer one; 0 where it has one only
+    int ray[kMost]{}, count = 0;
+    double unit;
+    void add(int number, float at, bool is_inner, float its_ratio) {
+        const Direction direction = kDirections[size_t(number)];
+        const float away = at / float(unit);
+        x[count] = away * direction.x, y[count] = away * direction.y, inner[count] = is_inner;
+        ratio[count] = its_ratio, ray[count++] = number;
     }
 };
 
@@ -51,11 +53,13 @@ Ratios ratios_near_middle(const Settings& settings) {
 /// nothing is there.
 constexpr std::array<int, kRays> kOrder{2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15, 0, 8, 4, 12};
 
-using Weights = std::array<double, 2 * kRays>;
+struct Weights {
+    alignas(4 * kLanes) float at[Crossings::kMost]{};
+};
 
 Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
     const float theta = float(seed.dark + seed.bright) / 2;
-    Crossings crossings;
+    Crossings crossings(std::max(1.0, double(seed.reach)));
     int missed = 0;
     for (int k = 0; k < kRays && missed <= 2 + k / 3; ++k) {
         const int number = kOrder[size_t(k)];
@@ -64,15 +68,19 @@ Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
         const float outer = inner < 0 ? -1 : ray.turn(false, theta, inner / float(ratios.least) + 2);
         const bool both = outer >= 0 && double(inner) < ratios.most * double(outer) + 1;
         const float ratio = both ? inner / outer : 0;
-        if (inner >= 0) crossings.add(number, double(inner), false, ratio);
-        if (both) crossings.add(number, double(outer), true, ratio);
+        if (inner >= 0) crossings.add(number, inner, true, ratio);
+        if (both) crossings.add(number, outer, false, ratio);
         missed += !both;
     }
     return crossings;
 }
 
 /// The weight of what is off by so many scales (Geman and McClure).
-double redescend(double off) { return 1 / ((1 + off * off) * (1 + off * off)); }
+template <typename T>
+ROUNDEL_INLINE T redescend(const T& off) {
+    const T inverse = 1.0f / (1.0f + off * off);
+    return inverse * inverse;
+}
 
 /// Two ellipses of one centre and shape: p^T M p + v p = 1 is the outer one and = level the inner one.
 struct Conics {
@@ -83,22 +91,35 @@ struct Conics {
     bool are_ellipses() const { return a > 0 && 4 * a * c > b * b; }
 };
 
-/// Linear least squares, each crossing with its weight.
-std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) {
-    std::array<Vector<6>, 6> H{};
-    Vector<6> g{};
-    for (int k = 0; k < crossings.count; ++k) {
-        const Crossing& p = crossings.list[size_t(k)];
-        const Vector<6> row{p.x * p.x, p.x * p.y, p.y * p.y, p.x, p.y, p.outer ? 0.0 : -1.0};
-        const double w = weights[size_t(k)];
+/// Normal equations of linear least squares, each crossing with its weight.
+struct Equations {
+    std::array<Vector<6>, 6> H;  // its lower triangle
+    Vector<6> g;
+};
+
+ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weights, Equations& equations) {
+    Lanes H[6][6] = {}, g[5] = {};
+    for (int k = 0; k < crossings.count; k += kLanes) {
+        const Lanes x = load(crossings.x + k), y = load(crossings.y + k), inner = load(crossings.inner + k);
+        const Lanes row[6] = {x * x, x * y, y * y, x, y, -inner}, w = load(weights.at + k);
         for (int i = 0; i < 6; ++i) {
-            for (int j = 0; j <= i; ++j) H[i][j] += w * row[i] * row[j];
-            g[i] += p.outer ? w * row[i] : 0;
+            const Lanes weighed = w * row[i];
+            for (int j = 0; j <= i; ++j) H[i][j] += weighed * row[j];
+            if (i < 5) g[i] += weighed * (1.0f - inner);
         }
     }
-    const Cholesky<6> factor(H);
+    for (int i = 0; i < 6; ++i) {
+        for (int j = 0; j <= i; ++j) equations.H[size_t(i)][size_t(j)] = double(sum(H[i][j]));
+        equations.g[size_t(i)] = i < 5 ? double(sum(g[i])) : 0;
+    }
+}
+
+std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) {
+    Equations equations;
+    accumulate(crossings, weights, equations);
+    const Cholesky<6> factor(equations.H);
     if (!factor.positive()) return std::nullopt;
-    const Vector<6> s = factor.solve(g);
+    const Vector<6> s = factor.solve(equations.g);
     const Conics conics{s[0], s[1], s[2], s[3], s[4], s[5]};
     return conics.are_ellipses() ? std::optional(conics) : std::nullopt;
 }
@@ -113,36 +134,56 @@ struct Frame {
     bool is_valid() const { return inner > 0 && inner < outer; }
 };
 
+/// How far each crossing is from its ellipse, in what it may be; beyond the last one 0.
+struct Distances {
+    alignas(4 * kLanes) float off[Crossings::kMost];
+};
+
+ROUNDEL_CLONES void measure(const Crossings& crossings, const Conics& c, const Frame& frame, Distances& to) {
+    const float a = float(c.a), b = float(c.b), cc = float(c.c);
+    const float per_outer = float(1 / frame.outer), per_inner = float(1 / frame.inner);
+    const float absolute = float(kAbsolute / crossings.unit);
+    for (int k = 0; k < crossings.count; k += kLanes) {
+        const Lanes dx = load(crossings.x + k) - float(frame.x), dy = load(crossings.y + k) - float(frame.y);
+        const Lanes inner = load(crossings.inner + k), square = dx * dx + dy * dy + 1e-12f;
+        const Lanes radius = square * inverse_sqrt(square);
+        const Lanes form = dx * (a * dx + b * dy) + cc * dy * dy;  // 1 on either ellipse, times its size
+        const Lanes share = form * (inner > 0.5f ? all(per_inner) : all(per_outer)) + 1e-12f;
+        const Lanes off = radius * (share * inverse_sqrt(share) - 1.0f);
+        store(to.off + k, off / (float(kRelative) * radius + absolute));
+    }
+}
+
 /// Weights by distance from the ellipses; returns how many crossings agree, of the kind of which fewer do.
 int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) {
     const Frame frame(conics);
+    Distances distances;
+    measure(crossings, conics, frame, distances);
     int agree[2] = {0, 0};
     for (int k = 0; k < crossings.count; ++k) {
-        const Crossing& p = crossings.list[size_t(k)];
-        const double dx = p.x - frame.x, dy = p.y - frame.y, radius = std::sqrt(dx * dx + dy * dy);
-        const double share = (conics.at(p.x, p.y) - 1 + frame.outer) / (p.outer ? frame.outer : frame.inner);
-        const double off = radius * (std::sqrt(std::max(share, 0.0)) - 1) / (kRelative * radius + kAbsolute);
-        agree[p.outer] += std::abs(off) < 1;
-        weights[size_t(k)] = redescend(2 * off) / (p.outer ? 1 : frame.inner / frame.outer);
+        const float off = distances.off[k];
+        agree[crossings.inner[k] > 0] += std::abs(off) < 1;
+        weights.at[k] = redescend(2 * off) * (crossings.inner[k] > 0 ? float(frame.outer / frame.inner) : 1);
     }
     return std::min(agree[0], agree[1]);
 }
 
 /// Weights to begin with: from near the middle, rays that nothing covers have about the same ratio.
 Weights weigh(const Crossings& crossings) {
-    std::array<float, 2 * kRays> ratios;
+    std::array<float, kRays> ratios;
     int n = 0;
     for (int k = 0; k < crossings.count; ++k)
-        if (const Crossing& p = crossings.list[size_t(k)]; p.outer) ratios[size_t(n++)] = p.ratio;
+        if (crossings.inner[k] == 0) ratios[size_t(n++)] = crossings.ratio[k];
     std::nth_element(ratios.begin(), ratios.begin() + n / 2, ratios.begin() + n);
     Weights weights;
     for (int k = 0; k < crossings.count; ++k)
-        weights[size_t(k)] = redescend(double(crossings.list[size_t(k)].ratio - ratios[size_t(n / 2)]) / 0.1);
+        weights.at[k] = redescend((crossings.ratio[k] - ratios[size_t(n / 2)]) * 10);
     return weights;
 }
 
 /// Solves and weighs anew from some weights on, until ever more crossings agree and at last `least`.
-std::optional<Conics> settle(const Crossings& crossings, Weights weights, int least) {
+std::optional<Conics> settle(const Crossings& crossings, const Weights& first, int least) {
+    Weights weights = first;
     std::optional<Conics> conics;
     for (int k = 0, agree = 0; k < kReweights && 2 * agree < crossings.count; ++k) {
         conics = solve(crossings, weights);
@@ -156,14 +197,14 @@ std::optional<Conics> settle(const Crossings& crossings, Weights weights, int le
 /// Of the crossings on half of the rays, side by side, those with which most agree: something covers the
 /// rest.
 std::optional<Conics> settle_half(const Crossings& crossings) {
-    int most = 0;
-    Weights best{};
+    int most = kLeastCovered - kReweights;  // what no less would do
+    std::optional<Weights> best;
     for (int first = 0; first < kRays; first += 2) {
         Weights weights;
         int n = 0;
         for (int k = 0; k < crossings.count; ++k) {
-            const bool in = (crossings.list[size_t(k)].ray - first + kRays) % kRays < kRays / 2;
-            weights[size_t(k)] = in, n += in;
+            const bool in = (crossings.ray[k] - first + kRays) % kRays < kRays / 2;
+            weights.at[k] = in, n += in;
         }
         if (n < kLeastOfHalf) continue;
         const auto conics = solve(crossings, weights);
@@ -171,14 +212,15 @@ std::optional<Conics> settle_half(const Crossings& crossings) {
         if (const int agree = reweigh(crossings, *conics, weights); agree > most)
             most = agree, best = weights;
     }
-    return most ? settle(crossings, best, kLeastCovered) : std::nullopt;
+    return best ? settle(crossings, *best, kLeastCovered) : std::nullopt;
 }
 
-Ellipse outer_ellipse(const Conics& c, const Frame& frame) {
+Ellipse outer_ellipse(const Conics& c, const Frame& frame, double unit) {
     const double det = c.a * c.c - c.b * c.b / 4;
     const Eigen e = eigen({c.c / det, -c.b / 2 / det, c.a / det});  // of M^-1
-    return {frame.x, frame.y, 2 * std::sqrt(frame.outer * e.first), 2 * std::sqrt(frame.outer * e.second),
-            e.angle};
+    const double diameter = 2 * unit;
+    return {unit * frame.x, unit * frame.y, diameter * std::sqrt(frame.outer * e.first),
+            diameter * std::sqrt(frame.outer * e.second), e.angle};
 }
 
 double median_level(const ImageView& image, const Ellipse& e, double scale) {
@@ -201,8 +243,8 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
         if (!conics) conics = settle_half(crossings);
         if (!conics) return std::nullopt;
         const Frame frame(*conics);
-        Ellipse outer = outer_ellipse(*conics, frame);
-        const double ratio = std::sqrt(frame.inner / frame.outer), moved = std::hypot(frame.x, frame.y);
+        Ellipse outer = outer_ellipse(*conics, frame, crossings.unit);
+        const double ratio = std::sqrt(frame.inner / frame.outer), moved = std::hypot(outer.x, outer.y);
         if (!(moved < outer.major)) return std::nullopt;
         outer.x += double(from.x), outer.y += double(from.y);
         const double m_d = median_level(image, outer, (1 + ratio) / 2);

@@ -18,7 +18,7 @@ constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
 constexpr int kMaxFits = 512;          // to new places of a frame
 constexpr size_t kMaxSmeared = 8;      // lost roundels of a frame that are looked for smeared
-constexpr double kNoiseSpan = 8.5;     // standard deviations
+constexpr double kNoiseSpan = 9.5;     // standard deviations
 
 }  // namespace
 
@@ -76,7 +76,7 @@ void Detector::search(const ImageView& image) {
     int top = 0;
     const ImageView band = next_band(image, top);
     const auto theta = uint8_t(std::lround(std::clamp(theta_.value(), 1.0, 255.0)));
-    // Of ten thousand pixels that only noise tells apart, the extremes lie eight deviations from each other.
+    // Ten thousand pixels that only noise tells apart span eight deviations, the widest tile of a frame nine.
     const double contrast = std::clamp(kNoiseSpan * noise_, settings_.min_contrast, 255.0);
     const ThresholdMap threshold = local_threshold(band, contrast, settings_.by_paper ? theta : 0);
     if (!settings_.by_paper) return search_chords(image, band, threshold, top);

@@ -6,6 +6,8 @@
 #include <cmath>
 #include <numbers>
 
+#include "simd.hpp"
+
 namespace roundel {
 
 namespace {
@@ -15,16 +17,14 @@ constexpr int kPixels = 1500;  // that are looked at, about
 constexpr double kChance = 4;  // standard deviations
 constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
 
-/// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse,
-/// takes a sixth of the time of the exact one.
-float direction(float x, float y) {
-    const float across = std::abs(x), up = std::abs(y),
-                t = std::min(across, up) / std::max({across, up, 1e-9f});
-    const float tt = t * t;
-    float angle = t + t * tt * (-0.327622764f + tt * (0.15931422f - tt * 0.0464964749f));
-    if (up > across) angle = float(std::numbers::pi / 2) - angle;
-    if (x < 0) angle = float(std::numbers::pi) - angle;
-    return y < 0 ? -angle : angle;
+/// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse.
+ROUNDEL_INLINE Lanes direction(const Lanes& x, const Lanes& y) {
+    const Lanes across = magnitude(x), up = magnitude(y), least = across < up ? across : up;
+    const Lanes most = (across < up ? up : across) + 1e-9f, t = least / most, tt = t * t;
+    Lanes angle = t + t * tt * (-0.327622764f + tt * (0.15931422f - tt * 0.0464964749f));
+    angle = up > across ? float(std::numbers::pi / 2) - angle : angle;
+    angle = x < 0.0f ? float(std::numbers::pi) - angle : angle;
+    return y < 0.0f ? -angle : angle;
 }
 
 /// Which edge a pixel belongs to, and which sector of it.
@@ -35,14 +35,12 @@ class Compass {
         const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
         xx_ = float(p[kAyy] / det), xy_ = float(-p[kAxy] / det), yy_ = float(p[kAxx] / det);
     }
-    struct Place {
-        bool inner;
-        int sector;
-    };
-    Place locate(float x, float y) const {
-        const float dx = x - x_, dy = y - y_, qx = xx_ * dx + xy_ * dy, qy = xy_ * dx + yy_ * dy;
-        const float turn = direction(qx, qy) * float(kSectors / (2 * std::numbers::pi));
-        return {qx * qx + qy * qy < between_, int(turn + kSectors) % kSectors};
+    /// The sector of the outer edge, or kSectors more of the inner one.
+    ROUNDEL_INLINE Bits locate(const Lanes& x, const Lanes& y) const {
+        const Lanes dx = x - x_, dy = y - y_, qx = xx_ * dx + xy_ * dy, qy = xy_ * dx + yy_ * dy;
+        const Lanes turn = direction(qx, qy) * float(kSectors / (2 * std::numbers::pi)) + float(kSectors);
+        const Bits inner = qx * qx + qy * qy < between_;  // -1 where it is true
+        return (__builtin_convertvector(turn, Bits) & (kSectors - 1)) + (inner & kSectors);
     }
 
   private:
@@ -70,20 +68,22 @@ struct Misfit {
 };
 
 /// Of the outer edge and of the inner one.
-std::array<Misfit, 2> misfit_by_sector(const EdgePixels& pixels, const Parameters& p) {
-    const Model model(p);
-    const Compass compass(p);
-    std::array<Misfit, 2> misfit;
+ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, const Compass& compass,
+                               std::array<Misfit, 2>& misfit) {
     Gradient at;
-    for (int begin = 0; begin < pixels.used; begin += kLanes) {
-        model.evaluate(pixels.x + begin, pixels.y + begin, pixels.level + begin, 1, at);
-        for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
-            const auto [inner, sector] = compass.locate(pixels.x[begin + k], pixels.y[begin + k]);
-            if (std::abs(at.residual[0][k]) < 256)  // others are clipped
-                misfit[inner].add(sector, double(std::abs(at.ring[0][k])), double(at.residual[0][k]));
+    for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
+        const int lanes = std::min(kChunk, (pixels.count - begin) / kLanes);
+        const float *x = pixels.x + begin, *y = pixels.y + begin;
+        model.evaluate(x, y, pixels.level + begin, lanes, at);
+        for (int n = 0; n < lanes; ++n) {
+            const Bits place = compass.locate(load(x + n * kLanes), load(y + n * kLanes));
+            const Lanes weight = magnitude(at.ring[n]), residual = at.residual[n];
+            for (int k = 0; k < kLanes; ++k)
+                if (std::abs(residual[k]) < 256)  // others are clipped, or none
+                    misfit[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(weight[k]),
+                                                            double(residual[k]));
         }
     }
-    return misfit;
 }
 
 /// The set with all sectors that lie within kReach of it on the image of a circle.
@@ -110,13 +110,17 @@ Pixel point_in_sector(const Parameters& p, int sector, double r) {
     return {float(p[kX] + p[kAxx] * x + p[kAxy] * y), float(p[kY] + p[kAxy] * x + p[kAyy] * y)};
 }
 
-void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels) {
+ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels) {
     const Compass compass(p);
     int kept = 0;
-    for (int k = 0; k < pixels.used; ++k) {
-        const auto [inner, sector] = compass.locate(pixels.x[k], pixels.y[k]);
-        if ((inner ? hidden.inner : hidden.outer) >> sector & 1) continue;
-        pixels.x[kept] = pixels.x[k], pixels.y[kept] = pixels.y[k], pixels.level[kept++] = pixels.level[k];
+    for (int begin = 0; begin < pixels.used; begin += kLanes) {
+        const Lanes x = load(pixels.x + begin), y = load(pixels.y + begin),
+                    level = load(pixels.level + begin);
+        const Bits place = compass.locate(x, y);
+        for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
+            if ((place[k] < kSectors ? hidden.outer : hidden.inner) >> (place[k] % kSectors) & 1) continue;
+            pixels.x[kept] = x[k], pixels.y[kept] = y[k], pixels.level[kept++] = level[k];
+        }
     }
     pixels.expected -= pixels.used - kept;
     pixels.used = kept;
@@ -129,7 +133,9 @@ Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, do
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
-    const auto [outer, inner] = misfit_by_sector(pixels, local);
+    std::array<Misfit, 2> misfit;
+    add_misfit(pixels, Model(local), Compass(local), misfit);
+    const auto& [outer, inner] = misfit;
     return {widen(outer.beyond(noise, slack), circle_image(local, 1)),
             widen(inner.beyond(noise, slack), circle_image(local, local[kRatio]))};
 }

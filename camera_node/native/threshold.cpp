@@ -72,24 +72,52 @@ inline void widen(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_lo
     }
 }
 
-/// The range of every 8 columns of the `rows` given ones; the buffers have room for whole tiles and 8 more.
-ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int columns, uint8_t* low, uint8_t* high,
-                                   uint8_t* to_low, uint8_t* to_high) {
-    const int n = columns * kTile;
-    std::memset(low, 255, size_t(n) + kTile);
-    std::memset(high, 0, size_t(n) + kTile);
-    for (int y = 0; y < rows.height; y += 2) widen(rows.row(y), rows.row(y), rows.width, low, high);
-    for (int step = kTile / 2; step; step /= 2) widen(low + step, high + step, n, low, high);
-    for (int k = 0; k < columns; ++k) to_low[k] = low[k * kTile], to_high[k] = high[k * kTile];
+/// The extremes of four rows of n pixels.
+inline void join_rows(const uint8_t* const rows[4], int n, uint8_t* low, uint8_t* high) {
+    const uint8_t *a = rows[0], *b = rows[1], *c = rows[2], *d = rows[3];
+    for (int x = 0; x < n; ++x) {
+        low[x] = least(least(a[x], b[x]), least(c[x], d[x]));
+        high[x] = greatest(greatest(a[x], b[x]), greatest(c[x], d[x]));
+    }
+}
+
+/// The extremes of n pairs of neighbours.
+inline void join_neighbours(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low,
+                            uint8_t* to_high) {
+    for (int x = 0; x < n; ++x) {
+        to_low[x] = least(low[2 * x], low[2 * x + 1]);
+        to_high[x] = greatest(high[2 * x], high[2 * x + 1]);
+    }
+}
+
+/// Room for the extremes of whole tiles, of single columns, of two and of four.
+struct Columns {
+    std::vector<uint8_t> low[3], high[3];
+    explicit Columns(int tiles) {
+        for (int k = 0; k < 3; ++k)
+            low[k].assign(size_t(tiles) * size_t(kTile >> k), 255), high[k].assign(low[k].size(), 0);
+    }
+};
+
+/// The range of every 8 columns of some rows, by every second one.
+ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int tiles, Columns& columns, uint8_t* to_low,
+                                   uint8_t* to_high) {
+    const uint8_t* four[4];
+    for (int k = 0; k < 4; ++k) four[k] = rows.row(std::min(2 * k, (rows.height - 1) & ~1));
+    auto& [low, high] = columns;
+    join_rows(four, rows.width, low[0].data(), high[0].data());
+    join_neighbours(low[0].data(), high[0].data(), 4 * tiles, low[1].data(), high[1].data());
+    join_neighbours(low[1].data(), high[1].data(), 2 * tiles, low[2].data(), high[2].data());
+    join_neighbours(low[2].data(), high[2].data(), tiles, to_low, to_high);
 }
 
 Range tile_range(const ImageView& image) {
     Range range((image.width + kTile - 1) / kTile, (image.height + kTile - 1) / kTile);
-    std::vector<uint8_t> low(size_t(range.columns + 1) * kTile), high(low.size());
+    Columns columns(range.columns);
     for (int y = 0; y < image.height; y += kTile) {
         const size_t first = range.at(0, y / kTile);
         range_of_tiles(image.window(0, y, image.width, std::min(kTile, image.height - y)), range.columns,
-                       low.data(), high.data(), &range.low[first], &range.high[first]);
+                       columns, &range.low[first], &range.high[first]);
     }
     return range;
 }

@@ -107,7 +107,8 @@ def smeared(image: Array, length: float, turn: float) -> Array:
         for dv in (0, 1):
             weight = abs(1 - du - part[:, 0]) * abs(1 - dv - part[:, 1])
             np.add.at(kernel, (low[:, 1] + dv, low[:, 0] + du), weight / len(step))
-    return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE), float)
+    anchor = (side // 2, side // 2)
+    return np.asarray(cv2.filter2D(image, -1, kernel, anchor=anchor, borderType=cv2.BORDER_REPLICATE), float)
 
 
 def moving(rng: np.random.Generator) -> tuple[Grey, list[Card]]:
