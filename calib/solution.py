@@ -19,7 +19,6 @@ from calib.wave import Wave
 Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
-NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
 # Of log f, cx, cy and k1: a recording that leaves more open fixes no lens.
 LENS_SIGMA = (0.005, 4.0, 4.0, 0.01)
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
@@ -57,8 +56,10 @@ def solve(
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
-    few = adjust(problem, with_disc_centres(wave, problem, state, observations), state)
-    free = [part for part in clocks if _tells(few, part, wave.period_s)]
+    centred = with_disc_centres(wave, problem, state, observations)
+    few = adjust(problem, centred, state)
+    judged = widen(few, centred)
+    free = [part for part in clocks if _tells(judged, part)]
     few = _with_lenses(replace(few, problem=few.problem.freeing(POSE, *free)), wave, observations)
     free += [LENS] if LENS[0] in few.problem.free else []
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
@@ -126,14 +127,11 @@ def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observat
     )
 
 
-def _tells(adjusted: Adjusted, part: tuple[int, ...], period_s: float) -> bool:
-    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, and by so
-    much that it matters."""
-    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
+def _tells(few: Adjusted, part: tuple[int, ...]) -> bool:
+    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, with the
+    covariance, and the number of observations that count as news, that neighbouring errors leave (`dependence`)."""
+    values = few.state.clocks[:, part[0] - OFFSET[0]]
     values = values - values.mean()
-    reach_s = 1.0 if part == OFFSET else np.ptp(adjusted.problem.knot_s) / 2
-    if np.abs(values).max() * reach_s < NEGLIGIBLE_S + NEGLIGIBLE * period_s:
-        return False
-    cov = adjusted.covariance(part)[:, 0, :, 0]
+    cov = few.covariance(part)[:, 0, :, 0]
     squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
-    return bool(squared > (len(values) - 1) * np.log(2 * adjusted.used.sum()))
+    return bool(squared > (len(values) - 1) * np.log(2 * few.used.sum() / few.dependence))
