@@ -2,7 +2,7 @@
 """What an adjusted wave says: the rig, its covariances, and a report that a person can act on."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -13,6 +13,7 @@ from calib.lengths import measure_lengths
 from calib.problem import DRIFT, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
 from calib.rig import Rig
+from calib.scale import Distance, compare, loosen
 from calib.solution import Solution
 from calib.world import move, upright
 from camera_node.pose import Pose
@@ -50,18 +51,24 @@ class Calibration:
 @dataclass(frozen=True, slots=True)
 class Told:
     """What is known before the adjustment, in the order of `names`, the placed cameras: frames with the wand, frames
-    left out by reason; the reason for each camera that is not placed; and whether the scale is known."""
+    left out by reason; the reason for each camera that is not placed; whether the scale is known; and the distance of
+    two cameras that somebody measured, with whether the rig is `scaled` by it."""
 
     names: list[str]
     frames: list[int]
     left_out: list[Counter[str]]
     unplaced: dict[str, str]
     metric: bool
+    distance: Distance | None = None
+    scaled: bool = False
 
 
 def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
     """The rig in an upright world, and the report."""
     adjusted, count = solution.adjusted, len(told.names)
+    if told.distance is not None and told.scaled:
+        adjusted = loosen(adjusted, told.distance)
+        solution = replace(solution, adjusted=adjusted)
     joint = adjusted.covariance(POSE)
     offsets, offset_sigma = clock_values(adjusted, OFFSET, 1e3)
     drift, drift_sigma = clock_values(adjusted, DRIFT, 1e6)
@@ -121,8 +128,10 @@ def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
         length_mean_mm=float(np.mean(lengths)) * 1e3 if len(lengths) else None,
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_outliers(told.names, seen, adjusted),
-        metric=told.metric,
+        metric=told.metric or told.scaled,
         widened=adjusted.dependence**0.5,
+        scaled_by=told.distance if told.scaled else None,
+        compared=compare(told.distance, told.names, adjusted) if told.distance and not told.scaled else None,
     )
 
 

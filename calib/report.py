@@ -14,6 +14,7 @@ from calib.lens_change import describe, find_changes
 
 if TYPE_CHECKING:
     from calib.outcome import Calibration
+    from calib.scale import Comparison, Distance
     from calib.trust import Trust
     from calib.waving import Progress
 
@@ -52,7 +53,8 @@ class WandReport:
 
     `unplaced` holds the reason for each camera without a pose; `scale` is what residuals are over what the detector
     claimed; lengths are those that the cameras measure less the wand file's, None without two markers; `metric` is
-    False where nothing gives the scale; standard deviations are `widened` times what independent errors would give.
+    False where nothing gives the scale; standard deviations are `widened` times what independent errors would give. A
+    measured distance of two cameras is what the rig is `scaled_by`, or `compared` with what the wand gives.
     """
 
     cameras: list[CameraReport]
@@ -64,6 +66,8 @@ class WandReport:
     outliers: list[Outlier]
     metric: bool
     widened: float = 1.0
+    scaled_by: "Distance | None" = None
+    compared: "Comparison | None" = None
 
     @property
     def residual_px(self) -> float:
@@ -83,6 +87,7 @@ class WandReport:
             "residual_px": round(self.residual_px, 4),
             "widened": round(self.widened, 2),
             "wand_length_error_mm": _figures(self.length_mean_mm, self.length_std_mm),
+            **self._distance(),
             "cameras": {
                 row.name: {
                     "frames": row.frames_used,
@@ -95,6 +100,14 @@ class WandReport:
             },
             "left_out": dict(self.left_out()),
             "unplaced": dict(self.unplaced),
+        }
+
+    def _distance(self) -> dict[str, Any]:
+        if (told := self.scaled_by or (self.compared and self.compared.distance)) is None:
+            return {}
+        said = {"cameras": [told.a, told.b], "metres": told.metres, "sigma_m": told.sigma_m}
+        return {
+            "distance": said | ({"by_wand_m": round(self.compared.by_wand_m, 5)} if self.compared else {})
         }
 
 
@@ -184,8 +197,14 @@ def _remarks(report: WandReport) -> list[str]:
     if not report.metric:
         lines.append(
             "warning: one marker of unknown size gives no scale: the two cameras farthest apart "
-            "are set 1 m apart"
+            "are set 1 m apart; give the distance of two of them, --distance NAME NAME METRES"
         )
+    if (told := report.scaled_by) is not None:
+        lines.append(
+            f"scale: '{told.a}' and '{told.b}' are {told.metres:g} ± {told.sigma_m:g} m apart, as was measured"
+        )
+    if report.compared is not None:
+        lines.append(report.compared.sentence())
     if left_out := report.left_out():
         lines.append("frames left out: " + ", ".join(f"{n} {why}" for why, n in left_out.most_common()))
     if report.outliers:

@@ -19,7 +19,6 @@ from calib.wave import Wave
 Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
-NEGLIGIBLE_S, NEGLIGIBLE = 2e-4, 0.01  # between clocks: seconds, and of a frame period
 # Of log f, cx, cy and k1: a recording that leaves more open fixes no lens.
 LENS_SIGMA = (0.005, 4.0, 4.0, 0.01)
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
@@ -33,33 +32,39 @@ class Solution:
     observations: Observations
 
 
-def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution:
+def solve(
+    wave: Wave, cameras: Array, offset_s: Array, metric: bool, known: tuple[int, int, float] | None = None
+) -> Solution:
     """Adjust from a rough start.
 
     Args:
         wave: the recording.
-        cameras: (C, 4, 4) T_world_cam; where nothing tells the scale, its two farthest cameras keep their distance.
+        cameras: (C, 4, 4) T_world_cam; where nothing tells the scale, its two farthest cameras are set 1 m apart.
         offset_s: (C,) true time = stamp + offset.
         metric: whether the start has the world's scale.
+        known: two cameras and the distance between them: the scale, where the wand has no length.
 
     Raises:
         CalibrationError: the wand's lengths fit nothing that was seen, or not its roundels' sizes.
         CameraFault: a camera's lens is not the one that was given, or what it saw contradicts the others.
     """
-    if not metric:
+    if known is not None or not metric:
+        a, b, wanted = known or (*_farthest(cameras)[:2], 1.0)
         cameras = cameras.copy()
-        cameras[:, :3, 3] /= _farthest(cameras)[2]
-    problem, state, observations = _around(wave, cameras, offset_s, FEW)
+        cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
+    problem, state, observations = _around(wave, cameras, offset_s, FEW, known)
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
-    few = adjust(problem, with_disc_centres(wave, problem, state, observations), state)
-    free = [part for part in clocks if _tells(few, part, wave.period_s)]
+    centred = with_disc_centres(wave, problem, state, observations)
+    few = adjust(problem, centred, state)
+    judged = widen(few, centred)
+    free = [part for part in clocks if _tells(judged, part)]
     few = _with_lenses(replace(few, problem=few.problem.freeing(POSE, *free)), wave, observations)
     free += [LENS] if LENS[0] in few.problem.free else []
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
-    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
+    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY, known)
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     problem = replace(problem.freeing(POSE, *free), density=density)
@@ -92,7 +97,9 @@ def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjus
     return freed
 
 
-def _around(wave: Wave, cameras: Array, offset_s: Array, budget: int) -> tuple[Problem, State, Observations]:
+def _around(
+    wave: Wave, cameras: Array, offset_s: Array, budget: int, known: tuple[int, int, float] | None
+) -> tuple[Problem, State, Observations]:
     found = wave.pose_problem(cameras, offset_s, budget)
     if found is None:
         raise CalibrationError(
@@ -101,7 +108,7 @@ def _around(wave: Wave, cameras: Array, offset_s: Array, budget: int) -> tuple[P
         )
     problem, state, observations = found
     if len(problem.wand.lengths) == 0:
-        problem = replace(problem, fixed_distance=_farthest(cameras))
+        problem = replace(problem, fixed_distance=known or _farthest(cameras))
     return problem, state, observations
 
 
@@ -120,14 +127,11 @@ def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observat
     )
 
 
-def _tells(adjusted: Adjusted, part: tuple[int, ...], period_s: float) -> bool:
-    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, and by so
-    much that it matters."""
-    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
+def _tells(few: Adjusted, part: tuple[int, ...]) -> bool:
+    """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, with the
+    covariance, and the number of observations that count as news, that neighbouring errors leave (`dependence`)."""
+    values = few.state.clocks[:, part[0] - OFFSET[0]]
     values = values - values.mean()
-    reach_s = 1.0 if part == OFFSET else np.ptp(adjusted.problem.knot_s) / 2
-    if np.abs(values).max() * reach_s < NEGLIGIBLE_S + NEGLIGIBLE * period_s:
-        return False
-    cov = adjusted.covariance(part)[:, 0, :, 0]
+    cov = few.covariance(part)[:, 0, :, 0]
     squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
-    return bool(squared > (len(values) - 1) * np.log(2 * adjusted.used.sum()))
+    return bool(squared > (len(values) - 1) * np.log(2 * few.used.sum() / few.dependence))

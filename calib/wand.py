@@ -15,6 +15,7 @@ from calib.outcome import Calibration, Told, conclude
 from calib.pairwise import MIN_INSTANTS, Pairs
 from calib.plausibility import check_motion
 from calib.rig import Rig
+from calib.scale import Distance
 from calib.sightings import Frames, Sightings, frame_counts, gather
 from calib.solution import Solution, solve
 from calib.start import Start, explain_unplaced, find_start
@@ -39,13 +40,16 @@ class Recording:
     left_out: list[Counter[str]]
 
 
-def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibration:
+def calibrate(
+    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None = None
+) -> Calibration:
     """Place the cameras of a rig, and set their clocks, by a wand waved before them.
 
     Args:
         rig: intrinsics of every camera; poses in it are not used.
         wand: its markers; two of them or more give the scale, one gives it only by the roundel's size.
         messages: detections of all cameras, any order; a roundel's `id`, where given, is its marker number.
+        distance: of two cameras: the scale, where the wand has one marker; else compared with what the wand gives.
 
     Returns:
         the rig with the poses and time offsets of all cameras that could be placed, and the report.
@@ -55,17 +59,21 @@ def calibrate(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Calibrati
             majority agrees; the message says why.
     """
     check_recording(rig, messages)
+    if distance is not None:
+        distance.check(list(rig.cameras))
     recording = read(rig, wand, messages)
     if not len(recording.seen):
         raise CalibrationError(_unseen(recording))
     check_motion(recording.seen, recording.names, recording.lenses)
     pairs = Pairs(recording.seen, recording.lenses, wand, recording.frames.period_s())
-    told, solution = _solve_majority(recording, pairs, wand)
+    told, solution = _solve_majority(recording, pairs, wand, distance)
     absent = {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
     return conclude(rig, solution, replace(told, unplaced=told.unplaced | absent))
 
 
-def _solve_majority(recording: Recording, pairs: Pairs, wand: Body) -> tuple[Told, Solution]:
+def _solve_majority(
+    recording: Recording, pairs: Pairs, wand: Body, distance: Distance | None
+) -> tuple[Told, Solution]:
     """The solution of the cameras that agree; those that contradict them are left out, and told.
 
     Raises:
@@ -83,11 +91,11 @@ def _solve_majority(recording: Recording, pairs: Pairs, wand: Body) -> tuple[Tol
             raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced, wrong | faults))
         left_out = [recording.left_out[k] for k in placed]
         told = Told([names[k] for k in placed], [counts[k] for k in placed], left_out, unplaced, start.metric)
+        told = replace(told, distance=distance, scaled=distance is not None and len(wand.markers) == 1)
+        known = distance.between(told.names, unplaced) if distance is not None and told.scaled else None
+        wave = gather_wave(recording, pairs, wand, placed)
         try:
-            solution = solve(
-                gather_wave(recording, pairs, wand, placed), *_columns(start, placed), start.metric
-            )
-            return told, solution
+            return told, solve(wave, *_columns(start, placed), start.metric, known)
         except CameraFault as fault:
             wrong |= fault.reasons
             sure |= fault.reasons if fault.certain else {}

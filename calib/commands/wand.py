@@ -18,6 +18,7 @@ from calib.live import Heard
 from calib.recording import save_wave
 from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
+from calib.scale import SIGMA_M, Distance
 from calib.waving import wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
@@ -49,6 +50,10 @@ class Wand:
     """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
     only: str | None = None
     """Place this camera alone, anew, by a short wave; the rig's others stay where they are."""
+    distance: tuple[str, str, float] | None = None
+    """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
+    distance_sigma: float = SIGMA_M
+    """Standard deviation of that distance, metres."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels: where errors are foretold."""
     maps: Path | None = None
@@ -63,11 +68,22 @@ class Wand:
         if self.seconds is not None and not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        if (distance := self._distance()) is not None:
+            distance.check(list(rig.cameras))
         if self.live:
             self._run_live(rig, wand, console)
         else:
             messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
             self._place(rig, wand, messages, console)
+
+    def _distance(self) -> Distance | None:
+        if self.distance is None:
+            return None
+        if self.only is not None:
+            raise ConfigError(
+                "--distance and --only exclude each other: the rig's other cameras keep its scale"
+            )
+        return Distance(*self.distance, self.distance_sigma)
 
     def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
         from calib.trust import assess
@@ -76,7 +92,7 @@ class Wand:
         if self.only is not None:
             return self._place_one(rig, wand, messages, self.only, console)
         with console.status("placing cameras"):
-            result = calibrate(rig, wand, messages)
+            result = calibrate(rig, wand, messages, self._distance())
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
         if self.maps is not None:
@@ -136,8 +152,12 @@ class Wand:
         """The command that solves a kept wave with the options of this one."""
         options = {"recording": recording, "wand": self.wand, "rig": self.rig, "out": self.out}
         options |= {"only": self.only, "height": self.height, "maps": self.maps}
-        words = [(f"--{name}", str(value)) for name, value in options.items() if value is not None]
-        return shlex.join(["python", "-m", "calib", "wand", *(word for pair in words for word in pair)])
+        words = [
+            word for name, value in options.items() if value is not None for word in (f"--{name}", value)
+        ]
+        if self.distance is not None:
+            words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
+        return shlex.join(["python", "-m", "calib", "wand", *map(str, words)])
 
     def _wave(self, session: Session, rig: Rig, wand: Body, console: Console) -> tuple[Heard, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.

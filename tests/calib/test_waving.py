@@ -137,14 +137,8 @@ def test_a_wave_whose_solution_fails_is_kept_and_the_command_told_tries_it_again
     save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
     server, told = Connection(connect=(endpoint,), arena="test"), io.StringIO()
-    command = Wand(
-        wand=tmp_path / "wand.yaml",
-        rig=tmp_path / "lenses.yaml",
-        out=tmp_path / "out.yaml",
-        live=True,
-        seconds=4.0,
-        server=server,
-    )
+    wand, out = tmp_path / "wand.yaml", tmp_path / "out.yaml"
+    command = Wand(wand=wand, rig=tmp_path / "lenses.yaml", out=out, live=True, seconds=4.0, server=server)
     with sending(sent, endpoint) as (_, done):
         with pytest.raises(CalibrationError, match="symmetric"):
             command.execute(Console(file=told, width=200))
@@ -156,7 +150,7 @@ def test_a_wave_whose_solution_fails_is_kept_and_the_command_told_tries_it_again
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.2, 0, 0], [0.5, 0, 0]]}")
     assert again[:3] == ["python", "-m", "calib"]
     execute(again[3:])
-    assert errors(load_rig(command.out), arena.truth) < (2e-4, 2e-4)  # no noise
+    assert errors(load_rig(out), arena.truth) < (2e-4, 2e-4)  # no noise
 
 
 def test_a_part_holds_whole_runs_of_all_cameras():

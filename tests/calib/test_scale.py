@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The distance of two cameras: the scale of a wand of one marker, and a check of all others."""
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.__main__ import execute
+from calib.errors import CalibrationError
+from calib.rig import load_rig, save_rig
+from calib.scale import Distance, compare
+from calib.wand import calibrate
+from camera_node.body import Body
+from camera_node.errors import ConfigError
+from camera_node.observations import write_observations
+from tests.calib.synthetic import Arena, errors, record, ring
+
+LIGHT = Body(diameter_m=0.1)
+
+
+def apart(arena: Arena, a: str, b: str) -> float:
+    first, second = (arena.truth.cameras[name].matrix()[:3, 3] for name in (a, b))
+    return float(np.linalg.norm(first - second))
+
+
+def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
+    """0.1 px at 2.6 m, f = 520 px, is 0.5 mm across a ray, over the root of some hundred moments: 2 mm is far beyond.
+    The distance's own deviation comes on top: of any two cameras' distance it is the same part."""
+    arena = ring(wand=LIGHT)
+    messages = record(arena, 20.0, sigma_px=0.1, sized=False)
+    true = apart(arena, "cam0", "cam2")
+    exact, rough = (
+        calibrate(arena.intrinsics, LIGHT, messages, Distance("cam0", "cam2", true, sigma))
+        for sigma in (0.0, 0.02)
+    )
+    assert exact.report.metric
+    assert errors(exact.rig, arena.truth) < (2e-3, 1e-3)
+    for a, b in combinations(exact.names, 2):
+        wanted = Distance(a, b, apart(arena, a, b), 0.0)
+        sure, loose = (compare(wanted, told.names, told.adjusted) for told in (exact, rough))
+        assert sure is not None
+        assert loose is not None
+        added = np.sqrt(loose.sigma_m**2 - sure.sigma_m**2)
+        assert added == pytest.approx(0.02 * sure.by_wand_m / true, rel=1e-3)
+    assert rough.report.as_dict()["distance"]["metres"] == true
+    sized = record(arena, 12.0, sigma_px=0.1)  # a roundel's size, a tenth off, gives way
+    wrong = Body(diameter_m=0.11)
+    by_tape = calibrate(arena.intrinsics, wrong, sized, Distance("cam0", "cam2", true))
+    assert errors(by_tape.rig, arena.truth) < (5e-3, 2e-3)
+
+
+def test_a_wand_that_knows_metres_is_compared():
+    """A true distance is within three sigmas; one that is 2 % off is told, as a part of it, with its sign."""
+    arena = ring()
+    messages, true = record(arena, 6.0, sigma_px=0.1), apart(arena, "cam0", "cam1")
+    plain = calibrate(arena.intrinsics, arena.wand, messages)
+    for given, warned in ((true, False), (1.02 * true, True)):
+        result = calibrate(arena.intrinsics, arena.wand, messages, Distance("cam0", "cam1", given))
+        told = result.report.compared
+        assert told is not None
+        assert told.sentence().startswith("warning: ") == warned
+        assert errors(result.rig, plain.rig) < (1e-12, 1e-7)  # what rounding leaves
+        assert told.off_m / given == pytest.approx(true / given - 1, abs=1e-3)
+
+
+def test_faults_are_named(tmp_path: Path):
+    arena = ring()
+    save_rig(arena.intrinsics, tmp_path / "rig.yaml")
+    (tmp_path / "wand.yaml").write_text("diameter_m: 0.1\n")
+    out = ("--out", str(tmp_path / "out.yaml"), "--wand", str(tmp_path / "wand.yaml"))
+    options = [
+        "wand",
+        "--rig",
+        str(tmp_path / "rig.yaml"),
+        *out,
+        "--observations",
+        str(tmp_path / "light.csv"),
+    ]
+    few = [m for m in record(ring(wand=LIGHT), 6.0, sigma_px=0.1, sized=False) if m.camera != "cam3"]
+    write_observations(tmp_path / "light.csv", few)
+    for words, fault in (
+        ("cam0 north 3.4", "names camera 'north', which is not in the rig; it has cam0, cam1, cam2, cam3"),
+        ("cam0 cam1 0", "is 0 m; it must be above 0"),
+        ("cam0 cam1 nan", "is nan m; it must be above 0"),
+        ("cam0 cam0 1", "names camera 'cam0' twice"),
+        ("cam0 cam1 2 --distance-sigma -1", "must be 0 or more"),
+        ("cam0 cam3 3", "gives no scale, as camera 'cam3' has no place"),
+    ):
+        with pytest.raises(CalibrationError, match=fault):
+            execute([*options, "--distance", *words.split()])
+    with pytest.raises(ConfigError, match="exclude each other"):
+        execute([*options, "--distance", "cam0", "cam1", "2", "--only", "cam0"])
+    assert not (tmp_path / "out.yaml").exists()
+    execute([*options, "--distance", "cam0", "cam1", "2"])
+    places = [camera.matrix()[:3, 3] for camera in load_rig(tmp_path / "out.yaml").placed().values()]
+    assert np.linalg.norm(places[0] - places[1]) == pytest.approx(2, abs=1e-6)
