@@ -53,10 +53,9 @@ class Sightings:
     def select(self, rows: NDArray) -> "Sightings":
         """The columns that a mask or an index array names."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        columns = (self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale)
-        return Sightings(
-            self.exposures, *(column.take(rows, -1) for column in columns)
-        )  # memory along columns
+        columns = (self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale)
+        taken = (column.take(rows, -1) for column in columns)  # memory along columns
+        return Sightings(self.exposures, self.frame[rows], *taken)
 
     @classmethod
     def of(cls, instant: Instant, optics: Optics, floor_px: float) -> "Sightings":
