@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.benchmarks.fusion_accuracy import accuracy
-from tests.benchmarks.fusion_capacity import capacity
+from tests.benchmarks.fusion_capacity import Capacity, capacity, compare
 from tests.benchmarks.fusion_grouping import cold_grouping
 from tests.benchmarks.fusion_load import Load
 from tests.benchmarks.fusion_swaps import identity
@@ -47,7 +47,7 @@ def main(thorough: bool = False) -> None:
     ):
         table.add_row(*row)
     console.print(table)
-    console.print(_growth(4.0 if thorough else 1.2))
+    console.print(_growth(10.0 if thorough else 3.0))
 
 
 def _accuracies(thorough: bool) -> Iterator[Row]:
@@ -63,10 +63,18 @@ def _accuracies(thorough: bool) -> Iterator[Row]:
             _verdict(free.tracker_mm < 1.15 * free.bound_mm),
         )
         yield (
-            f"{what}: by told association; by synchronised cameras",
-            f"{free.tracker_mm / free.told_mm:.3f}, {free.tracker_mm / together.tracker_mm:.2f} times",
-            "1.15, 1.10",
-            _verdict(free.tracker_mm < 1.15 * free.told_mm and free.tracker_mm < 1.1 * together.tracker_mm),
+            f"{what}: by told association",
+            f"{free.tracker_mm / free.told_mm:.3f} times",
+            "1.15 times",
+            _verdict(free.tracker_mm < 1.15 * free.told_mm),
+        )
+        # Cameras at other times than the instant's see a place that a velocity, itself uncertain, has moved: the bound
+        # of free-running cameras is higher, and what exceeds the bounds' ratio is lost by the tracker.
+        yield (
+            f"{what}: by synchronised cameras; and the bounds' ratio",
+            f"{free.tracker_mm / together.tracker_mm:.2f}, {free.bound_mm / together.bound_mm:.2f} times",
+            "1.10 times",
+            _verdict(free.tracker_mm < 1.1 * together.tracker_mm),
         )
         yield (
             f"{what}: squared error by covariance",
@@ -124,19 +132,30 @@ def _identities(thorough: bool) -> Iterator[Row]:
 
 
 def _growth(seconds: float) -> Table:
-    """What an instant costs, one factor changed at a time."""
+    """What an instant costs, one factor changed at a time; all loads take turns within one run.
+
+    A share of robots beside a cost says that the others are being searched for, in every instant, which costs more.
+    """
     table = Table(
         "factor",
         *("",) * 3,
-        title=f"processor time of an instant, from {MIDDLE.robots} robots x "
-        f"{MIDDLE.markers} markers x {MIDDLE.cameras} cameras at {MIDDLE.hz:g} Hz",
+        title=f"processor time of an instant that one in twenty does not exceed, and its growth from column to column"
+        f"\n{MIDDLE.robots} robots x {MIDDLE.markers} markers x {MIDDLE.cameras} cameras at {MIDDLE.hz:g} Hz but for",
     )
-    for factor, values in FACTORS.items():
-        costs = (capacity(replace(MIDDLE, **{factor: value}), seconds).quiet_ms for value in values)
-        table.add_row(
-            factor, *(f"{value:g}: {cost:.1f} ms" for value, cost in zip(values, costs, strict=True))
-        )
+    rows = {name: [replace(MIDDLE, **{name: value}) for value in values] for name, values in FACTORS.items()}
+    loads = list({load: None for row in rows.values() for load in row})
+    got = dict(zip(loads, compare(loads, seconds), strict=True))
+    for name, row in rows.items():
+        before = (row[0], *row[:-1])
+        cells = (_cost(name, load, got[load], got[last]) for load, last in zip(row, before, strict=True))
+        table.add_row(name, *cells)
     return table
+
+
+def _cost(factor: str, load: Load, got: Capacity, before: Capacity) -> str:
+    tracked = f", {got.tracked:.0%} tracked" if got.tracked < 0.99 else ""
+    times = got.quiet_ms / before.quiet_ms
+    return f"{getattr(load, factor):g}: {got.quiet_ms:.1f} ms, {times:.2f} times{tracked}"
 
 
 def _verdict(good: bool) -> str:

@@ -5,10 +5,13 @@ A queue with one server is simulated with the processor times measured: a messag
 waits until those before it are done, and an instant's latency counts from the arrival of the message that completed it.
 """
 
+import contextlib
 import gc
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeVar
 
 import msgspec
@@ -26,6 +29,7 @@ T = TypeVar("T")
 DELAY_NS = 5_000_000
 LATENCY = Latency(camera_ms=1.0, network_ms=1.0, wait_ms=1.0, fuse_ms=1.0, total_ms=4.0)
 START_S = 0.5  # in which robots are found
+TURN_S = 0.25  # of a load, before the next has its turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,22 +50,41 @@ class Capacity:
 
 def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
     """Of a load that runs for `seconds`; of several shards, each a core of its own, the worst of each figure."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()  # as the server does
-    try:
+    with _without_collector():
         queues = [_Queue(load, Shard(k + 1, shards)) for k in range(shards)]
         for message in load.messages(seconds):
             data, arrival_ns = encode(message), message.t_ns + DELAY_NS
             told = [queue.step(data, arrival_ns) for queue in queues]
             for k, queue in enumerate(queues):
                 queue.hear([pose for other in (*told[:k], *told[k + 1 :]) for pose in other])
-    finally:
-        gc.enable()
-        gc.unfreeze()
     each = [queue.sum_up(seconds) for queue in queues]
     worst = {name: max(getattr(c, name) for c in each) for name in Capacity.__slots__}
     return Capacity(**worst | {"tracked": min(c.tracked for c in each)})
+
+
+def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
+    """Of several loads, which take turns: what else the machine does meets all of them alike."""
+    with _without_collector():
+        queues = [_Queue(load, Shard()) for load in loads]
+        streams = [load.messages(seconds) for load in loads]
+        for _ in range(math.ceil(seconds / TURN_S)):
+            for load, queue, stream in zip(loads, queues, streams, strict=True):
+                for message in islice(stream, math.ceil(load.cameras * load.hz * TURN_S)):
+                    queue.step(encode(message), message.t_ns + DELAY_NS)
+    return [queue.sum_up(seconds) for queue in queues]
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Garbage is collected as the server does: once a second, between instants."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 class _Queue:
