@@ -41,16 +41,11 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def rotation_from_wxyz(wxyz: ArrayLike) -> Array:
-    """(3, 3) rotation of a quaternion w, x, y, z, which need not be of unit length."""
+    """(..., 3, 3) rotations of quaternions w, x, y, z (..., 4) of any length: I + 2 w [v]x + 2 [v]x^2 of unit ones."""
     q = np.asarray(wxyz, float)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    W = skew(q[..., 1:])
+    return np.eye(3) + 2 * q[..., :1, None] * W + 2 * W @ W
 
 
 def wxyz_from_rotation(R: ArrayLike) -> Array:

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +45,11 @@ class Frame:
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "Frame":
         """The frame that a message of a calibrated camera tells of."""
-        roundels = message.unpack()
-        return cls(
+        return cls.measure(
             message.camera,
             message.t_ns + round(camera.time_offset_ms * 1e6),
-            roundels,
-            *undistort(camera, roundels.uv),
+            message.unpack(),
+            camera,
             sent_ns=message.sent_ns,
             received_ns=received_ns,
             exposure_us=message.exposure_us,
@@ -57,9 +57,9 @@ class Frame:
         )
 
     @classmethod
-    def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens) -> "Frame":
-        """The frame of roundels that a lens saw."""
-        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv))
+    def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **arrival: Any) -> "Frame":
+        """The frame of roundels that a lens saw, and what else is known of its way."""
+        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **arrival)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

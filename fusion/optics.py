@@ -9,6 +9,7 @@ All of it happens in the undistorted plane x/z, y/z: `Frame.measure` takes detec
 Arrays hold one row's N columns last, (3, N) for N vectors, because numpy is several times faster along memory.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +55,7 @@ class Discs:
 
     def select(self, rows: NDArray) -> "Discs":
         """The columns that a mask or an index array names."""
-        return Discs(*(getattr(self, name)[..., rows] for name in self.__slots__))
+        return Discs(*taken(rows, *(getattr(self, name) for name in self.__slots__)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +89,7 @@ class Views:
 
     def select(self, rows: NDArray) -> "Views":
         """The columns that a mask or an index array names."""
-        return Views(*(getattr(self, name)[..., rows] for name in self.__slots__))
+        return Views(*taken(rows, *(getattr(self, name) for name in self.__slots__)))
 
     @property
     def facing(self) -> Array:
@@ -233,6 +234,12 @@ def shears(measured: Array, expected: Array) -> Array:
 def _rotations(R: Array) -> Array:
     """(..., 3, 3) -> (3, 3, K), memory along K."""
     return np.ascontiguousarray(R.reshape(-1, 3, 3).transpose(1, 2, 0))
+
+
+def taken(rows: NDArray, *arrays: NDArray) -> Iterator[NDArray]:
+    """The columns that a mask or an index array names, left along memory, as indexing would not leave them."""
+    rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+    return (A.take(rows, -1) for A in arrays)
 
 
 def _take(A: Array, columns: Index) -> Array:

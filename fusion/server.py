@@ -85,7 +85,7 @@ class Server:
 
     def run(self) -> None:
         """Serve."""
-        with _collecting_between_instants() as collect:
+        with collecting_between_instants() as collect:
             while not self._stopped.is_set():
                 more = self.link.work(TICK_S)
                 now_ns = self._tell_time()
@@ -267,7 +267,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def _collecting_between_instants() -> Iterator[Callable[[], object]]:
+def collecting_between_instants() -> Iterator[Callable[[], object]]:
     """No garbage is collected but when the function is called that this gives: between instants, once a second."""
     gc.collect()
     gc.freeze()  # what was imported is not looked through again and again

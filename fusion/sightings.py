@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.instants import Instant
-from fusion.optics import Discs, Exposures, Optics
+from fusion.optics import Discs, Exposures, Optics, taken
 from fusion.robots import Robot
 
 Array = NDArray[np.float64]
@@ -52,12 +52,8 @@ class Sightings:
 
     def select(self, rows: NDArray) -> "Sightings":
         """The columns that a mask or an index array names."""
-        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        columns = (self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale)
-        taken = (
-            column.take(rows, -1) for column in columns
-        )  # which leaves them along memory, indexing does not
-        return Sightings(self.exposures, self.frame[rows], *taken)
+        of_each = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
+        return Sightings(self.exposures, *taken(rows, *of_each))
 
     @classmethod
     def of(cls, instant: Instant, optics: Optics, floor_px: float) -> "Sightings":
@@ -197,7 +193,7 @@ class Observations:
     def select(self, rows: NDArray) -> "Observations":
         """The columns that a mask or an index array names."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        return Observations(self.discs.select(rows), self.seen.select(rows), self.whiten.take(rows, 2))
+        return Observations(self.discs.select(rows), self.seen.select(rows), *taken(rows, self.whiten))
 
 
 def _whiten(seen: Sightings) -> Array:

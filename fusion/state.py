@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose import skew
-
 Array = NDArray[np.float64]
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UNKNOWN_TURN = np.pi**2  # variance of a turn about the normal that nothing tells, rad^2
@@ -154,10 +152,3 @@ def wxyz_of(R: Array) -> Array:
     rows = np.array([[s[0], a, b, c], [a, s[1], d, e], [b, d, s[2], f], [c, e, f, s[3]]])
     q = rows[largest, :, np.arange(len(R))]
     return np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)
-
-
-def rotations_of(wxyz: Array) -> Array:
-    """(N, 3, 3) rotations of quaternions (N, 4), which need not be of unit length: I + 2 w [v]x + 2 [v]x^2."""
-    q = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-    cross = skew(q[:, 1:])
-    return np.eye(3) + 2 * q[:, :1, None] * cross + 2 * cross @ cross

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
+from camera_node.pose import rotation_from_wxyz
 from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.inspection import Inspection
@@ -20,16 +21,15 @@ from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
 from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.state import POSITION, THETA, States, exp_so3, rotations_of
+from fusion.state import POSITION, THETA, States, exp_so3
 from fusion.watch import Watch
 
 Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
-FOLLOWED_RAD = (
-    0.15  # likewise of its turn: a constellation turned further looks as if its markers were swapped
-)
+# Likewise of its turn: a constellation turned further looks as if its markers were swapped.
+FOLLOWED_RAD = 0.15
 TOLD = "position", "quaternion_wxyz", "velocity", "angular_velocity"  # of another shard's robot
 
 
@@ -275,7 +275,7 @@ class Tracker:
         self._others = {}
         dt = (self._t_ns - np.array([pose.t_ns for pose in poses]))[:, None] * 1e-9
         p, wxyz, v, omega = (np.array([getattr(pose, name) for pose in poses]) for name in TOLD)
-        R, P = rotations_of(wxyz), np.array([pose.covariance_matrix for pose in poses])
+        R, P = rotation_from_wxyz(wxyz), np.array([pose.covariance_matrix for pose in poses])
         there = States(exp_so3(omega * dt) @ R, p + v * dt, omega, v, P)
         self.states = self.states.with_rows(rows, there)
         for k, pose in zip(rows, poses, strict=True):

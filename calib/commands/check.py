@@ -10,6 +10,7 @@ import msgspec
 from rich.console import Console
 
 from calib.agreement import Agreement, Placed, compare
+from calib.commands.choice import require_one
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.errors import CalibrationError
@@ -17,7 +18,6 @@ from calib.report import print_report
 from calib.rig import Rig, load_rig
 from camera_node.body import Body
 from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
 from camera_node.messages import Detections
 
 if TYPE_CHECKING:
@@ -48,8 +48,10 @@ class Check:
 
     def execute(self, console: Console) -> None:
         """Calibrate anew, whole and in halves, and compare."""
-        if sum(way is not None for way in (self.frames, self.observations, self.recording)) != 1:
-            raise ConfigError("give one of --frames FOLDER, --observations CSV and --recording MCAP")
+        frames, observations, recording = self.frames, self.observations, self.recording
+        require_one(
+            {"--frames FOLDER": frames, "--observations CSV": observations, "--recording MCAP": recording}
+        )
         if self.out is not None:
             check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)

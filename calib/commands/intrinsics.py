@@ -11,6 +11,7 @@ from rich.progress import track
 
 from calib.board import make_finder
 from calib.board_wave import show_board
+from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.footage import find_cameras, read_frames, take_snapshots
@@ -46,8 +47,7 @@ class Intrinsics:
     def execute(self, console: Console) -> None:
         """Write the cameras' entries, keep the others; nothing is written unless all are good."""
         check_folder(self.out)
-        if (self.frames is not None) == self.live:
-            raise ConfigError("give one of --frames FOLDER and --live")
+        require_one({"--frames FOLDER": self.frames, "--live": self.live})
         if self.live and self.camera is None:
             raise ConfigError("--live needs --camera NAME, as the camera was started with --name")
         rig = load_rig(self.out) if self.out.exists() else None

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from zenoh import Session
 
+from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
@@ -63,8 +64,8 @@ class Wand:
     def execute(self, console: Console) -> None:
         """Nothing is written unless two cameras or more were placed."""
         check_folder(self.out)
-        if sum(way is not None for way in (self.frames, self.observations, self.recording)) + self.live != 1:
-            raise ConfigError("give one of --frames FOLDER, --observations CSV, --recording MCAP and --live")
+        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
+        require_one({**files, "--recording MCAP": self.recording, "--live": self.live})
         if self.seconds is not None and not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)

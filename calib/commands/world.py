@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
@@ -60,9 +61,8 @@ class World:
     def execute(self, console: Console) -> None:
         """Nothing is written unless the world is fixed."""
         check_folder(self.out)
-        ways = [self.positions, self.points, self.frame, self.standing]
-        if sum(way is not None for way in ways) != 1:
-            raise ConfigError("give one of --positions CSV, --points FILE, --frame YAML and --standing YAML")
+        places = {"--positions CSV": self.positions, "--points FILE": self.points}
+        require_one({**places, "--frame YAML": self.frame, "--standing YAML": self.standing})
         rig = load_rig(self.rig)
         rig.require_placed(self.rig)
         moved, misses = self._move(rig, console)
@@ -98,10 +98,8 @@ class World:
         return moved, misses
 
     def _look(self, rig: Rig, body: Body | None) -> list[Detections]:
-        if (self.frames is not None) + (self.observations is not None) + self.live != 1:
-            raise ConfigError(
-                "give one of --frames FOLDER, --observations CSV and --live, to see the roundels"
-            )
+        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
+        require_one({**files, "--live": self.live}, ", to see the roundels")
         if not self.live:
             return read_recording(rig, self.frames, self.observations, body)
         if not self.seconds > 0:

@@ -5,11 +5,10 @@ A queue with one server is simulated with the processor times measured: a messag
 waits until those before it are done, and an instant's latency counts from the arrival of the message that completed it.
 """
 
-import contextlib
 import gc
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import TypeVar
@@ -21,6 +20,7 @@ from camera_node.messages import Detections, decode, encode
 from fusion.health import memory_mb
 from fusion.instants import Frame, Instants
 from fusion.messages import Latency, RobotPose
+from fusion.server import collecting_between_instants
 from fusion.shards import Shard
 from fusion.tracker import Tracker
 from tests.benchmarks.fusion_load import Load
@@ -50,7 +50,7 @@ class Capacity:
 
 def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
     """Of a load that runs for `seconds`; of several shards, each a core of its own, the worst of each figure."""
-    with _without_collector():
+    with collecting_between_instants():
         queues = [_Queue(load, Shard(k + 1, shards)) for k in range(shards)]
         for message in load.messages(seconds):
             data, arrival_ns = encode(message), message.t_ns + DELAY_NS
@@ -64,7 +64,7 @@ def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
 
 def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
     """Of several loads, which take turns: what else the machine does meets all of them alike."""
-    with _without_collector():
+    with collecting_between_instants():
         queues = [_Queue(load, Shard()) for load in loads]
         streams = [load.messages(seconds) for load in loads]
         for _ in range(math.ceil(seconds / TURN_S)):
@@ -72,19 +72,6 @@ def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
                 for message in islice(stream, math.ceil(load.cameras * load.hz * TURN_S)):
                     queue.step(encode(message), message.t_ns + DELAY_NS)
     return [queue.sum_up(seconds) for queue in queues]
-
-
-@contextlib.contextmanager
-def _without_collector() -> Iterator[None]:
-    """Garbage is collected as the server does: once a second, between instants."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()
 
 
 class _Queue:
