@@ -4,11 +4,15 @@
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from camera_node.pose import rotation_from_wxyz
+from fusion.client import Arena as Client
 from fusion.errors import FusionError
 from fusion.measuring import Standing, find_standing, robot_of
 from fusion.messages import Markers
@@ -103,10 +107,11 @@ def command(endpoint: str, *words: str) -> list[str]:
     return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
 
 
-def test_a_robot_in_a_running_arena_is_defined(tmp_path):
-    """By the command, while the other one drives on; what it prints is an entry for robots.yaml."""
+@contextmanager
+def running(folder: Path) -> Iterator[tuple[str, Client]]:
+    """The endpoint of a server that follows one robot and sees another, which nobody declared; and a client."""
     arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": STANDS}, sigma_px=0.05)
-    settings, over = config(tmp_path), threading.Event()
+    settings, over = config(folder), threading.Event()
     with serving(settings) as (server, client):
 
         def go_on() -> None:
@@ -117,16 +122,20 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
         cameras.start()
         try:
             until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-            words = command(
-                settings.listen[0], "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground"
-            )
-            done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-            assert done.returncode == 0, done.stderr
-            assert "the server looks for b, of 3 markers" in done.stdout
-            until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
+            yield settings.listen[0], client
         finally:
             over.set()
             cameras.join()
+
+
+def test_a_robot_in_a_running_arena_is_defined(tmp_path):
+    """By the command, while the other one drives on; what it prints is an entry for robots.yaml."""
+    with running(tmp_path) as (endpoint, client):
+        words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
+        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "the server looks for b, of 3 markers" in done.stdout
+        until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
         robots = client.change_robots()
         assert set(robots) == {"a", "b"}
         path = tmp_path / "measured.yaml"
