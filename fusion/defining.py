@@ -11,7 +11,6 @@ import tyro
 from camera_node.config import is_name
 from camera_node.errors import ConfigError
 from camera_node.network import open_client
-from fusion.errors import FusionError
 from fusion.measuring import find_standing, robot_of, watch
 from fusion.messages import RobotsRequest
 from fusion.requests import change_robots
@@ -52,12 +51,7 @@ def define(
         raise ConfigError(f"--seconds is {seconds:g}; it must be above 0, and below an hour")
     with open_client(connect, zenoh_config) as session:
         change_robots(session, arena, RobotsRequest())  # says whether a server is there, before anybody waits
-        instants = watch(session, arena, seconds)
-        if not instants:
-            raise FusionError(
-                f"the server told of no instant in {seconds:g} s: are cameras running and calibrated?"
-            )
-        markers = find_standing(instants)
+        markers = find_standing(watch(session, arena, seconds))
         robot = robot_of(markers.within(at, within) if at else markers, diameter, motion)
         change_robots(session, arena, RobotsRequest(define={name: robot}))
     print(describe(name, robot))

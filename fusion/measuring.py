@@ -43,7 +43,7 @@ class Standing:
 
 
 def watch(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
-    """What a running server tells of markers in so many seconds."""
+    """What a running server tells of markers in so many seconds; FusionError where that is nothing."""
     arrived: queue.Queue[bytes] = queue.Queue()
     subscriber = session.declare_subscriber(
         Keys(arena).markers, lambda sample: arrived.put(sample.payload.to_bytes())
@@ -57,6 +57,10 @@ def watch(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
                 continue
     finally:
         subscriber.undeclare()
+    if not instants:
+        raise FusionError(
+            f"the server told of no instant in {seconds:g} s: are cameras running and calibrated?"
+        )
     return instants
 
 

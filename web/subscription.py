@@ -38,7 +38,7 @@ class Subscription:
         return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None), None)
 
     def watch(self, seconds: float) -> list[Markers]:
-        """What the server tells of markers in so many seconds."""
+        """What the server tells of markers in so many seconds; FusionError where that is nothing."""
         return watch(self.session, self.feed.keys.arena, seconds)
 
     def define(self, name: str, robot: Robot) -> None:

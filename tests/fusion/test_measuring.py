@@ -4,10 +4,13 @@
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -20,7 +23,7 @@ from fusion.robots import distances, load_robots, require_distinct
 from tests.conftest import free_port
 from tests.fusion.conftest import fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
-from tests.fusion.test_server import ARENA, DEADLINE_S, config, live, send, serving, until
+from tests.fusion.test_server import ARENA, DEADLINE_S, config, send, serving, until
 
 STANDS = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))
 UNKNOWN = np.full((3, 3), np.nan)
@@ -111,12 +114,17 @@ def command(endpoint: str, *words: str) -> list[str]:
 def running(folder: Path) -> Iterator[tuple[str, Client]]:
     """The endpoint of a server that follows one robot and sees another, which nobody declared; and a client."""
     arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": STANDS}, sigma_px=0.05)
+    a_second = arena.messages(30)
     settings, over = config(folder), threading.Event()
     with serving(settings) as (server, client):
 
         def go_on() -> None:
-            while not over.wait(0.9):  # a second of frames each time
-                send(server, live(arena.messages(30)))
+            for second in count(time.time_ns(), 10**9):
+                for message in a_second:
+                    t_ns = second + message.t_ns - a_second[0].t_ns
+                    if over.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
+                        return
+                    send(server, [msgspec.structs.replace(message, t_ns=t_ns, sent_ns=t_ns)])
 
         cameras = threading.Thread(target=go_on)
         cameras.start()
