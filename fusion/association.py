@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.pose import skew
 from fusion.instants import Frame, Instant
-from fusion.optics import Discs, Exposures, Optics, Views, outlines
+from fusion.optics import Discs, Exposures, Optics, Views
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States
 
@@ -177,6 +177,18 @@ def _major_px(discs: Discs, views: Views, sightings: Sightings, i: Index, j: Ind
     a, b, c = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
     largest = (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)) / 2  # eigenvalue
     return 2 * np.sqrt(np.maximum(largest, TINY_PX2))
+
+
+def outlines(centre: Array, normal: Array, radius: Array, scale: Array) -> Array:
+    """(N, 2, 2) shape matrices of discs' outlines in raw pixels; a circle of radius a has a^2 I.
+
+    `centre` and `normal` (3, N) are in the camera's frame; `scale` (2, 2, N) is the derivative of raw pixels by xy at
+    the disc: the lens is taken as affine over it.
+    """
+    dual = centre[:, None] * centre - radius**2 * (np.eye(3)[:, :, None] - normal[:, None] * normal)
+    dual = dual / dual[2, 2]
+    shape = dual[:2, None, 2] * dual[None, :2, 2] - dual[:2, :2]
+    return np.einsum("ian,abn,jbn->nij", scale, shape, scale)
 
 
 def _noise(sightings: Sightings) -> Array:

@@ -1,0 +1,12 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include <nanobind/nanobind.h>
+
+namespace roundel::fusion {
+void bind_poses(nanobind::module_& m);
+void bind_equations(nanobind::module_& m);
+}  // namespace roundel::fusion
+
+NB_MODULE(_core, m) {
+    roundel::fusion::bind_poses(m);
+    roundel::fusion::bind_equations(m);
+}
