@@ -94,6 +94,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     def __len__(self) -> int:
         return len(self.uv) // 16
 
+    @np.errstate(invalid="ignore")  # a signalling NaN becomes a quiet one
     def unpack(self) -> Roundels:
         """The columns as arrays."""
         cov = _column(self.cov, "<f4", 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -105,6 +106,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             *(np.frombuffer(c, "<i4").astype(np.int32) for c in (self.id, self.track)),
         )
 
+    @np.errstate(invalid="ignore")  # likewise
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive and small."""
         n, rest = divmod(len(self.uv), 16)
@@ -208,5 +210,4 @@ def decode(data: bytes, kind: type[T]) -> T:
 
 
 def _column(data: bytes, dtype: str, width: int) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
-        return np.frombuffer(data, dtype).reshape(-1, width).astype(float)
+    return np.frombuffer(data, dtype).reshape(-1, width).astype(float)

@@ -48,6 +48,37 @@ class Poses:
     ) -> Array:
         """(N, 2, 13) likewise of shears: axes (2, N), angle (N,), scale (2, 2, N), sigma (N,)."""
 
+class ExpectedMarkers:
+    """M markers of bodies that are followed, and how well their places are predicted."""
+
+    def __init__(self, R: Array, P: Array, body: Index, marker: Array, radius: Array, /) -> None:
+        """Bodies' R (B, 3, 3) and P (B, 12, 12); of each marker the body, the place (3, M) in it and the radius."""
+
+    def covariances(self, tau: float, /) -> Array:
+        """(M, 3, 3) of places in the world, tau seconds after the instant."""
+
+    def candidates(
+        self,
+        poses: Poses,
+        frame: Index,
+        xy: Array,
+        scale: Array,
+        cov: Array,
+        major: Array,
+        focal: Array,
+        /,
+    ) -> tuple[Index, Array]:
+        """(2, K) markers and detections within each other's gates, and (K,) what each pair costs.
+
+        N detections in order of their frames: xy (2, N), scale and cov (2, 2, N), major (N,); focal (F,) by frame.
+        """
+
+def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
+    """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) the derivatives of pixels by these.
+
+    cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
+    """
+
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) of measured ellipses, as discs should look with centre and normal (3, N)."""
 

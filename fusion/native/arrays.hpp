@@ -21,7 +21,9 @@ using Pairs = In<double, 2, -1>;
 using Vectors = In<double, 3, -1>;
 using Matrices2 = In<double, 2, 2, -1>;
 using RowArray = In<double, -1, 2, 13>;
-using Out = nb::ndarray<nb::numpy, double>;
+template <class T>
+using OutOf = nb::ndarray<nb::numpy, T>;
+using Out = OutOf<double>;
 
 /// Raises ValueError unless all of these are n.
 inline void require_equal(size_t n, std::initializer_list<size_t> sizes) {
@@ -29,10 +31,12 @@ inline void require_equal(size_t n, std::initializer_list<size_t> sizes) {
         if (size != n) throw nb::value_error("arrays of different lengths");
 }
 
-/// Raises IndexError unless indices are within 0..n.
+/// Raises IndexError unless it is within 0..n.
+inline void require_below(size_t n, int64_t index) {
+    if (uint64_t(index) >= n) throw nb::index_error("an index is out of range");
+}
 inline const int64_t* below(size_t n, const Index& indices) {
-    for (size_t k = 0; k < indices.size(); ++k)
-        if (uint64_t(indices(k)) >= n) throw nb::index_error("an index is out of range");
+    for (size_t k = 0; k < indices.size(); ++k) require_below(n, indices(k));
     return indices.data();
 }
 
@@ -47,12 +51,13 @@ inline Vector vector_at(const double* v) { return {v[0], v[1], v[2]}; }
 inline Matrix matrix_at(const double* m) { return {vector_at(m), vector_at(m + 3), vector_at(m + 6)}; }
 
 /// A new array that owns its memory.
-inline std::pair<Out, double*> make(std::initializer_list<size_t> shape) {
+template <class T = double>
+std::pair<OutOf<T>, T*> make(std::initializer_list<size_t> shape) {
     size_t size = 1;
     for (const size_t n : shape) size *= n;
-    auto* data = new double[size + 1];
-    const nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<double*>(p); });
-    return {Out(data, shape, owner), data};
+    auto* data = new T[size + 1];
+    const nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+    return {OutOf<T>(data, shape, owner), data};
 }
 
 /// Works without Python's lock.

@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "../../camera_node/native/cholesky.hpp"
+#include "../../camera_node/native/simd.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -11,23 +12,18 @@ namespace {
 constexpr int kReweightings = 4;  // by one linearisation at the most; two mostly
 constexpr double kSettled = 0.1;  // change of a weight that ends them
 
-/// Only H's lower triangles.
-void add(const System& system, const double* weights, Square* H, Step* g) {
+ROUNDEL_CLONES void add(const System& system, const double* weights, Square* H, Step* g) {
     for (size_t k = 0; k < system.n_rows; ++k) {
         Square& information = H[system.body[k]];
         Step& right = g[system.body[k]];
-        for (const auto& row : system.rows[k].A)
-            for (int i = 0; i < kErrors; ++i) {
-                const double weighted = weights[k] * row[i];
-                for (int j = 0; j <= i; ++j) information[i][j] += weighted * row[j];
-                right[i] += weighted * row[kErrors];
-            }
+        const Rows rows = system.rows[k];  // a copy, which the sums can't be part of
+        const double *a = rows.A[0], *b = rows.A[1], weight = weights[k];
+        for (int i = 0; i < kErrors; ++i) {
+            const double by_a = weight * a[i], by_b = weight * b[i];
+            for (int j = 0; j < kErrors; ++j) information[i][j] += by_a * a[j] + by_b * b[j];
+            right[i] += by_a * a[kErrors] + by_b * b[kErrors];
+        }
     }
-}
-
-void mirror(Square& H) {
-    for (int i = 0; i < kErrors; ++i)
-        for (int j = i + 1; j < kErrors; ++j) H[i][j] = H[j][i];
 }
 
 Step solve(const Square& H, const Step& g) {
@@ -70,7 +66,6 @@ void reweigh(const System& system, Square* H, Step* g, double* weights) {
         std::transform(H, H + n, g, steps.begin(), solve);
         change = weigh(system, steps, weights);
     }
-    std::for_each(H, H + n, mirror);
 }
 
 void remain(const System& system, const double* steps, double* to) {

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.optics import Discs, Exposures, Optics, Views
-from fusion.sightings import Observations
+from fusion.sightings import Observations, Sightings
 from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States, turns
 
 Array = NDArray[np.float64]
@@ -185,3 +185,29 @@ def reweigh(
         if np.abs(weights - before).max() < SETTLED:
             break
     return *sums(), weights
+
+
+def candidates(
+    optics: Optics, states: States, seen: Sightings, discs: Discs, covariance: Array
+) -> dict[tuple[int, int], float]:
+    """Costs by disc and sighting of one frame, within the gates; `covariance` (N, 3, 3) of the discs' places."""
+    views = view(pose(optics, states, seen.exposures), discs)
+    found = {}
+    for i in np.flatnonzero((views.facing > 0.1) & np.isfinite(views.xy[0])):
+        camera = seen.exposures.camera[discs.frame[i]]
+        R, z = optics.R_cam_world[camera], views.centre[2, i]
+        J = (R[:2] - views.xy[:, i, None] * R[2]) / z
+        depth = 0.05**2 + R[2] @ covariance[i] @ R[2] / z**2
+        for j in np.flatnonzero(seen.frame == discs.frame[i]):
+            scale = seen.scale[:, :, j]
+            per_scale = np.linalg.inv(scale)
+            noise = per_scale @ (seen.cov[:, :, j] + 0.7**2 * np.eye(2)) @ per_scale.T
+            C = J @ covariance[i] @ J.T + noise
+            off = seen.xy[:, j] - views.xy[:, i]
+            d2 = off @ np.linalg.solve(C, off)
+            shape = outlines(views.centre[:, [i]], views.normal[:, [i]], discs.radius[[i]], scale[..., None])
+            size = np.log(seen.axes_px[0, j] / 2 / np.sqrt(np.linalg.eigvalsh(shape[0])[1]))
+            if d2 < 13.8 and abs(size) <= np.log(1.35):
+                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * optics.focal[camera] ** 4 * depth)
+                found[int(i), int(j)] = cost
+    return found

@@ -4,6 +4,7 @@
 Both round differently, no more: in the order of 1e-15 of the largest term; 1e-9 leaves room for cancellation.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -109,6 +110,43 @@ def test_sums_and_weights_are_those_of_reweighted_least_squares():
     steps = random.normal(size=(5, 12))
     rest = rows[:, :, 12] - np.einsum("nai,ni->na", rows[:, :, :12], steps[body])
     assert_near(_core.remainder(rows, body, steps), rest.T)
+
+
+def test_candidates_are_the_pairs_within_the_gates():
+    """Of discs a few pixels beside detections: some pairs are near enough, of some the size does not fit."""
+    states, seen = scene()
+    exposures, discs = seen.seen.exposures, seen.discs
+    random = np.random.default_rng(3)
+    states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)
+    rows = random.choice(len(discs), 100, replace=False)
+    expected = _core.ExpectedMarkers(
+        states.R, states.P, discs.body[rows], discs.marker[:, rows].copy(), discs.radius[rows]
+    )
+    poses = OPTICS.pose(states, exposures)
+    of_frame = seen.seen.axes_px[0], OPTICS.focal[exposures.camera]
+    (marker, sighting), cost = expected.candidates(
+        poses, seen.seen.frame, seen.seen.xy, seen.seen.scale, seen.seen.cov, *of_frame
+    )
+    found = {}
+    for f, tau in enumerate(exposures.tau):
+        there = discs.select(rows)
+        there = replace(there, frame=np.full(len(rows), f))
+        found |= {
+            (f, *pair): value
+            for pair, value in equations.candidates(
+                OPTICS, states, seen.seen, there, expected.covariances(tau)
+            ).items()
+        }
+    got = dict(
+        zip(
+            zip(seen.seen.frame[sighting].tolist(), marker.tolist(), sighting.tolist(), strict=True),
+            cost,
+            strict=True,
+        )
+    )
+    assert got.keys() == found.keys()
+    assert len(got) > 20
+    assert_near([got[key] for key in found], list(found.values()))
 
 
 def test_indices_and_lengths_are_checked():
