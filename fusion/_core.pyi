@@ -89,3 +89,6 @@ def reweigh(
 
 def remainder(rows: Array, body: Index, steps: Array, /) -> Array:
     """(2, N) whitened: what steps (K, 12) leave of the rows."""
+
+def inverses(information: Array, /) -> Array:
+    """(K, 12, 12) of positive definite matrices; raises RuntimeError where one is not."""

@@ -103,7 +103,7 @@ class Estimator:
                 break
             solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
         P = states.P.copy()
-        P[seen] = np.linalg.inv(solution.information)
+        P[seen] = _core.inverses(solution.information)
         if self.single.any():
             P[self.single] = forget_turn(P[self.single])
         return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)

@@ -39,6 +39,15 @@ Out remainder_of(const RowArray& rows, const Index& body, const In<double, -1, 1
     return left;
 }
 
+Out inverses(const In<double, -1, 12, 12>& information) {
+    auto [covariances, to] = make({information.shape(0), kErrors, kErrors});
+    const auto* from = reinterpret_cast<const Square*>(information.data());
+    unlocked([&, out = reinterpret_cast<Square*>(to)] {
+        std::transform(from, from + information.shape(0), out, inverse);
+    });
+    return covariances;
+}
+
 }  // namespace
 
 void bind_equations(nb::module_& m) {
@@ -46,6 +55,7 @@ void bind_equations(nb::module_& m) {
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("reweigh", &sum_up);
     m.def("remainder", &remainder_of);
+    m.def("inverses", &inverses);
 }
 
 }  // namespace roundel::fusion

@@ -2,6 +2,7 @@
 #include "normal_equations.hpp"
 
 #include <algorithm>
+#include <stdexcept>
 
 #include "../../camera_node/native/cholesky.hpp"
 #include "../../camera_node/native/simd.hpp"
@@ -72,6 +73,12 @@ void remain(const System& system, const double* steps, double* to) {
     for (size_t k = 0; k < system.n_rows; ++k)
         for (int a = 0; a < 2; ++a)
             to[a * system.n_rows + k] = left(system.rows[k].A[a], steps + kErrors * system.body[k]);
+}
+
+Square inverse(const Square& H) {
+    const Cholesky<kErrors> factor(H);
+    if (!factor.positive()) throw std::runtime_error("a robot's information is not positive definite");
+    return factor.inverse_tail<kErrors>();
 }
 
 }  // namespace roundel::fusion

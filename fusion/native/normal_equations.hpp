@@ -32,4 +32,7 @@ void reweigh(const System& system, Square* H, Step* g, double* weights);
 /// 2 x N whitened: what steps (K x 12) leave of the right sides.
 void remain(const System& system, const double* steps, double* to);
 
+/// The inverse of a positive definite matrix. Throws std::runtime_error if it is not.
+Square inverse(const Square& H);
+
 }  // namespace roundel::fusion

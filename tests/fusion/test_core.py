@@ -112,6 +112,15 @@ def test_sums_and_weights_are_those_of_reweighted_least_squares():
     assert_near(_core.remainder(rows, body, steps), rest.T)
 
 
+def test_a_covariance_is_the_inverse_of_its_information():
+    root = np.random.default_rng(9).normal(size=(3, 12, 20))
+    information = root @ root.transpose(0, 2, 1)
+    assert_near(_core.inverses(information), np.linalg.inv(information))
+    information[1] -= 50 * np.eye(12)
+    with pytest.raises(RuntimeError, match="not positive definite"):
+        _core.inverses(information)
+
+
 def test_candidates_are_the_pairs_within_the_gates():
     """Of discs a few pixels beside detections: some pairs are near enough, of some the size does not fit."""
     states, seen = scene()
