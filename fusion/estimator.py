@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fusion import _core
 from fusion.optics import Optics
 from fusion.sightings import Observations
-from fusion.state import States, forget_turn, predict
+from fusion.state import Motion, States, forget_turn, predict
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -30,16 +30,14 @@ AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added.
+    """N bodies at this instant before its observations, and how errors moved since the last.
 
     `information` (N, 12, 12) is the inverse of the states' covariance: made here, before the last detection is there.
     """
 
-    before: Array  # (N, 12, 12) covariance at the last instant
     states: States
     information: Array
-    F: Array
-    Q: Array
+    motion: Motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +70,10 @@ class Estimator:
 
     def predict(self, states: States, dt: Array) -> Prediction:
         """All robots, `dt` (N,) seconds later."""
-        moved, F, Q = predict(states, dt, self.densities, self.single)
+        moved, motion = predict(states, dt, self.densities, self.single)
         if self.single.any():
             moved.P[self.single] = forget_turn(moved.P[self.single])
-        return Prediction(states.P, moved, np.asarray(np.linalg.inv(moved.P), float), F, Q)
+        return Prediction(moved, _core.inverses(moved.P), motion)
 
     def update(
         self, prediction: Prediction, observations: Observations, small: float = SMALL
