@@ -17,6 +17,7 @@ class Serve:
     """Fuse what an arena's cameras publish into robot poses, until stopped; holds the arena's Zenoh router.
 
     For recordings: python -m fusion run | record | replay --help
+    For a new robot, measured where it stands: python -m fusion define --help
     """
 
     config: Path | None = None
@@ -67,6 +68,8 @@ def _program() -> int:
         from fusion.offline import run as command
     elif arguments[:1] == ["record"]:
         from fusion.recording import record as command
+    elif arguments[:1] == ["define"]:
+        from fusion.defining import define as command
     elif arguments[:1] == ["replay"]:
         from fusion.offline import replay as command
     else:

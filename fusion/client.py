@@ -26,7 +26,9 @@ from calib.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.messages import Keys, MessageError, decode
 from camera_node.network import open_client
-from fusion.messages import FusionStatus, Markers, RobotPose
+from fusion.messages import FusionStatus, Markers, RobotPose, RobotsRequest
+from fusion.requests import change_robots
+from fusion.robots import Robot as RobotBody
 
 T = TypeVar("T")
 TIMEOUT_S = 10.0
@@ -181,6 +183,21 @@ class Arena:
     def robots(self) -> tuple[str, ...]:
         """Names of the robots that were heard of so far."""
         return tuple(sorted(self._known))
+
+    def change_robots(
+        self,
+        rename: dict[str, str] | None = None,
+        remove: Sequence[str] = (),
+        define: dict[str, RobotBody] | None = None,
+    ) -> dict[str, RobotBody]:
+        """Rename, then remove, then define robots while the server runs, all or nothing; those that there are then.
+
+        Raises:
+            FusionError: the change makes no sense; the server's own words.
+            NetworkError: no server answers in time.
+        """
+        request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
+        return change_robots(self._session, self.keys.arena, request)
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every instant."""

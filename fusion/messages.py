@@ -100,6 +100,10 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M, 3) positions, world."""
         return np.frombuffer(self.position, "<f8").reshape(-1, 3)
 
+    def normals(self) -> NDArray[np.float32]:
+        """(M, 3) unit vectors out of the printed sides, world; NaN where unknown."""
+        return np.frombuffer(self.normal, "<f4").reshape(-1, 3)
+
     def robot_index(self) -> NDArray[np.int32]:
         """(M,) index into `robots`, -1 for none."""
         return np.frombuffer(self.robot, "<i4")

@@ -12,8 +12,10 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+import tyro
 import zenoh
 
 from calib.messages import RigMessage
@@ -75,7 +77,7 @@ def record(
     *,
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
     arena: str = "arena",
-    zenoh_config: Path | None = None,
+    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
     seconds: float | None = None,
 ) -> int:
     """Record an arena's detections, poses, markers, rig and robots, until stopped.

@@ -6,7 +6,6 @@ harmless: it would turn the printed sides away from the cameras.
 """
 
 import math
-from collections.abc import Iterator
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Literal
@@ -151,25 +150,29 @@ def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:
         if fault := _likeness(robot, robot):
             raise FusionError(f"{where}: robot '{name}' looks the same when turned: {fault}")
     for (name_a, a), (name_b, b) in combinations(robots.items(), 2):
-        if max(a.diameter_m, b.diameter_m) > SIZES_DIFFER * min(a.diameter_m, b.diameter_m):
-            continue
-        if a.is_single or b.is_single:
-            continue
-        if a.markers == b.markers and a.diameter_m == b.diameter_m:
-            _require_starts(name_a, a, name_b, b, where)
-            continue
-        small, large = (a, b) if len(a.markers) <= len(b.markers) else (b, a)
-        if fault := _likeness(small, large):
-            raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are too alike: {fault}")
+        if fault := _confusion(a, b):
+            raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are {fault}")
 
 
-def _require_starts(name_a: str, a: Robot, name_b: str, b: Robot, where: str) -> None:
-    """Robots with the same markers are told apart by history, which needs a beginning."""
-    if a.start_m is None or b.start_m is None or math.dist(a.start_m, b.start_m) < APART_M:
-        raise FusionError(
-            f"{where}: robots '{name_a}' and '{name_b}' are identical: give both a start_m, {APART_M:g} m or more "
-            f"apart, or move a marker of one by {DISTINCT_M * 1e3:.0f} mm"
-        )
+def _confusion(a: Robot, b: Robot) -> str | None:
+    """Why two robots can't be told apart."""
+    if max(a.diameter_m, b.diameter_m) > SIZES_DIFFER * min(a.diameter_m, b.diameter_m):
+        return None
+    if a.is_single and b.is_single:
+        return _lack_of_starts(a, b, f"print one of them {SIZES_DIFFER:g} times as large")
+    if a.is_single or b.is_single:
+        return None  # which a constellation finds out by itself
+    if a.markers == b.markers and a.diameter_m == b.diameter_m:
+        return _lack_of_starts(a, b, f"move a marker of one by {DISTINCT_M * 1e3:.0f} mm")
+    fault = _likeness(*sorted((a, b), key=lambda robot: len(robot.markers)))
+    return fault and f"too alike: {fault}"
+
+
+def _lack_of_starts(a: Robot, b: Robot, remedy: str) -> str | None:
+    """Robots that look the same are told apart by history, which needs a beginning."""
+    if a.start_m and b.start_m and math.dist(a.start_m, b.start_m) >= APART_M:
+        return None
+    return f"identical: give both a start_m, {APART_M:g} m or more apart, or {remedy}"
 
 
 def distances(points: Array) -> Array:
@@ -186,20 +189,17 @@ def align(a: Array, b: Array) -> tuple[Array, Array]:
 def _likeness(small: Robot, large: Robot) -> str | None:
     """How `small` could be taken for markers of `large`, in another order if they are the same robot."""
     D, E = distances(small.points), distances(large.points)
-    for order in _labellings(small, large):
-        worst = np.abs(D - E[np.ix_(order, order)])
-        if worst.max() < DISTINCT_M and align(small.points, large.points[list(order)])[0][2, 2] > 0:
-            return _explain(D, E, order, worst)
+    orders = np.array(list(permutations(range(len(large.markers)), len(small.markers))))
+    if small is large:
+        orders = orders[1:]  # without the one that is its own
+    worst = np.abs(D - E[orders[:, :, None], orders[:, None]])  # (labellings, M, M)
+    for k in np.flatnonzero(worst.max((1, 2)) < DISTINCT_M):
+        if align(small.points, large.points[orders[k]])[0][2, 2] > 0:
+            return _explain(D, E, orders[k], worst[k])
     return None
 
 
-def _labellings(small: Robot, large: Robot) -> Iterator[tuple[int, ...]]:
-    orders = permutations(range(len(large.markers)), len(small.markers))
-    same = tuple(range(len(small.markers)))
-    return (order for order in orders if not (small is large and order == same))
-
-
-def _explain(D: Array, E: Array, order: tuple[int, ...], worst: Array) -> str:
+def _explain(D: Array, E: Array, order: NDArray[np.intp], worst: Array) -> str:
     i, j = np.unravel_index(np.argmax(worst), worst.shape)
     a, b = sorted((order[i], order[j]))
     return (

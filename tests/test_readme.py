@@ -130,7 +130,7 @@ def server(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 def test_the_live_programs(server: tuple[Path, str]):
-    """Beside the README's server: a camera that is not there and a wand without cameras say so; the view serves."""
+    """Beside the README's server: what needs cameras says that there are none; the view serves."""
     folder, endpoint = server
     camera = find("python -m camera_node --source").replace("tcp/localhost:7447", endpoint)
     if not Path("/dev/video0").exists():
@@ -140,6 +140,8 @@ def test_the_live_programs(server: tuple[Path, str]):
     shutil.copy(folder / "frames" / "rig.yaml", folder / "rig.yaml")
     wand = find("python -m calib wand --live").replace("--seconds 30", f"--seconds 2 --connect {endpoint}")
     assert "error: " in run(wand, folder, expected=2).stderr
+    define = find("python -m fusion define") + f" --connect {endpoint}"
+    assert "told of no instant" in run(define, folder, expected=2).stderr
     view = find("python -m web").replace("tcp/localhost:7447", endpoint)
     port = free_port()
     process = subprocess.Popen([*words(view), "--port", str(port)], cwd=folder, stdout=subprocess.DEVNULL)

@@ -78,12 +78,16 @@ def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: thr
             print(describe(feed.latest()), flush=True)
         return
     from web.controls import LiveControls
+    from web.picking import Picking
     from web.playback import ReplayControls
     from web.view import View
 
     view = View(feed, options.host, options.port)
-    live = isinstance(source, Subscription)
-    view.add(LiveControls(view.server, source) if live else ReplayControls(view.server, source))
+    if isinstance(source, Subscription):
+        view.add(LiveControls(view.server, source))
+        view.add(Picking(view.server, source))
+    else:
+        view.add(ReplayControls(view.server, source))
     print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
     try:
         view.run(stop)

@@ -16,6 +16,7 @@ from web.trails import Trails, fade
 
 BACKGROUND = (3, 3, 4)
 CAMERA, GHOST, LABELLED, UNLABELLED = (122, 162, 247), (235, 238, 245), (255, 255, 255), (150, 150, 150)
+PICKED = (255, 214, 64)
 COASTING, LOST = (222, 99, 10), (40, 20, 20)
 # Viser's meshes and lines take colours as linear light: (c / 255)^2.2 of what is to be seen.
 ROBOTS = np.array(

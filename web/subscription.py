@@ -5,7 +5,10 @@ from typing import Any
 
 import zenoh
 
-from fusion.messages import undo_key
+from fusion.measuring import watch
+from fusion.messages import Markers, RobotsRequest, undo_key
+from fusion.requests import change_robots
+from fusion.robots import Robot
 from web.feed import Feed
 
 ASK_S = 2.0
@@ -33,6 +36,14 @@ class Subscription:
         """The JPEG that a camera sees now, or None where it does not answer in time."""
         replies = self.session.get(self.feed.keys.snapshot(camera), timeout=timeout_s)
         return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None), None)
+
+    def watch(self, seconds: float) -> list[Markers]:
+        """What the server tells of markers in so many seconds."""
+        return watch(self.session, self.feed.keys.arena, seconds)
+
+    def define(self, name: str, robot: Robot) -> None:
+        """Have the server look for a robot; FusionError or NetworkError where it does not."""
+        change_robots(self.session, self.feed.keys.arena, RobotsRequest(define={name: robot}), ASK_S)
 
     def undo(self, timeout_s: float = ASK_S) -> str:
         """Have the server take back the last pose that it found of a moved camera; what came of it, in words."""

@@ -57,12 +57,12 @@ class Load:
 
     @cached_property
     def bodies(self) -> dict[str, Robot]:
-        """Robots that nothing but their distances tells apart."""
+        """Robots that nothing but their distances tells apart; those of one marker nothing at all."""
         rng = np.random.default_rng(self.seed)
         bodies: dict[str, Robot] = {}
         while len(bodies) < self.robots:
             robot = _robot(rng, self.markers)
-            if all(_differ(robot, other) for other in bodies.values()):
+            if robot.is_single or all(_differ(robot, other) for other in bodies.values()):
                 bodies[f"r{len(bodies)}"] = robot
         return bodies
 

@@ -46,6 +46,20 @@ def test_identical_robots_need_a_beginning():
     require_distinct({"a": twin((0.0, 0, 0)), "b": twin((1.0, 0, 0))})
 
 
+def test_robots_of_one_marker_need_a_beginning_or_sizes_of_their_own():
+    def single(diameter_m: float, *start: float) -> Robot:
+        return Robot(diameter_m=diameter_m, start_m=start or None)  # pyright: ignore[reportArgumentType] three of them
+
+    with pytest.raises(
+        FusionError, match=r"'a' and 'b' are identical: give both a start_m.*or print one of them"
+    ):
+        require_distinct({"a": single(0.1), "b": single(0.12)})
+    with pytest.raises(FusionError, match="identical"):
+        require_distinct({"a": single(0.1, 0.0, 0.0, 0.0), "b": single(0.1)})
+    require_distinct({"a": single(0.1, 0.0, 0.0, 0.0), "b": single(0.1, 1.0, 0.0, 0.0)})
+    require_distinct({"a": single(0.1), "b": single(0.13), "c": TRIANGLE})
+
+
 def test_identical_robots_after_an_occlusion_are_told_apart_by_where_they_were(run_arena):
     """Both hidden for 0.5 s, 1.6 m apart: back under their names within 0.2 s. Ground robots move 0.2 m (a sigma)
     from where they were expected in that time."""

@@ -49,8 +49,8 @@ def view(subscription: Subscription) -> Iterator[View]:
     view.close()
 
 
-@pytest.fixture
-def page(view: View) -> Iterator[Page]:
+@contextmanager
+def browsing(view: View) -> Iterator[Page]:
     """A browser on the view; an error on its console fails the test."""
     if CHROMIUM is None:
         pytest.skip("no chromium on this machine; apt-get install chromium")
@@ -69,6 +69,13 @@ def page(view: View) -> Iterator[Page]:
         yield page
         browser.close()
     assert not errors
+
+
+@pytest.fixture
+def page(view: View) -> Iterator[Page]:
+    """A browser on the view."""
+    with browsing(view) as page:
+        yield page
 
 
 def play(played: Played) -> None:

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a program may ask of a running server."""
+
+import time
+
+import zenoh
+
+from camera_node.errors import NetworkError
+from camera_node.messages import MessageError, decode, encode
+from fusion.errors import FusionError
+from fusion.messages import Robots, RobotsRequest, robots_key
+from fusion.robots import Robot
+
+ASK_S = 5.0
+AGAIN_S = 0.1
+
+
+def change_robots(
+    session: zenoh.Session, arena: str, request: RobotsRequest, timeout_s: float = ASK_S
+) -> dict[str, Robot]:
+    """Rename, remove and define robots, all of it or nothing; the robots that the server looks for then.
+
+    Raises:
+        FusionError: the request makes no sense; the server's own words.
+        NetworkError: no server answers in time.
+    """
+    end = time.monotonic() + timeout_s
+    while (left := end - time.monotonic()) > 0:
+        for reply in session.get(robots_key(arena), payload=encode(request), timeout=left):
+            if reply.ok is None:
+                raise FusionError(reply.err.payload.to_string() if reply.err else "the server refused")
+            try:
+                return decode(reply.ok.payload.to_bytes(), Robots).robots
+            except MessageError as error:
+                raise NetworkError(f"the server's answer is no list of robots: {error}") from None
+        time.sleep(min(AGAIN_S, left))  # a session that has just been opened knows nobody whom it could ask
+    raise NetworkError(
+        f"no server of arena '{arena}' answers within {timeout_s:g} s; is python -m fusion running there?"
+    )

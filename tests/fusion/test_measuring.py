@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot that nobody declared is measured where it stands, defined, and tracked from then on."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.pose import rotation_from_wxyz
+from fusion.client import Arena as Client
+from fusion.errors import FusionError
+from fusion.measuring import Standing, find_standing, robot_of
+from fusion.messages import Markers
+from fusion.robots import distances, load_robots, require_distinct
+from tests.conftest import free_port
+from tests.fusion.conftest import fuse
+from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
+from tests.fusion.test_server import ARENA, DEADLINE_S, config, live, send, serving, until
+
+STANDS = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))
+UNKNOWN = np.full((3, 3), np.nan)
+
+
+def watched(arena: Arena, n: int = 30) -> list[Markers]:
+    """What a tracker that knows only the triangle, which is not there, tells of markers."""
+    known = Arena({"a": TRIANGLE}, {"a": line((0, 0, 0))}, arena.cameras)
+    return [fused.markers for fused in fuse(known, arena.frames(n))]
+
+
+def test_what_is_measured_is_what_stands_there():
+    """0.1 px is at most 0.6 mm a marker and instant here, and a median of 30 has 1.25 / sqrt(30) of that: distances are
+    within 5 sigma of it and the rounding, 1 mm. The frame is the one promised: origin, z and x."""
+    markers = find_standing(watched(Arena({"b": WIDE}, {"b": STANDS}, sigma_px=0.1)))
+    robot = robot_of(markers, WIDE.diameter_m)
+    R, p = STANDS(0.0)
+    true = p + WIDE.points @ R.T
+    order = [int(np.argmin(np.linalg.norm(true - q, axis=1))) for q in markers.position]
+    assert sorted(order) == [0, 1, 2]
+    assert np.abs(distances(robot.points) - distances(WIDE.points[order])).max() < 1e-3
+    assert np.abs(robot.points.mean(0)).max() < 1e-4, "rounded to a tenth of a millimetre"
+    assert robot.points[0, 0] > 0.1
+    assert np.abs(robot.points[0, 1:]).max() < 1e-3
+    require_distinct({"a": TRIANGLE, "b": robot})
+
+
+def test_a_robot_as_measured_is_tracked_where_it_stands():
+    """The position is the markers' middle and z is the prints' own, within 1 mm and what 1 mm turns 0.2 m by."""
+    arena = Arena({"b": WIDE}, {"b": STANDS}, sigma_px=0.1)
+    measured = {"b": robot_of(find_standing(watched(arena)), WIDE.diameter_m)}
+    pose = fuse(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
+    R, p = STANDS(0.0)
+    assert pose.state == "tracked"
+    assert np.linalg.norm(pose.position - (p + R @ WIDE.points.mean(0))) < 1e-3
+    assert R[:, 2] @ rotation_from_wxyz(pose.quaternion_wxyz)[:, 2] > np.cos(1e-3 / 0.2)
+
+
+def test_what_moves_or_comes_and_goes_does_not_stand():
+    """Of a robot that drives, one that is hidden for most of the time, and one that stands, the last is measured."""
+    robots = {"moves": SINGLE, "hides": SINGLE, "stands": SINGLE}
+    motions = {
+        "moves": line((0.5, 0.0, 0.2), (0.3, 0.0, 0.0)),
+        "hides": line((0.0, -0.6, 0.2)),
+        "stands": line((-0.5, 0.3, 0.2)),
+    }
+    arena = Arena(robots, motions, sigma_px=0.1, hidden=lambda name, marker, t: name == "hides" and t > 0.3)
+    markers = find_standing(watched(arena))
+    assert np.abs(markers.position - [[-0.5, 0.3, 0.2]]).max() < 2e-3
+    assert len(markers.within((-0.5, 0.3, 0.2), 0.1).position) == 1
+    assert len(markers.within((0.5, 0.3, 0.2), 0.1).position) == 0
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_z_is_up_where_no_print_tells(turn: float):
+    """Of markers in a plane that nothing tells the sides of, in either order about it."""
+    points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1 * turn, 0.1], [-0.1, -0.1 * turn, 0.1]])
+    robot = robot_of(Standing(points, UNKNOWN), 0.1)
+    centred = points - points.mean(0)
+    assert np.allclose(robot.points @ [1, 0, 0], centred[:, 0], atol=1e-4), "x along the first marker"
+    assert np.allclose(robot.points @ [0, 1, 0], centred[:, 1], atol=1e-4), (
+        "so y by a right hand, seen from above"
+    )
+
+
+def test_prints_tell_z_where_markers_are_no_plane():
+    points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
+    normal = np.array([0.1, 0.0, 1.0]) / np.linalg.norm([0.1, 0.0, 1.0])
+    robot = robot_of(Standing(points, np.tile(normal, (4, 1))), 0.1)
+    height = (points - points.mean(0)) @ normal
+    assert np.allclose(robot.points[:, 2], height, atol=1e-4)
+
+
+def test_what_makes_no_robot_is_said():
+    nothing = Standing(np.empty((0, 3)), np.empty((0, 3)))
+    with pytest.raises(FusionError, match="no marker of no robot stands there: hold the robot still"):
+        robot_of(nothing, 0.1)
+    with pytest.raises(FusionError, match=r"make no robot: .*one line"):
+        robot_of(Standing(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN), 0.1)
+    assert len(find_standing([]).position) == 0
+
+
+def command(endpoint: str, *words: str) -> list[str]:
+    return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
+
+
+@contextmanager
+def running(folder: Path) -> Iterator[tuple[str, Client]]:
+    """The endpoint of a server that follows one robot and sees another, which nobody declared; and a client."""
+    arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": STANDS}, sigma_px=0.05)
+    settings, over = config(folder), threading.Event()
+    with serving(settings) as (server, client):
+
+        def go_on() -> None:
+            while not over.wait(0.9):  # a second of frames each time
+                send(server, live(arena.messages(30)))
+
+        cameras = threading.Thread(target=go_on)
+        cameras.start()
+        try:
+            until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+            yield settings.listen[0], client
+        finally:
+            over.set()
+            cameras.join()
+
+
+def test_a_robot_in_a_running_arena_is_defined(tmp_path):
+    """By the command, while the other one drives on; what it prints is an entry for robots.yaml."""
+    with running(tmp_path) as (endpoint, client):
+        words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
+        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "the server looks for b, of 3 markers" in done.stdout
+        until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
+        robots = client.change_robots()
+        assert set(robots) == {"a", "b"}
+        path = tmp_path / "measured.yaml"
+        path.write_text("robots:\n" + done.stdout.partition("robots.yaml:\n")[2])
+        assert load_robots(path) == {"b": robots["b"]}
+        with pytest.raises(FusionError, match="no robot 'c'"):
+            client.change_robots(remove=["c"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("b/c", "--diameter", "0.12"), "can't name a robot"),
+        (("b", "--diameter", "0.12", "--seconds", "-1"), "above 0"),
+        (("b", "--diameter", "0.12"), "no server of arena 'test' answers"),
+    ],
+)
+def test_what_can_not_be_defined_is_said_in_one_line(words, said):
+    words = command(f"tcp/127.0.0.1:{free_port()}", *words)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
