@@ -94,6 +94,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     def __len__(self) -> int:
         return len(self.uv) // 16
 
+    @np.errstate(invalid="ignore")  # a signalling NaN becomes a quiet one
     def unpack(self) -> Roundels:
         """The columns as arrays."""
         cov = _column(self.cov, "<f4", 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -105,6 +106,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             *(np.frombuffer(c, "<i4").astype(np.int32) for c in (self.id, self.track)),
         )
 
+    @np.errstate(invalid="ignore")  # likewise
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive and small."""
         n, rest = divmod(len(self.uv), 16)
@@ -118,12 +120,9 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("no camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible time")
-        cov = _column(self.cov, "<f4", 3)
-        uu, uv, vv = np.where(np.isfinite(cov), cov, 0.0).T
-        if (
-            not (np.abs(_column(self.uv, "<f8", 2)) < 1e5).all()
-            or not ((uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)).all()
-        ):
+        uu, uv, vv = _column(self.cov, "<f4", 3).T  # what is no number is in no range
+        known = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
+        if not (known.all() and (np.abs(np.frombuffer(self.uv, "<f8")) < 1e5).all()):
             raise MessageError("a centre or a covariance that is no number or out of range")
 
 
@@ -208,5 +207,4 @@ def decode(data: bytes, kind: type[T]) -> T:
 
 
 def _column(data: bytes, dtype: str, width: int) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
-        return np.frombuffer(data, dtype).reshape(-1, width).astype(float)
+    return np.frombuffer(data, dtype).reshape(-1, width).astype(float)

@@ -4,8 +4,8 @@
     posterior of the last instant -- white-noise-on-acceleration motion -- observations of this instant
 
 All robots are one graph, of which each is a part of its own. What the last posterior and the motion say together is one
-HessianFactor a robot, what its observations say another; those, each at its own capture time, are linearised in one
-numpy batch over all robots and weighed one by one (Cauchy).
+HessianFactor a robot, what its observations say another; those, each at its own capture time, are linearised and
+weighed one by one (Cauchy) by `native/linearisation.cpp` and `native/normal_equations.cpp`.
 """
 
 from dataclasses import dataclass, replace
@@ -15,87 +15,29 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Optics, Poses, Views, measured_outlines, outlines, shears
+from fusion import _core
+from fusion.optics import Optics
 from fusion.sightings import Observations
-from fusion.state import OMEGA, States, forget_turn, predict
+from fusion.state import Motion, States, forget_turn, predict
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-CAUCHY = 4.0  # whitened distance at which an observation's weight is halved
-NOMINAL_WEIGHT = (
-    0.8983  # mean Cauchy weight of Gaussian noise in two dimensions: E[1 / (1 + chi2_2 / CAUCHY^2)]
-)
 ITERATIONS = 8  # at the most
-REWEIGHTINGS = 4  # by one linearisation at the most; two mostly
-SETTLED = 0.1  # change of a weight that ends them
 SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
-STEP = 1e-4  # rad, of the difference quotient of an outline's shape
 STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more than noise does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """N bodies at this instant before its observations: `F` moves an error of the last instant, `Q` is added.
+    """N bodies at this instant before its observations, and how errors moved since the last.
 
     `information` (N, 12, 12) is the inverse of the states' covariance: made here, before the last detection is there.
     """
 
-    before: Array  # (N, 12, 12) covariance at the last instant
     states: States
     information: Array
-    F: Array
-    Q: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """Whitened linear equations A delta = b, columns last: A (2, 12, N), b (2, N), and the body of each.
-
-    What can't be seen has A = b = 0.
-    """
-
-    body: Index
-    A: Array
-    b: Array
-
-    def joined(self, other: "_Rows") -> "_Rows":
-        """Both."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__slots__)
-        return _Rows(*(np.concatenate(pair, axis=-1) for pair in pairs))
-
-
-class _System:
-    """The equations of B bodies side by side (B, S, 2, 13): A and b, zeros where a body has fewer than S."""
-
-    def __init__(self, rows: _Rows, n_bodies: int) -> None:
-        count = np.bincount(rows.body, minlength=n_bodies)
-        order = np.argsort(rows.body, kind="stable")
-        place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
-        size = int(count.max())
-        self._at = np.empty(len(order), np.intp)
-        self._at[order] = rows.body[order] * size + place
-        table = np.zeros((n_bodies * size, 26))
-        table[self._at] = np.concatenate([rows.A, rows.b[:, None]], 1).reshape(26, -1).T
-        self._table = table.reshape(n_bodies, size, 2, 13)
-        self.shape = (n_bodies, size)
-
-    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        """(B, 12, 12) information and (B, 12) right sides, by weights (B, S)."""
-        flat = self._table.reshape(len(weights), -1, 13)
-        weighted = (self._table * weights[:, :, None, None]).reshape(flat.shape)
-        product = weighted.transpose(0, 2, 1) @ flat
-        return product[:, :12, :12], product[:, :12, 12]
-
-    def remainder(self, step: Array) -> Array:
-        """(B, S, 2) whitened: what steps (B, 12) leave of b."""
-        B, S = self.shape
-        by = np.concatenate([-step, np.ones((B, 1))], 1)[:, :, None]
-        return (self._table.reshape(B, 2 * S, 13) @ by).reshape(B, S, 2)
-
-    def remainder_of_rows(self, step: Array) -> Array:
-        """(2, N) the same, in the order of the rows."""
-        return self.remainder(step).reshape(-1, 2)[self._at].T
+    motion: Motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,12 +52,6 @@ class _Solution:
     information: Array
     weights: Array
     remainder: Array
-
-
-def _weights(remainder: Array) -> Array:
-    """(B, S) Cauchy weights, scaled so that Gaussian noise keeps its information."""
-    x, y = remainder[..., 0], remainder[..., 1]
-    return 1 / (NOMINAL_WEIGHT + (NOMINAL_WEIGHT / CAUCHY**2) * (x * x + y * y))
 
 
 class Estimator:
@@ -134,10 +70,10 @@ class Estimator:
 
     def predict(self, states: States, dt: Array) -> Prediction:
         """All robots, `dt` (N,) seconds later."""
-        moved, F, Q = predict(states, dt, self.densities, self.single)
+        moved, motion = predict(states, dt, self.densities, self.single)
         if self.single.any():
             moved.P[self.single] = forget_turn(moved.P[self.single])
-        return Prediction(states.P, moved, np.asarray(np.linalg.inv(moved.P), float), F, Q)
+        return Prediction(moved, _core.inverses(moved.P), motion)
 
     def update(
         self, prediction: Prediction, observations: Observations, small: float = SMALL
@@ -165,7 +101,7 @@ class Estimator:
                 break
             solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
         P = states.P.copy()
-        P[seen] = np.linalg.inv(solution.information)
+        P[seen] = _core.inverses(solution.information)
         if self.single.any():
             P[self.single] = forget_turn(P[self.single])
         return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)
@@ -182,21 +118,15 @@ class Estimator:
     ) -> "_Solution":
         """Linearise once about the states `at`, which are displaced by `delta` (N, 12), weigh and eliminate."""
         row = np.cumsum(np.bincount(seen, minlength=len(at))) - 1
+        body = row[np.concatenate([observations.discs.body, observations.discs.body[shaped]])]
         rows = self._linearise(at, observations, shaped)
-        system = _System(replace(rows, body=row[rows.body]), len(seen))
         displaced = (prior @ delta[seen, :, None])[:, :, 0]
-        weights = np.ones(system.shape) if weights is None else weights
-        for _ in range(REWEIGHTINGS):
-            H, right = system.normal_equations(weights)
-            step = np.asarray(np.linalg.solve(prior + H, (right - displaced)[:, :, None]), float)[:, :, 0]
-            before, weights = weights, _weights(system.remainder(step))
-            if np.max(np.abs(weights - before), initial=0) < SETTLED:
-                break
-        H, right = system.normal_equations(weights)
-        step = _eliminate(prior + H, right - displaced)
+        weights = np.ones(len(rows)) if weights is None else weights
+        information, right, weights = _core.reweigh(rows, body, prior, -displaced, weights)
+        step = _eliminate(information, right)
         delta = delta.copy()
         delta[seen] += step
-        return _Solution(delta, step, prior + H, weights, system.remainder_of_rows(step))
+        return _Solution(delta, step, information, weights, _core.remainder(rows, body, step))
 
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the robots."""
@@ -221,23 +151,18 @@ class Estimator:
         seen = replace(observations.seen, cov=observations.seen.cov + moved)
         return Observations.seeing(seen, observations.discs)
 
-    def _linearise(self, states: States, observations: Observations, shaped: Index) -> _Rows:
-        """Rows of the observations in their order, then rows of the outlines `shaped`."""
-        discs, seen = observations.discs, observations.seen
+    def _linearise(self, states: States, observations: Observations, shaped: Index) -> Array:
+        """(N + S, 2, 13) rows of the observations, then of the S outlines `shaped`; see `_core.Poses.linearise`."""
+        seen = observations.seen
         poses = self.optics.pose(states, seen.exposures)
-        views = self.optics.view(poses, discs)
-        A = self.optics.derive(poses, seen.exposures, discs, views, observations.whiten)
-        A[:, OMEGA, self.single[discs.body]] = 0  # one marker's turning rate would but fit its noise
-        x, y = seen.xy - views.xy
-        b = observations.whiten[:, 0] * x + observations.whiten[:, 1] * y
-        unseen = ~np.isfinite(b[0])
-        if unseen.any():
-            A[..., unseen] = b[:, unseen] = 0
-            shaped = shaped[~unseen[shaped]]
-        rows = _Rows(discs.body, A, b)
+        of_centre = seen.xy, observations.whiten, self.single
+        rows = poses.linearise(*observations.discs.columns, *of_centre)
         if not len(shaped):
             return rows
-        return rows.joined(_linearise_shapes(observations.select(shaped), poses, views.select(shaped)))
+        discs, seen = observations.discs.select(shaped), seen.select(shaped)
+        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+        of_outline = seen.axes_px, seen.angle_rad, seen.scale, sigma
+        return np.concatenate([rows, poses.linearise_outlines(*discs.columns, *of_outline)])
 
 
 def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
@@ -250,21 +175,6 @@ def misfit(observations: Observations, remainder: Array, slack_px: float) -> Arr
 def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
     """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
     return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
-
-
-def _linearise_shapes(observations: Observations, poses: Poses, views: Views) -> _Rows:
-    """How an outline is stretched tells the normal where few markers do; its size, prone to blur, is left out."""
-    seen, discs = observations.seen, observations.discs
-    R = poses.R_cam[..., poses.columns(discs)]
-    measured = measured_outlines(seen.axes_px, seen.angle_rad)
-    turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
-    at, about_x, about_y = (
-        shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
-    )
-    A = np.zeros((2, 12, len(discs)))
-    A[:, 0], A[:, 1] = (at - about_x) / STEP, (at - about_y) / STEP
-    sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-    return _Rows(discs.body, A / sigma, at / sigma)
 
 
 def _eliminate(information: Array, right: Array) -> Array:

@@ -5,9 +5,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.discs import fibonacci_sphere
+from fusion import _core
 from fusion.estimator import AXIS_SIGMA_PX
 from fusion.grouping import Marker
-from fusion.optics import Optics, measured_outlines, outlines, shears
+from fusion.optics import Optics
 from fusion.sightings import Sightings
 
 Array = NDArray[np.float64]
@@ -28,15 +29,17 @@ def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: fl
     n, v = len(normals), len(seen)
     R = optics.R_cam_world[seen.camera]
     centre = np.einsum("vij,vj->iv", R, -to)
-    expected = outlines(
-        np.tile(centre, n),
+    every = np.tile(np.arange(v), n)
+    shears = _core.shears(
+        seen.axes_px[:, every],
+        seen.angle_rad[every],
+        centre[:, every],
         np.einsum("vij,nj->inv", R, normals).reshape(3, -1),
         np.full(n * v, radius),
-        np.tile(seen.scale, n),
+        seen.scale[:, :, every],
     )
-    measured = np.tile(measured_outlines(seen.axes_px, seen.angle_rad), (n, 1, 1))
     sigma = 2 * AXIS_SIGMA_PX / seen.axes_px[1]
-    chi2 = ((shears(measured, expected).reshape(2, n, v) / sigma) ** 2).sum((0, 2))
+    chi2 = ((shears.reshape(2, n, v) / sigma) ** 2).sum((0, 2))
     best = int(np.argmin(chi2))
     elsewhere = chi2[normals @ normals[best] < ELSEWHERE]
     return normals[best] if not len(elsewhere) or elsewhere.min() > chi2[best] + CLEARLY else None

@@ -18,7 +18,7 @@ from fusion.normals import find_normal, rotation_to
 from fusion.optics import Optics
 from fusion.robots import Robot
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.signature import fits_size, identify
+from fusion.signature import Fit, fits_size, identify
 from fusion.state import POSITION, States
 
 Array = NDArray[np.float64]
@@ -60,6 +60,16 @@ class _Birth:
     matches: Matches
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """Births refined, row by row: where they are then, and of each observation the match and the squared misfit."""
+
+    states: States
+    observations: Observations
+    matches: Matches
+    misfit: Array
+
+
 class Search:
     """Looks for a tracker's missing robots."""
 
@@ -85,14 +95,19 @@ class Search:
         tracker = self.tracker
         turn = np.roll(missing, -self._turn)[:BODIES]
         self._turn = (self._turn + BODIES) % len(missing) if len(missing) > BODIES else 0
-        fits = identify({int(k): tracker.robots[k] for k in turn}, markers, self._faces, self._history)
-        births = [
-            _Birth(
-                fit.robot, fit.R, fit.t, self._claim(fit.robot, fit.numbers, [markers[p] for p in fit.points])
-            )
-            for fit in fits
-            if tracker.owned[fit.robot]
-        ]
+
+        def born(fit: Fit) -> _Birth:
+            claimed = self._claim(fit.robot, fit.numbers, [markers[p] for p in fit.points])
+            return _Birth(fit.robot, fit.R, fit.t, claimed)
+
+        def judge(fits: list[Fit]) -> Array:
+            births = [born(fit) for fit in fits]
+            trial = self._refine(births, sightings, BIRTH)
+            return np.bincount(trial.observations.discs.body, trial.misfit, len(births)).astype(float)
+
+        bodies = {int(k): tracker.robots[k] for k in turn}
+        fits = identify(bodies, markers, self._faces, self._history, judge)
+        births = [born(fit) for fit in fits if tracker.owned[fit.robot]]
         return self._with_singles(matches.joined(self._bear(births, sightings, BIRTH)), aside)
 
     def _find_singles(
@@ -173,26 +188,25 @@ class Search:
         """Start robots at these poses, refined by their observations; the matches of those that agree."""
         if not births:
             return Matches.none()
-        tracker = self.tracker
-        robots = np.array([birth.robot for birth in births])
+        trial = self._refine(births, sightings, sigmas)
+        body = trial.observations.discs.body
+        good = mean_of_bodies(trial.misfit, body, len(births)) < MAX_CHI2
+        self.tracker.adopt(np.array([birth.robot for birth in births])[good], trial.states.select(good))
+        return trial.matches.select(good[body])
+
+    def _refine(self, births: list[_Birth], sightings: Sightings, sigmas: tuple) -> "_Trial":
+        """Each birth by itself, its robot's body and speed by its observations."""
         at = States.at_rest(np.array([b.R for b in births]), np.array([b.p for b in births]), sigmas)
-        matches = births[0].matches
-        for birth in births[1:]:
-            matches = matches.joined(birth.matches)
-        observations = Observations.of(matches, sightings, tracker.catalogue)
-        row = np.zeros(len(tracker.robots), np.intp)
-        row[robots] = np.arange(len(robots))
-        observations = replace(
-            observations, discs=replace(observations.discs, body=row[observations.discs.body])
-        )
-        estimator = tracker.estimator.select(robots)
-        prediction = estimator.predict(at, np.full(len(robots), BIRTH_S))
+        parts = [birth.matches for birth in births]
+        matches = Matches(*(np.concatenate([getattr(m, k) for m in parts]) for k in Matches.__slots__))
+        observations = Observations.of(matches, sightings, self.tracker.catalogue)
+        body = np.repeat(np.arange(len(births)), [len(part) for part in parts])
+        observations = replace(observations, discs=replace(observations.discs, body=body))
+        estimator = self.tracker.estimator.select(np.array([birth.robot for birth in births]))
+        prediction = estimator.predict(at, np.full(len(births), BIRTH_S))
         found, remainder = estimator.update(prediction, observations, BIRTH_SMALL)
         d2 = misfit(observations, remainder, SLACK_PX)
-        good = mean_of_bodies(d2, observations.discs.body, len(robots)) < MAX_CHI2
-        kept = good[observations.discs.body]
-        tracker.adopt(robots[good], found.select(good))
-        return matches.remaining(remainder).select(kept)
+        return _Trial(found, observations, matches.remaining(remainder), d2)
 
     def _faces(self, marker: Marker, normal: Array) -> bool:
         """Whether a marker with this normal shows its print to the cameras that saw it."""

@@ -2,7 +2,7 @@
 """Which markers are a robot: constellations by their distances, and by facing the cameras that see them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand
 CLEARLY = 9.0  # by how much the runner-up's chi-square must be worse
+MAX_JUDGED = 40  # fits in one instant: what is more stays open until fewer robots are looked for
 MAX_WAYS = 20_000  # of placing one robot's first markers: more is a scene of nothing but look-alikes
 
 
@@ -26,7 +27,13 @@ class Fit:
     points: tuple[int, ...]
     R: Array
     t: Array
-    chi2: float
+    shape2: float  # chi-square of the distances
+    history2: float  # and of the robot's standing there
+
+    @property
+    def chi2(self) -> float:
+        """Of both."""
+        return self.shape2 + self.history2
 
     def rivals(self, other: "Fit") -> bool:
         """Whether both can't be true."""
@@ -38,6 +45,7 @@ def identify(
     markers: list[Marker],
     faces: Callable[[Marker, Array], bool],
     history: Callable[[int, Array], float],
+    judge: Callable[[list[Fit]], Array],
 ) -> list[Fit]:
     """The constellations among `markers`, each with more markers, or fitting clearly better, than any rival.
 
@@ -46,24 +54,54 @@ def identify(
         markers: what stands free.
         faces: whether a marker with this normal would show its print to the cameras that saw it.
         history: chi-square of a robot's standing there, by where it was last.
+        judge: chi-square of each fit's detections, the robot's speed estimated; asked where distances don't decide.
     """
     if len(markers) < 3:
         return []
     scene = _Scene.of(markers)
     fits = [fit for k, robot in robots.items() for fit in _fits(k, robot, scene, faces, history)]
+    fits = _judged(fits, judge)
     fits.sort(key=lambda fit: (-len(fit.points), fit.chi2))
-    rivals = [
-        [n for n, other in enumerate(fits) if n != k and fit.rivals(other)] for k, fit in enumerate(fits)
-    ]
+    rivals = _rivals(fits)
     accepted: set[int] = set()
     for k, fit in enumerate(fits):
-        alike = (n for n in rivals[k] if len(fits[n].points) == len(fit.points))
+        alike = _alike(fits, rivals, k)
         open_ = [n for n in rivals[k] if not accepted.intersection(rivals[n])]
         if accepted.intersection(rivals[k]) or any(fits[n].chi2 < fit.chi2 + CLEARLY for n in alike):
             continue
         if all(n > k for n in open_):
             accepted.add(k)
     return [fits[k] for k in sorted(accepted)]
+
+
+def _rivals(fits: list[Fit]) -> list[list[int]]:
+    """Of each, the others with which it can't be true."""
+    return [[n for n, other in enumerate(fits) if n != k and fit.rivals(other)] for k, fit in enumerate(fits)]
+
+
+def _alike(fits: list[Fit], rivals: list[list[int]], k: int) -> list[int]:
+    """Those of its rivals that explain as many markers."""
+    return [n for n in rivals[k] if len(fits[n].points) == len(fits[k].points)]
+
+
+def _judged(fits: list[Fit], judge: Callable[[list[Fit]], Array]) -> list[Fit]:
+    """The same; those that distances do not tell from a rival by what their detections say.
+
+    Free-running cameras see a moving marker at different places, and its distances to others are as uncertain. Where
+    a speed is estimated with the pose, detections tell shapes apart that differ by less.
+    """
+    rivals = _rivals(fits)
+    open_ = [
+        k
+        for k, fit in enumerate(fits)
+        if any(abs(fits[n].chi2 - fit.chi2) < CLEARLY for n in _alike(fits, rivals, k))
+    ]
+    if not 0 < len(open_) <= MAX_JUDGED:
+        return fits
+    judged = list(fits)
+    for k, shape2 in zip(open_, judge([fits[k] for k in open_]), strict=True):
+        judged[k] = replace(fits[k], shape2=float(shape2))
+    return judged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +143,7 @@ def _fits(
             error = robot.points[numbers] @ R.T + t - scene.X[points]
             cov = np.array([m.covariance for m in chosen]) + SLACK_M**2 * np.eye(3)
             chi2 = float(np.einsum("ni,ni->", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0]))
-            yield Fit(index, tuple(numbers), tuple(points), R, t, chi2 + history(index, t))
+            yield Fit(index, tuple(numbers), tuple(points), R, t, chi2, history(index, t))
 
 
 def _search(robot: Robot, scene: _Scene, usable: NDArray[np.intp]) -> list[dict[int, int]]:

@@ -81,8 +81,8 @@ def _smooth(states: States, prediction: Prediction, after: States, followed: NDA
     rows = np.flatnonzero(followed)
     if not len(rows):
         return states
-    P, F, expected = states.P[rows], prediction.F[rows], prediction.states.select(rows)
-    C = np.linalg.solve(expected.P, F @ P).transpose(0, 2, 1)
+    P, expected = states.P[rows], prediction.states.select(rows)
+    C = np.linalg.solve(expected.P, prediction.motion.select(rows).carry(P)).transpose(0, 2, 1)
     error = _difference(after.select(rows), expected)
     better = states.select(rows).moved(np.einsum("nij,nj->ni", C, error))
     P = P + C @ (after.P[rows] - expected.P) @ C.transpose(0, 2, 1)

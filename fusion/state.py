@@ -58,9 +58,26 @@ class States:
         )
 
 
-def predict(
-    states: States, dt: Array, densities: Array, single: NDArray[np.bool_]
-) -> tuple[States, Array, Array]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """How errors of N bodies move in `dt` (N,) seconds: F adds `turn` (N, 3, 3) of the rate's, dt of the speed's."""
+
+    turn: Array
+    dt: Array
+
+    def carry(self, errors: Array) -> Array:
+        """F @ errors (N, 12, M)."""
+        moved = errors.copy()
+        moved[:, THETA] += self.turn @ errors[:, OMEGA]
+        moved[:, POSITION] += self.dt[:, None, None] * errors[:, VELOCITY]
+        return moved
+
+    def select(self, rows: NDArray) -> "Motion":
+        """The rows that a mask or an index array names."""
+        return Motion(self.turn[rows], self.dt[rows])
+
+
+def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Motion]:
     """Where bodies are after `dt` (N,) seconds.
 
     Args:
@@ -70,18 +87,15 @@ def predict(
         single: (N,) bodies of one marker: their normal wanders, and no turning rate is claimed.
 
     Returns:
-        the predicted states; F (N, 12, 12), how an error moves; Q (N, 12, 12), the noise added.
+        the predicted states, P = F P F^T + Q; how an error moves.
     """
     half = exp_so3(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
     turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
-    F = np.tile(np.eye(12), (len(states), 1, 1))
-    F[:, THETA, OMEGA] = turn
-    F[:, POSITION, VELOCITY] = dt[:, None, None] * np.eye(3)
-    Q = _noise(dt, densities, R_half)
-    P = F @ states.P @ F.transpose(0, 2, 1) + Q
+    motion = Motion(turn, dt)
+    P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + _noise(dt, densities, R_half)
     moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
-    return moved, F, Q
+    return moved, motion
 
 
 def forget_turn(P: Array) -> Array:

@@ -275,8 +275,12 @@ class Tracker:
         self._others = {}
         dt = (self._t_ns - np.array([pose.t_ns for pose in poses]))[:, None] * 1e-9
         p, wxyz, v, omega = (np.array([getattr(pose, name) for pose in poses]) for name in TOLD)
-        R, P = rotation_from_wxyz(wxyz), np.array([pose.covariance_matrix for pose in poses])
-        there = States(exp_so3(omega * dt) @ R, p + v * dt, omega, v, P)
+        P = (
+            np.frombuffer(b"".join(pose.covariance for pose in poses), "<f4")
+            .reshape(-1, 12, 12)
+            .astype(float)
+        )
+        there = States(exp_so3(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, P)
         self.states = self.states.with_rows(rows, there)
         for k, pose in zip(rows, poses, strict=True):
             self.status[k] = pose.state

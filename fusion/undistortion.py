@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.lens import Lens
+from fusion import _core
 
 Array = NDArray[np.float64]
 CELL_PX, FINE_CELL_PX = 32, 16
@@ -45,14 +46,14 @@ def undistort(lens: Lens, uv: Array) -> tuple[Array, Array]:
         xy: (2, N), within `TOLERANCE_PX` of `Lens.normalise`; NaN where the lens has no inverse.
         scale: (2, 2, N) the derivative of raw pixels by xy.
     """
-    xy, by_pixel = table_of(lens).look_up(uv)
+    xy, scale = table_of(lens).look_up(uv)
     left = np.isnan(xy[0])
-    scale = _inverse(by_pixel)
     if left.any():
         xy[:, left], scale[..., left] = _exactly(lens, uv[left])
     return xy, scale
 
 
+@lru_cache(maxsize=256)
 def table_of(lens: Lens) -> "Table":
     """The lens's table, made once for all cameras and poses with these intrinsics: 30 to 150 ms."""
     return _table_of(Lens(**{name: getattr(lens, name) for name in Lens.__struct_fields__}))
@@ -64,9 +65,9 @@ def _table_of(lens: Lens) -> "Table":
 
 
 class Table:
-    """A lens's cells: `coefficients` (cells, 20) of x and y, a cell's side by side: memory that is far away costs most.
+    """A lens's cells, and a ring of empty ones around the image: `coefficients` (rows + 2, columns + 2, 20) of x and y.
 
-    They are NaN in empty cells and in a row of cells all around the image.
+    They are NaN in empty cells.
     """
 
     def __init__(self, lens: Lens) -> None:
@@ -75,23 +76,12 @@ class Table:
         if near < ENOUGH:
             self.cell_px = FINE_CELL_PX
             fitted, near = _fit(lens, self.cell_px)
-        self._outside = np.array([[fitted.shape[1]], [fitted.shape[0]]], float)  # column and row
-        around = ((1, 1), (1, 1), (0, 0), (0, 0))
-        self.coefficients = np.pad(fitted, around, constant_values=np.nan).reshape(-1, 2 * len(POWERS))
-        per_px = 2 / self.cell_px
-        self._slopes = np.concatenate([np.eye(len(POWERS)), BY_S * per_px, BY_T * per_px])
+        cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
+        self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
 
     def look_up(self, uv: Array) -> tuple[Array, Array]:
-        """(2, N) undistorted coordinates of pixels (N, 2), and their derivatives (2, 2, N); NaN in empty cells."""
-        place = (uv.T + 0.5) / self.cell_px
-        corner = np.floor(place)
-        column, row = np.minimum(np.maximum(corner, -1), self._outside) + 1
-        cell = row * (self._outside[0] + 2) + column
-        of_cells = self.coefficients.take(cell.astype(np.intp), 0)
-        coefficients = np.ascontiguousarray(of_cells.T).reshape(2, len(POWERS), -1)
-        basis = (self._slopes @ _monomials(2 * (place - corner) - 1)).reshape(3, len(POWERS), -1)
-        values = np.einsum("kcn,dcn->kdn", coefficients, basis)
-        return values[:, 0], values[:, 1:]
+        """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) pixels' derivatives by these; NaN if empty."""
+        return _core.look_up(self.coefficients, self.cell_px, np.ascontiguousarray(uv))
 
 
 def _monomials(st: Array) -> Array:
@@ -162,13 +152,3 @@ def _exactly(lens: Lens, uv: Array) -> tuple[Array, Array]:
     xy = lens.normalise(uv)
     scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
     return np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))
-
-
-def _inverse(M: Array) -> Array:
-    """(2, 2, N) of (2, 2, N)."""
-    inverse = np.empty_like(M)
-    inverse[0, 0], inverse[1, 1] = M[1, 1], M[0, 0]
-    np.negative(M[0, 1], out=inverse[0, 1])
-    np.negative(M[1, 0], out=inverse[1, 0])
-    inverse /= M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
-    return inverse

@@ -73,16 +73,14 @@ class Watch:
         """Whether what remains of an instant's detections (N,), px^2, is far more than usual."""
         if len(squared_px) < MIN_EXPECTED:
             return False
-        median = float(np.sqrt(np.nanmedian(squared_px)))
+        median = _median_px(squared_px)
         return self._learnt >= LEARN and median > max(STRANGE_PX, STRANGE * self._usual_px)
 
     def learn(self, squared_px: Array) -> None:
         """Take what remains of an instant's detections as usual."""
         if len(squared_px) >= MIN_EXPECTED:
             self._learnt += 1
-            self._usual_px += (float(np.sqrt(np.nanmedian(squared_px))) - self._usual_px) / min(
-                self._learnt, LEARN
-            )
+            self._usual_px += (_median_px(squared_px) - self._usual_px) / min(self._learnt, LEARN)
 
     def suspects(self, names: tuple[str, ...]) -> list[str]:
         """The cameras, the last suspect first."""
@@ -147,6 +145,12 @@ class Watch:
         """Take a camera back, and forget what was seen of it."""
         self.bumped.discard(name)
         self._cameras.pop(name, None)
+
+
+def _median_px(squared_px: Array) -> float:
+    """Of what remains of the detections that can be seen."""
+    known = squared_px[np.isfinite(squared_px)]
+    return float(np.sqrt(np.median(known))) if len(known) else np.nan
 
 
 def _share(watched: _Watched) -> float | None:

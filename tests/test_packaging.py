@@ -12,9 +12,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = """
 import pathlib, sys
-import camera_node._core, camera_node.node, calib.rig, fusion.client
+import camera_node._core, camera_node.node, calib.rig, fusion._core, fusion.client
 here = pathlib.Path(sys.argv[1])
-for module in (camera_node, camera_node._core, calib, fusion):
+for module in (camera_node, camera_node._core, calib, fusion, fusion._core):
     assert here in pathlib.Path(module.__file__).parents, module.__file__
 from web.demo import default_scene
 assert here in default_scene().parents, default_scene()
@@ -40,7 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
-    """Installed without the checkout, the native core and the demo's configs are its own.
+    """Installed without the checkout, the native cores and the demo's configs are its own.
 
     `-S` keeps the editable install's import hook out; the dependencies come by PYTHONPATH, after the wheel.
     """
@@ -53,7 +53,7 @@ def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
 
 
 def test_a_wheel_holds_what_runs_and_nothing_else(wheel: Path):
-    """The four programs, the native module with its stub, the configs of the demo; no C++ sources and no tests."""
+    """The four programs, the native modules with their stubs, the configs of the demo; no C++ sources and no tests."""
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
         "camera_node",
@@ -62,5 +62,5 @@ def test_a_wheel_holds_what_runs_and_nothing_else(wheel: Path):
         "web",
     }
     assert not [name for name in names if name.endswith((".cpp", ".hpp"))]
-    assert "camera_node/_core.pyi" in names
+    assert {"camera_node/_core.pyi", "fusion/_core.pyi"} <= set(names)
     assert "web/configs/wand.yaml" in names

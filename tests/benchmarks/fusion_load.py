@@ -13,10 +13,11 @@ from camera_node.pose import Pose, look_at
 from camera_node.roundels import Roundels
 from fusion.errors import FusionError
 from fusion.instants import Frame
-from fusion.optics import Exposures, Optics, outlines
+from fusion.optics import Exposures, Optics
 from fusion.robots import Robot, require_distinct
 from fusion.sightings import Catalogue
 from fusion.state import States, exp_so3
+from tests.fusion.equations import outlines
 
 START_NS = 1_000_000_000_000
 LENS = {"width": 1280, "height": 800, "fx": 840.0, "fy": 841.0, "cx": 642.0, "cy": 397.0}

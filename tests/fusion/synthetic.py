@@ -11,9 +11,10 @@ from camera_node.messages import Detections
 from camera_node.pose import Pose, look_at, rotation_from_vector
 from camera_node.roundels import Roundels
 from fusion.instants import Frame
-from fusion.optics import Optics, outlines
+from fusion.optics import Optics
 from fusion.robots import Robot
 from fusion.sightings import Catalogue
+from tests.fusion.equations import outlines
 
 PERIOD_NS = 33_333_333
 START_NS = 1_000_000_000_000

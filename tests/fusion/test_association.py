@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from camera_node.roundels import Roundels
-from fusion.association import Association, _Expected
+from fusion._core import ExpectedMarkers
+from fusion.association import Association
 from fusion.instants import Frame, Instant
 from fusion.optics import Optics
 from fusion.robots import Robot
@@ -29,7 +30,8 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
     v, still = random.normal(size=(1, 3)), np.zeros((1, 3))
     states = States(R, random.normal(size=(1, 3)), still, v, root @ root.transpose(0, 2, 1))
     catalogue = Catalogue.of([WIDE])
-    found = _Expected.of(states, catalogue, np.array([True])).covariance(np.array([tau]))
+    expected = ExpectedMarkers(states.R, states.P, catalogue.robot, catalogue.marker, catalogue.radius)
+    found = expected.covariances(tau)
     steps = 1e-4 * np.eye(12)[:, None]
     for k, marker in enumerate(catalogue.marker.T):
         J = np.column_stack(
@@ -38,7 +40,7 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
                 for step in steps
             ]
         )
-        np.testing.assert_allclose(found[:, :, k], J @ states.P[0] @ J.T, atol=1e-7)
+        np.testing.assert_allclose(found[k], J @ states.P[0] @ J.T, atol=1e-7)
 
 
 @pytest.mark.parametrize("measured", [0, 1])

@@ -17,7 +17,8 @@ import pytest
 from calib.camera import Camera
 from camera_node.pose import rotation_from_vector
 from camera_node.roundels import Roundels
-from fusion.estimator import CAUCHY, NOMINAL_WEIGHT, Estimator, Prediction
+from fusion._core import CAUCHY, NOMINAL_WEIGHT
+from fusion.estimator import Estimator, Prediction
 from fusion.instants import Frame, Instant
 from fusion.optics import Discs, Optics
 from fusion.sightings import Observations, Sightings

@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include <nanobind/stl/tuple.h>
+
+#include "arrays.hpp"
+#include "candidates.hpp"
+#include "inverse_lens.hpp"
+
+namespace roundel::fusion {
+namespace {
+
+using Markers = std::vector<ExpectedMarker>;
+
+/// R and P are those of the bodies, `body` that of each marker.
+void make_expected(Markers* self, const In<double, -1, 3, 3>& R, const In<double, -1, 12, 12>& P,
+                   const Index& body, const Vectors& marker, const Numbers& radius) {
+    const size_t n = body.size();
+    require_equal(R.shape(0), {P.shape(0)});
+    require_equal(n, {radius.size()});
+    below(R.shape(0), body);
+    const auto places = columns<3>(marker, n);
+    Markers markers;
+    for (size_t k = 0; k < n; ++k)
+        markers.push_back(ExpectedMarker::of(body(k), places.vector(k), radius(k),
+                                             matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
+    new (self) Markers(std::move(markers));
+}
+
+Out covariances(const Markers& markers, double tau) {
+    auto [all, to] = make({markers.size(), 3, 3});
+    for (const ExpectedMarker& marker : markers) {
+        const Matrix C = marker.covariance(tau);
+        for (const Vector& row : {C.r0, C.r1, C.r2}) *to++ = row.x, *to++ = row.y, *to++ = row.z;
+    }
+    return all;
+}
+
+auto candidates(const Markers& markers, const Poses& poses, const Index& frame, const Pairs& xy,
+                const Matrices2& scale, const Matrices2& cov, const Numbers& major, const Numbers& focal) {
+    const size_t n = frame.size();
+    below(poses.exposures().size(), frame);
+    require_equal(n, {major.size()});
+    require_equal(poses.exposures().size(), {focal.size()});
+    for (const ExpectedMarker& marker : markers) require_below(poses.n_bodies(), marker.body);
+    const Detections seen{frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n),
+                          major.data()};
+    std::vector<Candidate> found;
+    unlocked([&] { found = find_candidates(poses, markers, seen, focal.data()); });
+    auto [pairs, rows] = make<int64_t>({2, found.size()});
+    auto [costs, to] = make({found.size()});
+    for (const Candidate& pair : found) {
+        rows[found.size()] = pair.detection, *rows++ = pair.marker;
+        *to++ = pair.cost;
+    }
+    return std::make_tuple(pairs, costs);
+}
+
+auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv) {
+    if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
+    const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
+    const size_t n = uv.shape(0);
+    auto [xy, to_xy] = make({2, n});
+    auto [scale, to_scale] = make({2, 2, n});
+    unlocked([&, a = to_xy, b = to_scale] { look_up(lens, uv.data(), n, a, b); });
+    return std::make_tuple(xy, scale);
+}
+
+}  // namespace
+
+void bind_detections(nb::module_& m) {
+    nb::class_<Markers>(m, "ExpectedMarkers")
+        .def("__init__", &make_expected)
+        .def("covariances", &covariances)
+        .def("candidates", &candidates);
+    m.def("look_up", &look_up_pixels);
+}
+
+}  // namespace roundel::fusion

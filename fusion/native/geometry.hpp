@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <cmath>
+
+namespace roundel::fusion {
+
+struct Vector {
+    double x, y, z;
+};
+
+inline Vector operator+(const Vector& a, const Vector& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vector operator-(const Vector& a, const Vector& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vector operator*(double s, const Vector& a) { return {s * a.x, s * a.y, s * a.z}; }
+inline double dot(const Vector& a, const Vector& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+/// By its rows.
+struct Matrix {
+    Vector r0, r1, r2;
+
+    Vector column0() const { return {r0.x, r1.x, r2.x}; }
+    Vector column1() const { return {r0.y, r1.y, r2.y}; }
+    Vector column2() const { return {r0.z, r1.z, r2.z}; }
+};
+
+inline Vector operator*(const Matrix& A, const Vector& b) {
+    return {dot(A.r0, b), dot(A.r1, b), dot(A.r2, b)};
+}
+/// a^T B.
+inline Vector operator*(const Vector& a, const Matrix& B) { return a.x * B.r0 + a.y * B.r1 + a.z * B.r2; }
+inline Matrix operator*(const Matrix& A, const Matrix& B) { return {A.r0 * B, A.r1 * B, A.r2 * B}; }
+inline Matrix operator+(const Matrix& A, const Matrix& B) { return {A.r0 + B.r0, A.r1 + B.r1, A.r2 + B.r2}; }
+inline Matrix operator*(double s, const Matrix& A) { return {s * A.r0, s * A.r1, s * A.r2}; }
+
+/// The rotation by a vector, by Rodrigues' formula: cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T, a =
+/// |w|.
+inline Matrix turn(const Vector& w) {
+    const double a = std::fmax(std::sqrt(dot(w, w)), 1e-12), c = std::cos(a), half = std::sin(a / 2) / a;
+    const Vector s = (std::sin(a) / a) * w, k = (2 * half * half) * w;
+    return {{k.x * w.x + c, k.x * w.y - s.z, k.x * w.z + s.y},
+            {k.y * w.x + s.z, k.y * w.y + c, k.y * w.z - s.x},
+            {k.z * w.x - s.y, k.z * w.y + s.x, k.z * w.z + c}};
+}
+
+}  // namespace roundel::fusion

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The observation model a second time, in NumPy, a few columns of linear algebra at a time: the core's oracle.
+
+Arrays hold one row's N columns last, (3, N) for N vectors. See `fusion/native/disc_view.hpp` for the equations' source.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.optics import Discs, Exposures, Optics, Views
+from fusion.sightings import Observations, Sightings
+from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States, turns
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+NEAR_M = 1e-3
+CAUCHY, NOMINAL_WEIGHT, SETTLED = 4.0, 0.8983, 0.1
+STEP = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Every body in every frame, column f * n_bodies + b: rotation and translation to the camera, and to the world.
+
+    `R_cam` and `R_world` (3, 3, K), `t_cam` (3, K).
+    """
+
+    n_bodies: int
+    R_cam: Array
+    t_cam: Array
+    R_world: Array
+
+    def columns(self, discs: Discs) -> Index:
+        """(N,) which column is a disc's."""
+        return discs.frame * self.n_bodies + discs.body
+
+
+def pose(optics: Optics, states: States, exposures: Exposures) -> Poses:
+    """Bodies at each frame's own time."""
+    tau, R_cw, B = exposures.tau[:, None], optics.R_cam_world[exposures.camera], len(states)
+    R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
+    turn = turns(omega[:, None] * tau)  # (3, 3, F, B)
+    R_world = (
+        turn[:, 0, None] * R[0, :, None] + turn[:, 1, None] * R[1, :, None] + turn[:, 2, None] * R[2, :, None]
+    )
+    to = states.p.T[:, None] + v[:, None] * tau - optics.centres[exposures.camera].T[:, :, None]
+    # The cameras' rotations by one product each: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
+    R_cam = R_cw @ R_world.transpose(2, 0, 1, 3).reshape(-1, 3, 3 * B)
+    t_cam = R_cw @ to.transpose(1, 0, 2)
+    return Poses(
+        B,
+        R_cam.reshape(-1, 3, 3, B).transpose(1, 2, 0, 3).reshape(3, 3, -1),
+        t_cam.transpose(1, 0, 2).reshape(3, -1),
+        R_world.reshape(3, 3, -1),
+    )
+
+
+def view(poses: Poses, discs: Discs) -> Views:
+    """See `Views`."""
+    at = poses.columns(discs)
+    R = _take(poses.R_cam, at)
+    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.marker), R[:, 2]
+    q = n * (n[2] * discs.radius**2 / c[2])
+    q[2] -= discs.radius**2 / c[2]
+    q += c
+    z = np.where(c[2] > NEAR_M, q[2], np.nan)
+    return Views(c, n, q, q[:2] / z)
+
+
+def derive(
+    optics: Optics, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
+) -> Array:
+    """(2, 12, N) of the outline's centre, times `whiten` (2, 2, N), by the error of the disc's body.
+
+    What moves by velocity in tau seconds moves tau times as by pose.
+    """
+    at, tau = poses.columns(discs), exposures.tau[discs.frame]
+    by_centre, by_normal = _by_disc(views, discs.radius, whiten)
+    R = _take(poses.R_cam, at)
+    h, k = np.einsum("ain,ijn->ajn", by_centre, R), np.einsum("ain,ijn->ajn", by_normal, R)
+    J = np.empty((2, 12, len(at)))
+    x, y, z = discs.marker
+    J[:, 0] = y * h[:, 2] - z * h[:, 1]  # h (w x m) = (m x h) w
+    J[:, 1] = z * h[:, 0] - x * h[:, 2]
+    J[:, 2] = x * h[:, 1] - y * h[:, 0]
+    J[:, 0] -= k[:, 1]
+    J[:, 1] += k[:, 0]
+    R_cw = _take(_rotations(optics.R_cam_world), exposures.camera[discs.frame])
+    J[:, POSITION] = np.einsum("ain,ijn->ajn", by_centre, R_cw)
+    J[:, OMEGA] = tau * np.einsum("ain,jin->ajn", J[:, THETA], _take(poses.R_world, at))
+    J[:, VELOCITY] = tau * J[:, POSITION]
+    return J
+
+
+def _by_disc(views: Views, radius: Array, whiten: Array) -> tuple[Array, Array]:
+    """Derivatives (2, 3, N) of the whitened outline's centre by the disc's centre and by its normal, camera frame.
+
+    dq/dc = I - s/c_z e_z^T, dq/dn = r^2/c_z (n e_z^T + n_z I) with s = r^2/c_z (n_z n - e_z) = q - c.
+    """
+    g = np.empty((2, 3, len(radius)))
+    g[:, :2] = whiten / views.q[2]
+    g[:, 2] = -(g[:, 0] * views.xy[0] + g[:, 1] * views.xy[1])
+    size = radius**2 / views.centre[2]
+    by_normal = (size * views.normal[2]) * g
+    by_normal[:, 2] += size * np.einsum("ain,in->an", g, views.normal)
+    by_centre = g.copy()
+    by_centre[:, 2] -= np.einsum("ain,in->an", g, views.q - views.centre) / views.centre[2]
+    return by_centre, by_normal
+
+
+def outlines(centre: Array, normal: Array, radius: Array, scale: Array) -> Array:
+    """(N, 2, 2) shape matrices of discs' outlines in raw pixels; a circle of radius a has a^2 I.
+
+    `centre` and `normal` (3, N) are in the camera's frame; `scale` (2, 2, N) is the derivative of raw pixels by xy at
+    the disc: the lens is taken as affine over it.
+    """
+    dual = centre[:, None] * centre - radius**2 * (np.eye(3)[:, :, None] - normal[:, None] * normal)
+    dual = dual / dual[2, 2]
+    shape = dual[:2, None, 2] * dual[None, :2, 2] - dual[:2, :2]
+    return np.einsum("ian,abn,jbn->nij", scale, shape, scale)
+
+
+def measured_outlines(axes_px: Array, angle_rad: Array) -> Array:
+    """(N, 2, 2) shape matrices of ellipses with full axes (2, N) and the major one's direction (N,)."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    U = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    return U @ (U.transpose(0, 2, 1) * (axes_px.T[:, :, None] / 2) ** 2)
+
+
+def shears(measured: Array, expected: Array) -> Array:
+    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
+
+    The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
+    """
+    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
+    l10 = expected[:, 1, 0] / l00
+    l11 = np.sqrt(expected[:, 1, 1] - l10**2)
+    a = measured[:, 0, 0] / l00**2
+    b = (measured[:, 0, 1] / l00 - l10 * a) / l11
+    c = (measured[:, 1, 1] - l10 * (2 * measured[:, 0, 1] / l00 - l10 * a)) / l11**2
+    return np.stack([a - c, 2 * b]) / (np.sqrt(0.5) * (a + c))
+
+
+def _rotations(R: Array) -> Array:
+    """(..., 3, 3) -> (3, 3, K)."""
+    return R.reshape(-1, 3, 3).transpose(1, 2, 0)
+
+
+def _take(A: Array, columns: Index) -> Array:
+    return np.take(A, columns, axis=-1)
+
+
+def shape_rows(poses: Poses, discs: Discs, views: Views, observations: Observations, sigma: Array) -> Array:
+    """(N, 2, 13) equations of outlines, by difference quotients of their shears."""
+    seen = observations.seen
+    R = poses.R_cam[..., poses.columns(discs)]
+    measured = measured_outlines(seen.axes_px, seen.angle_rad)
+    turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
+    at, about_x, about_y = (
+        shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
+    )
+    rows = np.zeros((2, 13, len(discs)))
+    rows[:, 0], rows[:, 1], rows[:, 12] = (at - about_x) / STEP, (at - about_y) / STEP, at
+    return (rows / sigma).transpose(2, 0, 1)
+
+
+def reweigh(
+    rows: Array, body: Index, information: Array, right: Array, weights: Array
+) -> tuple[Array, Array, Array]:
+    """Sums of priors and rows by Cauchy's weights, these renewed until they settle, four times at the most."""
+    A, b = rows[:, :, :12], rows[:, :, 12]
+
+    def sums() -> tuple[Array, Array]:
+        H, g = information.copy(), right.copy()
+        np.add.at(H, body, np.einsum("n,nai,naj->nij", weights, A, A))
+        np.add.at(g, body, np.einsum("n,nai,na->ni", weights, A, b))
+        return H, g
+
+    for _ in range(4):
+        H, g = sums()
+        rest = b - np.einsum("nai,ni->na", A, np.linalg.solve(H, g[:, :, None])[body, :, 0])
+        before, weights = weights, 1 / (NOMINAL_WEIGHT * (1 + np.sum(rest**2, 1) / CAUCHY**2))
+        if np.abs(weights - before).max() < SETTLED:
+            break
+    return *sums(), weights
+
+
+def candidates(
+    optics: Optics, states: States, seen: Sightings, discs: Discs, covariance: Array
+) -> dict[tuple[int, int], float]:
+    """Costs by disc and sighting of one frame, within the gates; `covariance` (N, 3, 3) of the discs' places."""
+    views = view(pose(optics, states, seen.exposures), discs)
+    found = {}
+    for i in np.flatnonzero((views.facing > 0.1) & np.isfinite(views.xy[0])):
+        camera = seen.exposures.camera[discs.frame[i]]
+        R, z = optics.R_cam_world[camera], views.centre[2, i]
+        J = (R[:2] - views.xy[:, i, None] * R[2]) / z
+        depth = 0.05**2 + R[2] @ covariance[i] @ R[2] / z**2
+        for j in np.flatnonzero(seen.frame == discs.frame[i]):
+            scale = seen.scale[:, :, j]
+            per_scale = np.linalg.inv(scale)
+            noise = per_scale @ (seen.cov[:, :, j] + 0.7**2 * np.eye(2)) @ per_scale.T
+            C = J @ covariance[i] @ J.T + noise
+            off = seen.xy[:, j] - views.xy[:, i]
+            d2 = off @ np.linalg.solve(C, off)
+            shape = outlines(views.centre[:, [i]], views.normal[:, [i]], discs.radius[[i]], scale[..., None])
+            size = np.log(seen.axes_px[0, j] / 2 / np.sqrt(np.linalg.eigvalsh(shape[0])[1]))
+            if d2 < 13.8 and abs(size) <= np.log(1.35):
+                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * optics.focal[camera] ** 4 * depth)
+                found[int(i), int(j)] = cost
+    return found

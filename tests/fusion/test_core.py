@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The native core against the same equations in NumPy (`tests/fusion/equations.py`).
+
+Both round differently, no more: in the order of 1e-15 of the largest term; 1e-9 leaves room for cancellation.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from camera_node.roundels import Roundels
+from fusion import _core
+from fusion.instants import Frame, Instant
+from fusion.optics import Discs, Optics
+from fusion.sightings import Observations, Sightings
+from fusion.state import States, exp_so3
+from tests.fusion import equations
+from tests.fusion.synthetic import ring
+
+CAMERAS = ring()
+OPTICS = Optics(CAMERAS)
+BODIES, EACH = 7, 60
+assert_near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+
+
+def scene(seed: int = 2) -> tuple[States, Observations]:
+    """Turning bodies about the middle, and detections that have nothing to do with them; one can't be seen at all."""
+    random = np.random.default_rng(seed)
+    n = len(CAMERAS) * EACH
+    states = States(
+        exp_so3(random.normal(size=(BODIES, 3))),
+        random.uniform(-0.8, 0.8, (BODIES, 3)),
+        random.normal(size=(BODIES, 3)),
+        random.normal(size=(BODIES, 3)),
+        np.tile(np.eye(12), (BODIES, 1, 1)),
+    )
+    states.p[0] = 2 * OPTICS.centres[0]  # behind a camera
+    frames = [frame(name, random) for name in CAMERAS]
+    discs = Discs(
+        frame=np.repeat(np.arange(len(frames)), EACH),
+        body=random.integers(0, BODIES, n),
+        row=np.arange(n),
+        marker=random.uniform(-0.2, 0.2, (3, n)),
+        radius=random.uniform(0.02, 0.1, n),
+    )
+    return states, Observations.seeing(Sightings.of(Instant(0, tuple(frames)), OPTICS, 0.1), discs)
+
+
+def frame(name: str, random: np.random.Generator) -> Frame:
+    """A camera's, up to 20 ms beside the instant."""
+    root = random.normal(size=(EACH, 2, 2))
+    axes = np.sort(random.uniform(10, 30, (EACH, 2)))[:, ::-1]
+    none, level = np.full(EACH, -1, np.int32), np.ones(EACH)
+    uv, angle = random.uniform(100, 500, (EACH, 2)), random.uniform(-1.5, 1.5, EACH)
+    roundels = Roundels(uv, root @ root.transpose(0, 2, 1), axes, angle, level, level, none, none)
+    return Frame.measure(name, int(random.integers(-20_000_000, 20_000_000)), roundels, CAMERAS[name])
+
+
+def test_views_are_the_observation_models():
+    states, seen = scene()
+    exposures = seen.seen.exposures
+    found = OPTICS.view(OPTICS.pose(states, exposures), seen.discs)
+    expected = equations.view(equations.pose(OPTICS, states, exposures), seen.discs)
+    assert np.isnan(expected.xy).any()
+    for name in ("centre", "normal", "q", "xy", "facing"):
+        assert_near(getattr(found, name), getattr(expected, name))
+
+
+def test_equations_of_centres_are_the_derivatives():
+    states, seen = scene()
+    exposures, discs = seen.seen.exposures, seen.discs
+    single = np.arange(BODIES) == 1
+    of_centre = seen.seen.xy, seen.whiten, single
+    found = OPTICS.pose(states, exposures).linearise(*discs.columns, *of_centre)
+    poses = equations.pose(OPTICS, states, exposures)
+    views = equations.view(poses, discs)
+    A = equations.derive(OPTICS, poses, exposures, discs, views, seen.whiten)
+    A[:, 6:9, single[discs.body]] = 0
+    b = np.einsum("ain,in->an", seen.whiten, seen.seen.xy - views.xy)
+    rows = np.concatenate([A, b[:, None]], 1).transpose(2, 0, 1)
+    rows[np.isnan(b[0])] = 0
+    assert_near(found, rows, atol=1e-9 * np.abs(rows).max())
+
+
+def test_equations_of_outlines_are_the_shears_quotients():
+    """An outline's shape is what two numbers leave that are (range / radius)^2, up to 4e4, times larger; by the step of
+    1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives in the order of 30."""
+    states, seen = scene()
+    exposures, discs = seen.seen.exposures, seen.discs
+    sigma = np.linspace(0.1, 0.2, len(discs))
+    of_outline = seen.seen.axes_px, seen.seen.angle_rad, seen.seen.scale, sigma
+    found = OPTICS.pose(states, exposures).linearise_outlines(*discs.columns, *of_outline)
+    poses = equations.pose(OPTICS, states, exposures)
+    views = equations.view(poses, discs)
+    rows = equations.shape_rows(poses, discs, views, seen, sigma)
+    rows[np.isnan(views.xy[0])] = 0
+    assert_near(found, rows, atol=1e-6)
+
+
+def test_sums_and_weights_are_those_of_reweighted_least_squares():
+    random = np.random.default_rng(8)
+    rows, body = random.normal(size=(200, 2, 13)), random.integers(0, 5, 200)
+    rows[:9, :, 12] += 20  # outliers
+    prior, right = np.tile(3 * np.eye(12), (5, 1, 1)), random.normal(size=(5, 12))
+    found = _core.reweigh(rows, body, prior, right, np.ones(200))
+    for got, expected in zip(found, equations.reweigh(rows, body, prior, right, np.ones(200)), strict=True):
+        assert_near(got, expected)
+    steps = random.normal(size=(5, 12))
+    rest = rows[:, :, 12] - np.einsum("nai,ni->na", rows[:, :, :12], steps[body])
+    assert_near(_core.remainder(rows, body, steps), rest.T)
+
+
+def test_a_covariance_is_the_inverse_of_its_information():
+    root = np.random.default_rng(9).normal(size=(3, 12, 20))
+    information = root @ root.transpose(0, 2, 1)
+    assert_near(_core.inverses(information), np.linalg.inv(information))
+    information[1] -= 50 * np.eye(12)
+    with pytest.raises(RuntimeError, match="not positive definite"):
+        _core.inverses(information)
+
+
+def test_candidates_are_the_pairs_within_the_gates():
+    """Of discs a few pixels beside detections: some pairs are near enough, of some the size does not fit."""
+    states, seen = scene()
+    exposures, discs = seen.seen.exposures, seen.discs
+    random = np.random.default_rng(3)
+    states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)
+    rows = random.choice(len(discs), 100, replace=False)
+    expected = _core.ExpectedMarkers(
+        states.R, states.P, discs.body[rows], discs.marker[:, rows].copy(), discs.radius[rows]
+    )
+    poses = OPTICS.pose(states, exposures)
+    of_frame = seen.seen.axes_px[0], OPTICS.focal[exposures.camera]
+    (marker, sighting), cost = expected.candidates(
+        poses, seen.seen.frame, seen.seen.xy, seen.seen.scale, seen.seen.cov, *of_frame
+    )
+    found = {}
+    for f, tau in enumerate(exposures.tau):
+        there = discs.select(rows)
+        there = replace(there, frame=np.full(len(rows), f))
+        found |= {
+            (f, *pair): value
+            for pair, value in equations.candidates(
+                OPTICS, states, seen.seen, there, expected.covariances(tau)
+            ).items()
+        }
+    got = dict(
+        zip(
+            zip(seen.seen.frame[sighting].tolist(), marker.tolist(), sighting.tolist(), strict=True),
+            cost,
+            strict=True,
+        )
+    )
+    assert got.keys() == found.keys()
+    assert len(got) > 20
+    assert_near([got[key] for key in found], list(found.values()))
+
+
+def test_indices_and_lengths_are_checked():
+    """An array that does not fit is refused rather than read beyond its end."""
+    states, seen = scene()
+    poses = OPTICS.pose(states, seen.seen.exposures)
+    frame, body, marker, radius = seen.discs.columns
+    for wrong in (body + BODIES, body - BODIES):
+        with pytest.raises(IndexError):
+            poses.view(frame, wrong, marker, radius)
+    with pytest.raises(ValueError, match="lengths"):
+        poses.view(frame, body, marker[:, 1:].copy(), radius)
+    with pytest.raises(IndexError):
+        _core.remainder(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
