@@ -15,6 +15,9 @@ namespace {
 constexpr int kSlack = 24;   // by which a run may be off its proportion: a pixel's edge and blur
 constexpr int kUneven = 26;  // of one dark run to the other, in a chord that nothing covers
 constexpr int kDrift = 3;    // pixels that the middle may move from one line to the next
+constexpr int kStreakLines = 3, kStreakWidth = 14;  // the least; pixels
+constexpr float kStreakLong = 0.5f;  // of its width, and less where bars pass each other aslant:
+constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
 /// The places of the bits of a word. Eight are written without asking how many there are.
 inline int* append_bits(uint64_t bits, int base, int* to) {
@@ -96,7 +99,7 @@ void ChordSearch::find_chords(const BitImage& along, int line) {
     for (int k = 0; k < found; ++k) {
         const int* edge = &edges_[2 * size_t(numbers_[size_t(k)])];
         const int b = edge[1], c = edge[2];
-        chords_.push_back({(b + c - 1) / 2, c - b, line, line});
+        chords_.push_back({(b + c - 1) / 2, c - b, line, line, (b + c - 1) / 2, edge[3] - edge[0]});
     }
 }
 
@@ -109,7 +112,9 @@ void ChordSearch::link(int line) {
         const bool same = chord != chords_.end() && chord->middle <= stack.middle + kDrift &&
                           std::abs(chord->inner - stack.inner) <= 2 + stack.inner / 4;
         if (same)
-            next_.push_back({chord->middle, chord->inner, stack.first, line}), ++chord;
+            next_.push_back({chord->middle, chord->inner, stack.first, line, stack.begin,
+                             std::max(stack.outer, chord->outer)}),
+                ++chord;
         else if (stack.last + 2 > line)
             next_.push_back(stack);
         else
@@ -122,6 +127,7 @@ void ChordSearch::link(int line) {
 /// A stack of two chords or more is tried across its middle.
 void ChordSearch::close(const Stack& stack) {
     if (stack.first == stack.last) return;
+    add_streak(stack);
     const BitImage& across = *across_;
     const int at = stack.middle, line = at / 2, middle = stack.first + stack.last;  // two pixels a line
     if (across.is_dark(line, middle)) return;
@@ -140,6 +146,19 @@ void ChordSearch::close(const Stack& stack) {
     seeds_.push_back({along_rows_ ? x : y, along_rows_ ? y : x, reach, m_d, m_b});
 }
 
+/// A stack as long as the bars of a roundel that is smeared along it.
+void ChordSearch::add_streak(const Stack& stack) {
+    const int lines = stack.last - stack.first + 1;
+    if (lines < kStreakLines || stack.outer < kStreakWidth) return;
+    const float slope = float(stack.middle - stack.begin) / float(2 * (lines - 1));
+    const float cosine = 1 / std::sqrt(1 + slope * slope), sine = slope * cosine;
+    const float width = float(stack.outer) * cosine;
+    if (float(2 * lines) < kStreakLong * width * (cosine - kPassing * std::abs(sine))) return;
+    const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) + 0.5f;
+    streaks_.push_back(along_rows_ ? Streak{at, line, sine, cosine, width}
+                                   : Streak{line, at, cosine, sine, width});
+}
+
 void ChordSearch::scan(const BitImage& along, const BitImage& across, bool along_rows) {
     across_ = &across, along_rows_ = along_rows;
     edges_.resize(size_t(along.length) + 80);  // append_bits writes up to 8 more than there are
@@ -153,7 +172,7 @@ void ChordSearch::scan(const BitImage& along, const BitImage& across, bool along
 }
 
 const std::vector<Seed>& ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
-    seeds_.clear();
+    seeds_.clear(), streaks_.clear();
     image_ = &image;
     binarise(image, threshold, rows_, columns_);
     scan(rows_, columns_, true);

@@ -4,6 +4,7 @@
 
 #include "bits.hpp"
 #include "settings.hpp"
+#include "streaks.hpp"
 
 namespace roundel {
 
@@ -33,16 +34,22 @@ class ChordSearch {
     /// The seeds of an image; a roundel may have several.
     const std::vector<Seed>& run(const ImageView& image, const ThresholdMap& threshold);
 
+    /// The streaks of that image; sharp roundels are among them.
+    const std::vector<Streak>& streaks() const { return streaks_; }
+
   private:
     /// A bright run between two dark ones, on one or more neighbouring lines.
     struct Stack {
         int middle, inner;  // of the last line: middle of the bright run, and its length, pixels
         int first, last;    // lines, of two pixels each
+        int begin;          // middle on the first line
+        int outer;          // longest chord, with its dark runs
     };
     void scan(const BitImage& along, const BitImage& across, bool along_rows);
     void find_chords(const BitImage& along, int line);
     void link(int line);
     void close(const Stack& stack);
+    void add_streak(const Stack& stack);
     bool is_diametral(int dark, int inner) const;
 
     Proportions limits_{};
@@ -52,6 +59,7 @@ class ChordSearch {
     std::vector<int> passes_, numbers_;  // which bright runs between two dark ones are diametral
     std::vector<Stack> chords_, open_, next_;
     std::vector<Seed> seeds_;
+    std::vector<Streak> streaks_;
     const ImageView* image_ = nullptr;
     const BitImage* across_ = nullptr;
     bool along_rows_ = true;
