@@ -17,7 +17,8 @@ constexpr double kLengths[] = {0.25, 0.4, 0.55, 0.75, 1};  // of the motion, dia
 constexpr int kInstants = 16;                              // of the exposure
 constexpr double kReachAlong = 2, kReachAcross = 1.2;      // of the points, radii
 constexpr double kSeeThrough = 30;              // variance of the ground over that of what is no roundel
-constexpr double kNear = 0.3;                   // misfit over the contrast from which the descent may begin,
+constexpr double kFirst = 0.4;                  // misfit over the contrast in the streak's own direction,
+constexpr double kNear = 0.25;                  // in any, from which the descent begins,
 constexpr double kNears[] = {0.2, 0.13, 0.09};  // and after each of its rounds
 constexpr double kFirstStep = 0.1, kNextStep = 0.6;  // of the width; of the step before
 constexpr double kTurn = 1.5;                        // radians of a step of one width
@@ -134,15 +135,16 @@ bool StreakMatcher::descend(const ImageView& image, Match& best) const {
 
 std::optional<SmearedStart> StreakMatcher::match(const ImageView& image, const Streak& s) const {
     if (!is_symmetric(image, s, min_contrast_ / 2)) return std::nullopt;
-    Match best{{}, nullptr, kNear, 0, 0};
+    Match best{{}, nullptr, kFirst, 0, 0};
     Column levels;
     const double width = double(s.width), angle = std::atan2(double(s.along_y), double(s.along_x));
     for (const double turn : kTurns) {
         const Place place{double(s.x), double(s.y), angle + turn, width, width};
         sample(image, place, levels);
         compare(levels, place, best);
+        if (!best.appearance) return std::nullopt;
     }
-    if (!best.appearance || !descend(image, best)) return std::nullopt;
+    if (best.misfit > kNear || !descend(image, best)) return std::nullopt;
     const Place& p = best.place;
     const auto [minor, major] = std::minmax(p.along, p.across);
     const Ellipse outer{p.x, p.y, major, minor, p.angle + (p.across > p.along ? std::numbers::pi / 2 : 0)};
