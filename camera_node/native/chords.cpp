@@ -20,6 +20,7 @@ constexpr int kDrift = 3;         // pixels that the middle may move from one li
 constexpr int kStreakLines = 3, kStreakWidth = 14;  // the least; pixels
 constexpr float kStreakLong = 0.5f;  // of its width, and less where bars pass each other aslant:
 constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows or columns see better
+constexpr int kTurns = 4;            // pictures in which both diagonals have their turn
 constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
 /// The places of the bits of a word. Eight are written without asking how many there are.
@@ -188,13 +189,13 @@ void ChordSearch::scan(const BitImage& along, const BitImage* across, const Rast
 /// For smeared ones alone.
 void ChordSearch::scan_diagonals() {
     for (const bool growing : {true, false}) {
-        if (!both_ && growing != growing_) continue;
+        if (!both_ && turn_ != (growing ? 0 : kTurns / 2)) continue;
         shear(rows_, growing, diagonals_);
         const Raster raster =
             growing ? Raster{float(-2 * (rows_.lines - 1)), 0.5f, 2, 2, 4, 0} : Raster{0, 0.5f, -2, 2, 4, 0};
         scan(diagonals_, nullptr, raster, coarse_);
     }
-    both_ = partial_, growing_ = !growing_;
+    both_ = partial_, turn_ = (turn_ + 1) % kTurns;
 }
 
 const std::vector<Seed>& ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {

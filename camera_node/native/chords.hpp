@@ -30,7 +30,8 @@ struct Proportions {
 /// the dark runs is enough, so a roundel that something covers in part is found by the other direction.
 ///
 /// One that moves is seen across its motion only, wherever that is within half a right angle of the lines.
-/// Diagonals are scanned by turns, one a picture; both of the first one, and of pictures that are parts.
+/// Diagonals are scanned by turns, one in every second picture; both of the first one, and of pictures that
+/// are parts.
 class ChordSearch {
   public:
     explicit ChordSearch(const Settings& settings);
@@ -71,7 +72,8 @@ class ChordSearch {
     const ImageView* image_ = nullptr;
     const BitImage* across_ = nullptr;
     bool along_rows_ = true;
-    bool partial_, both_ = true, growing_ = true;  // which diagonals the next picture's search looks along
+    bool partial_, both_ = true;  // whether the next picture is searched along both diagonals
+    int turn_ = 0;                // pictures since one was
 };
 
 }  // namespace roundel

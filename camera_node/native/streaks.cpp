@@ -18,7 +18,7 @@ constexpr int kInstants = 16;                              // of the exposure
 constexpr double kReachAlong = 2, kReachAcross = 1.2;      // of the points, radii
 constexpr double kSeeThrough = 30;              // variance of the ground over that of what is no roundel
 constexpr double kFirst = 0.4;                  // misfit over the contrast in the streak's own direction,
-constexpr double kNear = 0.25;                  // in any, from which the descent begins,
+constexpr double kNear = 0.22;                  // in any, from which the descent begins,
 constexpr double kNears[] = {0.2, 0.13, 0.09};  // and after each of its rounds
 constexpr double kFirstStep = 0.1, kNextStep = 0.6;  // of the width; of the step before
 constexpr double kTurn = 1.5;                        // radians of a step of one width
@@ -98,8 +98,11 @@ void StreakMatcher::sample(const ImageView& image, const Place& p, Column& level
         }
 }
 
-ROUNDEL_CLONES void StreakMatcher::compare(const Column& levels, const Place& place, Match& best) const {
-    for (const Appearance& seen : appearances_) {
+/// With every `stride`-th appearance.
+ROUNDEL_CLONES void StreakMatcher::compare(const Column& levels, const Place& place, size_t stride,
+                                           Match& best) const {
+    for (size_t n = stride - 1; n < appearances_.size(); n += stride) {
+        const Appearance& seen = appearances_[n];
         Lanes sums[3] = {}, squares = {};
         for (size_t k = 0; k < kPadded; k += kLanes)
             for (size_t i = 0; i < 3; ++i) sums[i] += load(&seen.solve[i].at[k]) * load(&levels.at[k]);
@@ -125,7 +128,7 @@ bool StreakMatcher::descend(const ImageView& image, Match& best) const {
                 Place place = best.place;
                 place.*member += sign * step * (member == &Place::angle ? kTurn : width);
                 sample(image, place, levels);
-                compare(levels, place, best);
+                compare(levels, place, 1, best);
             }
         if (best.misfit > near) return false;
         step *= kNextStep;
@@ -141,7 +144,7 @@ std::optional<SmearedStart> StreakMatcher::match(const ImageView& image, const S
     for (const double turn : kTurns) {
         const Place place{double(s.x), double(s.y), angle + turn, width, width};
         sample(image, place, levels);
-        compare(levels, place, best);
+        compare(levels, place, 2, best);
         if (!best.appearance) return std::nullopt;
     }
     if (best.misfit > kNear || !descend(image, best)) return std::nullopt;

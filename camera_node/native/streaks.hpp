@@ -57,7 +57,7 @@ class StreakMatcher {
     };
     static Appearance make_appearance(double ratio, double length);
     static void sample(const ImageView& image, const Place& place, Column& levels);
-    void compare(const Column& levels, const Place& place, Match& best) const;
+    void compare(const Column& levels, const Place& place, size_t stride, Match& best) const;
     bool descend(const ImageView& image, Match& best) const;
 
     float min_contrast_;
