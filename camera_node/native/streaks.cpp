@@ -18,7 +18,7 @@ constexpr int kInstants = 16;                              // of the exposure
 constexpr double kReachAlong = 2, kReachAcross = 1.2;      // of the points, radii
 constexpr double kSeeThrough = 30;              // variance of the ground over that of what is no roundel
 constexpr double kFirst = 0.4;                  // misfit over the contrast in the streak's own direction,
-constexpr double kNear = 0.22;                  // in any, from which the descent begins,
+constexpr double kNear = 0.25;                  // in any, from which the descent begins,
 constexpr double kNears[] = {0.2, 0.13, 0.09};  // and after each of its rounds
 constexpr double kFirstStep = 0.1, kNextStep = 0.6;  // of the width; of the step before
 constexpr double kTurn = 1.5;                        // radians of a step of one width
