@@ -114,6 +114,23 @@ ROUNDEL_CLONES void transpose_block(uint64_t* a) {
             }
 }
 
+/// The 64 bits from `at` on, which may lie beyond either end of the line.
+inline uint64_t bits_from(const uint64_t* line, int words, int at) {
+    const int n = at >> 6, shift = at & 63;
+    const uint64_t low = n >= 0 && n < words ? line[n] : 0;
+    const uint64_t high = shift && n + 1 >= 0 && n + 1 < words ? line[n + 1] << (64 - shift) : 0;
+    return low >> shift | high;
+}
+
+/// Every fourth bit.
+inline uint64_t thin_out(uint64_t x) {
+    x &= 0x1111111111111111u;
+    x = (x | x >> 3) & 0x0303030303030303u;
+    x = (x | x >> 6) & 0x000f000f000f000fu;
+    x = (x | x >> 12) & 0x000000ff000000ffu;
+    return (x | x >> 24) & 0xffff;
+}
+
 }  // namespace
 
 void BitImage::reset(int line_count, int line_length) {
@@ -175,6 +192,24 @@ void transpose(const BitImage& rows, BitImage& columns) {
             for (int k = 0; k < std::min(kWord, rows.length - x); ++k)
                 columns.line(x + k)[y / kWord] = block[k];
         }
+}
+
+void shear(const BitImage& rows, bool growing, BitImage& diagonals) {
+    static thread_local BitImage sheared;
+    const int most = 2 * (rows.lines - 1);
+    sheared.reset(rows.lines, (rows.length + most + 3) / 4);
+    for (int k = 0; k < rows.lines; ++k) {
+        const int shift = growing ? most - 2 * k : 2 * k;
+        uint64_t* to = sheared.line(k);
+        for (int n = 0; n < sheared.words; ++n) {
+            to[n] = 0;
+            const int first = 4 * kWord * n - shift;
+            if (first >= rows.length || first + 4 * kWord <= 0) continue;
+            for (int part = 0; part < 4; ++part)
+                to[n] |= thin_out(bits_from(rows.line(k), rows.words, first + kWord * part)) << 16 * part;
+        }
+    }
+    transpose(sheared, diagonals);
 }
 
 }  // namespace roundel

@@ -34,4 +34,9 @@ void binarise(const ImageView& image, const ThresholdMap& threshold, BitImage& r
 /// The same picture with its columns as lines.
 void transpose(const BitImage& rows, BitImage& columns);
 
+/// The diagonals of `rows` (which binarise gives) as lines, those along which x grows with y, or falls: every
+/// fourth pixel of every row, so that they lie sqrt(8) pixels apart, as their own pixels do. Pixel k of line
+/// d is at x = 4 d + 2 k - 2 (rows.lines - 1), or at 4 d - 2 k.
+void shear(const BitImage& rows, bool growing, BitImage& diagonals);
+
 }  // namespace roundel

@@ -12,9 +12,16 @@ namespace roundel {
 namespace {
 
 // In sixteenths of a pixel, or of one.
-constexpr int kSlack = 24;   // by which a run may be off its proportion: a pixel's edge and blur
-constexpr int kUneven = 26;  // of one dark run to the other, in a chord that nothing covers
-constexpr int kDrift = 3;    // pixels that the middle may move from one line to the next
+constexpr int kSlack = 24;        // by which a run may be off its proportion: a pixel's edge and blur
+constexpr int kCoarseLeast = 6;   // pixels, which are sqrt(8) as wide on a diagonal;
+constexpr int kCoarseSlack = 16;  // sixteenths of them
+constexpr int kUneven = 26;       // of one dark run to the other, in a chord that nothing covers
+constexpr int kDrift = 3;         // pixels that the middle may move from one line to the next
+constexpr int kStreakLines = 3, kStreakWidth = 14;  // the least; pixels
+constexpr float kStreakLong = 0.5f;  // of its width, and less where bars pass each other aslant:
+constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows or columns see better
+constexpr int kTurns = 4;            // pictures in which both diagonals have their turn
+constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
 /// The places of the bits of a word. Eight are written without asking how many there are.
 inline int* append_bits(uint64_t bits, int base, int* to) {
@@ -45,8 +52,8 @@ ROUNDEL_CLONES void test_chords(const int* edges, int count, const Proportions& 
         const int inner = edges[2 * k + 2] - edges[2 * k + 1];
         const int dark = left < right ? left : right, uneven = left < right ? right : left;
         const int total = inner + 2 * dark;
-        passes[k] = (total >= p.least) & (total <= p.most) & (16 * dark <= p.thick * inner + kSlack) &
-                    (16 * dark + kSlack >= p.thin * inner) & (16 * uneven <= kUneven * dark + kSlack);
+        passes[k] = (total >= p.least) & (total <= p.most) & (16 * dark <= p.thick * inner + p.slack) &
+                    (16 * dark + p.slack >= p.thin * inner) & (16 * uneven <= kUneven * dark + p.slack);
     }
 }
 
@@ -77,14 +84,18 @@ ChordSearch::ChordSearch(const Settings& settings) {
     const double r = std::max(0.05, low - settings.ratio_tolerance);
     const double R = std::min(0.95, high + settings.ratio_tolerance);
     // The shortest chord through the centre is the minor axis.
-    limits_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2),
-               int(std::lround(16 * (1 - r) / (2 * r))), int(std::lround(16 * (1 - R) / (2 * R)))};
+    const int thick = int(std::lround(16 * (1 - r) / (2 * r))),
+              thin = int(std::lround(16 * (1 - R) / (2 * R)));
+    fine_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2), thick, thin, kSlack};
+    coarse_ = {kCoarseLeast, int(settings.max_diameter / 2.8) + 2, thick, thin, kCoarseSlack};
     min_contrast_ = int(settings.min_contrast / 2);
+    partial_ = settings.search_share < 1;
 }
 
 bool ChordSearch::is_diametral(int dark, int inner) const {
-    return dark > 0 && inner + 2 * dark <= limits_.most && 16 * dark <= limits_.thick * inner + kSlack &&
-           16 * dark + kSlack >= limits_.thin * inner;
+    return dark > 0 && inner + 2 * dark <= limits_.most &&
+           16 * dark <= limits_.thick * inner + limits_.slack &&
+           16 * dark + limits_.slack >= limits_.thin * inner;
 }
 
 void ChordSearch::find_chords(const BitImage& along, int line) {
@@ -96,7 +107,7 @@ void ChordSearch::find_chords(const BitImage& along, int line) {
     for (int k = 0; k < found; ++k) {
         const int* edge = &edges_[2 * size_t(numbers_[size_t(k)])];
         const int b = edge[1], c = edge[2];
-        chords_.push_back({(b + c - 1) / 2, c - b, line, line});
+        chords_.push_back({(b + c - 1) / 2, c - b, line, line, (b + c - 1) / 2, edge[3] - edge[0]});
     }
 }
 
@@ -109,7 +120,9 @@ void ChordSearch::link(int line) {
         const bool same = chord != chords_.end() && chord->middle <= stack.middle + kDrift &&
                           std::abs(chord->inner - stack.inner) <= 2 + stack.inner / 4;
         if (same)
-            next_.push_back({chord->middle, chord->inner, stack.first, line}), ++chord;
+            next_.push_back({chord->middle, chord->inner, stack.first, line, stack.begin,
+                             std::max(stack.outer, chord->outer)}),
+                ++chord;
         else if (stack.last + 2 > line)
             next_.push_back(stack);
         else
@@ -122,6 +135,8 @@ void ChordSearch::link(int line) {
 /// A stack of two chords or more is tried across its middle.
 void ChordSearch::close(const Stack& stack) {
     if (stack.first == stack.last) return;
+    add_streak(stack);
+    if (!across_) return;
     const BitImage& across = *across_;
     const int at = stack.middle, line = at / 2, middle = stack.first + stack.last;  // two pixels a line
     if (across.is_dark(line, middle)) return;
@@ -140,8 +155,27 @@ void ChordSearch::close(const Stack& stack) {
     seeds_.push_back({along_rows_ ? x : y, along_rows_ ? y : x, reach, m_d, m_b});
 }
 
-void ChordSearch::scan(const BitImage& along, const BitImage& across, bool along_rows) {
-    across_ = &across, along_rows_ = along_rows;
+/// A stack as long as the bars of a roundel that is smeared along it.
+void ChordSearch::add_streak(const Stack& stack) {
+    const int lines = stack.last - stack.first + 1;
+    if (lines < kStreakLines) return;
+    const Raster& r = raster_;
+    const float drift = float(stack.middle - stack.begin) / float(lines - 1);
+    const float x = r.line_x + drift * r.step_x, y = r.line_y + drift * r.step_y;  // along the bars
+    const float per_line = 1 / std::hypot(x, y), step = std::hypot(r.step_x, r.step_y);
+    const float sine = std::abs(r.step_x * x + r.step_y * y) * per_line / step;  // of the slant
+    const float cosine = std::abs(r.step_x * y - r.step_y * x) * per_line / step;
+    const float width = float(stack.outer) * step * cosine, length = float(lines) * cosine / per_line;
+    if (!across_ && sine > kAside) return;
+    if (width < kStreakWidth || length < kStreakLong * width * (cosine - kPassing * sine)) return;
+    const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) / 2;
+    streaks_.push_back({r.x + at * r.step_x + line * r.line_x, r.y + at * r.step_y + line * r.line_y,
+                        x * per_line, y * per_line, width});
+}
+
+void ChordSearch::scan(const BitImage& along, const BitImage* across, const Raster& raster,
+                       const Proportions& limits) {
+    across_ = across, along_rows_ = raster.step_y == 0, raster_ = raster, limits_ = limits;
     edges_.resize(size_t(along.length) + 80);  // append_bits writes up to 8 more than there are
     passes_.resize(edges_.size() / 2), numbers_.resize(edges_.size() / 2);
     open_.clear();
@@ -152,12 +186,25 @@ void ChordSearch::scan(const BitImage& along, const BitImage& across, bool along
     for (const Stack& stack : open_) close(stack);
 }
 
+/// For smeared ones alone.
+void ChordSearch::scan_diagonals() {
+    for (const bool growing : {true, false}) {
+        if (!both_ && turn_ != (growing ? 0 : kTurns / 2)) continue;
+        shear(rows_, growing, diagonals_);
+        const Raster raster =
+            growing ? Raster{float(-2 * (rows_.lines - 1)), 0.5f, 2, 2, 4, 0} : Raster{0, 0.5f, -2, 2, 4, 0};
+        scan(diagonals_, nullptr, raster, coarse_);
+    }
+    both_ = partial_, turn_ = (turn_ + 1) % kTurns;
+}
+
 const std::vector<Seed>& ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
-    seeds_.clear();
+    seeds_.clear(), streaks_.clear();
     image_ = &image;
     binarise(image, threshold, rows_, columns_);
-    scan(rows_, columns_, true);
-    scan(columns_, rows_, false);
+    scan(rows_, &columns_, {0, 0.5f, 1, 0, 0, 2}, fine_);
+    scan(columns_, &rows_, {0.5f, 0, 0, 1, 2, 0}, fine_);
+    scan_diagonals();
     return seeds_;
 }
 

@@ -4,6 +4,7 @@
 
 #include "bits.hpp"
 #include "settings.hpp"
+#include "streaks.hpp"
 
 namespace roundel {
 
@@ -15,46 +16,64 @@ struct Seed {
 };
 
 /// What a chord of a roundel may be: the least and the most of its length, pixels, and of one dark run over
-/// the bright one, (1 - r) / 2r, in sixteenths.
+/// the bright one, (1 - r) / 2r, in sixteenths, as is by what a run may be off.
 struct Proportions {
-    int least, most, thick, thin;
+    int least, most, thick, thin, slack;
 };
 
-/// Looks for roundels along all rows and columns of a picture.
+/// Looks for roundels along all rows and columns of a picture, and for smeared ones also along diagonals.
 ///
 /// A line through a roundel's centre is dark, bright and dark in the proportions (1 - r) : 2r : (1 - r) at
 /// any slant, r being the ratio of the diameters: an affine picture keeps ratios along a line (1 : 3 : 1 for
 /// the paper's 0.6), and lines that pass the centre within half the inner radius differ little. Chords of
 /// neighbouring lines that agree make a stack; its middle is where the line across is tried. There one of
 /// the dark runs is enough, so a roundel that something covers in part is found by the other direction.
+///
+/// One that moves is seen across its motion only, wherever that is within half a right angle of the lines.
+/// Diagonals are scanned by turns, one in every second picture; both of the first one, and of pictures that
+/// are parts.
 class ChordSearch {
   public:
     explicit ChordSearch(const Settings& settings);
     /// The seeds of an image; a roundel may have several.
     const std::vector<Seed>& run(const ImageView& image, const ThresholdMap& threshold);
+    /// The streaks of that image; sharp roundels are among them.
+    const std::vector<Streak>& streaks() const { return streaks_; }
 
   private:
     /// A bright run between two dark ones, on one or more neighbouring lines.
     struct Stack {
         int middle, inner;  // of the last line: middle of the bright run, and its length, pixels
         int first, last;    // lines, of two pixels each
+        int begin;          // middle on the first line
+        int outer;          // longest chord, with its dark runs
     };
-    void scan(const BitImage& along, const BitImage& across, bool along_rows);
+    /// Where pixel k of line d is in the image: at origin + k step + d line, as x and y.
+    struct Raster {
+        float x, y, step_x, step_y, line_x, line_y;
+    };
+    void scan(const BitImage& along, const BitImage* across, const Raster& raster, const Proportions& limits);
+    void scan_diagonals();
     void find_chords(const BitImage& along, int line);
     void link(int line);
     void close(const Stack& stack);
+    void add_streak(const Stack& stack);
     bool is_diametral(int dark, int inner) const;
 
-    Proportions limits_{};
+    Proportions fine_{}, coarse_{}, limits_{};  // of rows and columns; of diagonals; of what is scanned
+    Raster raster_{};
     int min_contrast_;  // grey levels
-    BitImage rows_, columns_;
+    BitImage rows_, columns_, diagonals_;
     std::vector<int> edges_;             // begin, end, begin, end, ... of the dark runs of a line
     std::vector<int> passes_, numbers_;  // which bright runs between two dark ones are diametral
     std::vector<Stack> chords_, open_, next_;
     std::vector<Seed> seeds_;
+    std::vector<Streak> streaks_;
     const ImageView* image_ = nullptr;
     const BitImage* across_ = nullptr;
     bool along_rows_ = true;
+    bool partial_, both_ = true;  // whether the next picture is searched along both diagonals
+    int turn_ = 0;                // pictures since one was
 };
 
 }  // namespace roundel

@@ -18,13 +18,15 @@ constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
 constexpr int kMaxFits = 512;          // to new places of a frame
 constexpr size_t kMaxSmeared = 8;      // lost roundels of a frame that are looked for smeared
+constexpr int kMaxMoving = 32;         // fits of new smeared ones, of which
+constexpr int kMaxFailed = 3;          // so many may fail
 constexpr double kNoiseSpan = 9.5;     // standard deviations
 
 }  // namespace
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear(), lost_.clear();
+    found_.clear(), lost_.clear(), streaks_.clear();
     postponed_ = fits_ = 0;
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
@@ -32,6 +34,7 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
     follow(image);
     search(image);
     follow_smeared(image);
+    search_smeared(image);
     tracks_.update(found_);
     update_theta();
     return found_;
@@ -86,10 +89,14 @@ void Detector::search(const ImageView& image) {
     }
 }
 
+/// Seeds are fitted at once, streaks kept for later.
+///
 /// Where there are more places than fits are allowed, the next frame begins with those that were left.
 void Detector::search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold,
                              int top) {
     const std::vector<Seed>& seeds = chords_.run(band, threshold);
+    streaks_ = chords_.streaks();
+    for (Streak& streak : streaks_) streak.y += float(top);
     const size_t n = seeds.size(), first = size_t(begin_at_ * double(n));
     const int most = fits_ + kMaxFits;
     size_t looked_at = 0;
@@ -101,6 +108,22 @@ void Detector::search_chords(const ImageView& image, const ImageView& band, cons
     }
     postponed_ = int(n - looked_at);
     begin_at_ = postponed_ ? double((first + looked_at) % n) / double(n) : 0;
+}
+
+/// What is new and smeared: the streaks that look most like it are fitted.
+void Detector::search_smeared(const ImageView& image) {
+    std::vector<SmearedStart> starts;
+    for (const Streak& streak : streaks_) {
+        if (claims_.cover_quickly(double(streak.x), double(streak.y))) continue;
+        if (const auto start = smeared_.match(image, streak)) starts.push_back(*start);
+    }
+    std::sort(starts.begin(), starts.end(), [](const auto& a, const auto& b) { return a.misfit < b.misfit; });
+    int fits = 0, failed = 0;
+    for (const auto& [start, misfit] : starts) {
+        if (failed == kMaxFailed || fits == kMaxMoving) break;
+        if (claims_.cover(start.still.outer.x, start.still.outer.y)) continue;
+        ++fits, failed += !keep(image, fit_moving(image, start, settings_, noise_), -1);
+    }
 }
 
 /// Fits, tests and keeps a roundel, unless it was found before; whether it is there.

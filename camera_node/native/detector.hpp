@@ -17,7 +17,8 @@ namespace roundel {
 /// wait for each other.
 class Detector {
   public:
-    explicit Detector(Settings settings) : settings_(std::move(settings)), chords_(settings_) {}
+    explicit Detector(Settings settings)
+        : settings_(std::move(settings)), chords_(settings_), smeared_(settings_) {}
     std::vector<Roundel> detect(const ImageView& image);
     /// The paper's theta, in force for the next frame.
     double theta() const { return theta_.value(); }
@@ -30,6 +31,7 @@ class Detector {
     void follow(const ImageView& image);
     void search(const ImageView& image);
     void follow_smeared(const ImageView& image);
+    void search_smeared(const ImageView& image);
     void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
     bool accept(const ImageView& image, const std::optional<Start>& start, int track);
     bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
@@ -38,11 +40,13 @@ class Detector {
 
     Settings settings_;
     ChordSearch chords_;
+    StreakMatcher smeared_;
     Theta theta_;
     Tracks tracks_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
     std::vector<Tracks::Expected> lost_;
+    std::vector<Streak> streaks_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     double begin_at_ = 0;     // share of the places to look at, where a frame had too many

@@ -46,6 +46,12 @@ std::optional<Fit> fit_again(const ImageView& image, const MovingStart& start, c
 
 }  // namespace
 
+std::optional<Fit> fit_moving(const ImageView& image, const MovingStart& start, const Settings& settings,
+                              double noise) {
+    const auto fit = refine_moving(image, start);
+    return fit && is_moving_roundel(*fit, settings, noise) ? fit : std::nullopt;
+}
+
 std::optional<Fit> follow_moving(const ImageView& image, const Tracks::Expected& expected,
                                  const Settings& settings, double noise) {
     const Fit& last = expected.fit;

@@ -3,6 +3,7 @@
 #include <optional>
 
 #include "image.hpp"
+#include "moving_fit.hpp"
 #include "settings.hpp"
 #include "tracks.hpp"
 
@@ -12,5 +13,10 @@ namespace roundel {
 /// then, and wherever around its expected place it looks smeared.
 std::optional<Fit> follow_moving(const ImageView& image, const Tracks::Expected& expected,
                                  const Settings& settings, double noise);
+
+/// The fit of a roundel that is new and moves; nothing where it does not pass the gates that end false
+/// positives.
+std::optional<Fit> fit_moving(const ImageView& image, const MovingStart& start, const Settings& settings,
+                              double noise);
 
 }  // namespace roundel

@@ -39,14 +39,16 @@ def chooses_when_loaded(binary: Path | str) -> bool:
 
 
 def frames() -> list[np.ndarray]:
-    """Roundels of 9 to 60 px, frontal to 60 degrees, whole, clipped and cut by the border; two frames each."""
+    """Roundels of 9 to 60 px, frontal to 60 degrees, whole, clipped and cut by the border, and one that moves; two
+    frames each."""
     rng, made = np.random.default_rng(9), []
     for diameter in (9, 12, 16, 21, 34, 60):
         for tilt in (0.0, 0.6, 1.05):
             discs = [Disc((80.2, 60.7), diameter, tilt, tilt), Disc((4.0, 100.0), 20, 0.2)]
             clean = render(discs, bright=rng.choice([150, 190, 262]), ground=rng.choice([60, 120, 190]))
             made += [expose(clean, 3, rng) for _ in range(2)]
-    return made
+    moving = np.mean([render([Disc((60.2 + t, 50.7), 32)]) for t in range(-10, 11)], axis=0)
+    return [*made, *(expose(moving, 3, rng) for _ in range(2))]
 
 
 @pytest.mark.skipif(
