@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.instants import choose_instants, group_instants
+from calib.lens_prior import usual_sigma
 from calib.problem import Observations, Problem, State
 from calib.sightings import Sightings
 from calib.start import triangulate
@@ -69,7 +70,8 @@ class Wave:
         rows, knot = rows[good[knot]], renumbered[knot[good[knot]]]
         knot_s, basis = knot_s[good], basis[good]
         density = acceleration_density(knot_s, basis, self.gap_s)
-        problem = Problem(list(self.lenses), affine, knot_s, self.gap_s, density, self.middle_s)
+        lens_sigma = np.array([usual_sigma(lens) for lens in self.lenses])
+        problem = Problem(list(self.lenses), affine, knot_s, self.gap_s, density, self.middle_s, lens_sigma)
         motion = np.stack([basis, finite_velocities(knot_s, basis, self.gap_s)], axis=1)
         return problem, State.of(cameras, offset_s, motion), self._observe(rows, knot)
 

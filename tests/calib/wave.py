@@ -17,7 +17,7 @@ from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.pose import Pose, invert, look_at
 from camera_node.roundels import Roundels
-from tests.calib.synthetic import WAND, outlines
+from tests.calib.synthetic import CALIBRATED, WAND, outlines
 
 Array = NDArray[np.float64]
 EPOCH_S = 1_000.0
@@ -108,6 +108,7 @@ def surround(wave: Wave, rng: np.random.Generator) -> Rig:
             cx=640 + rng.uniform(-15, 15),
             cy=400 + rng.uniform(-15, 15),
             distortion=(-0.1, 0.03, 0.0002, -0.0001, 0.0),
+            lens_sigma=CALIBRATED,
             T_world_cam=Pose.from_matrix(look_at(np.array(at), np.append(rng.uniform(-0.2, 0.2, 2), 1.1))),
             time_offset_ms=rng.uniform(-0.5, 0.5) * wave.offset_ms,
         )
