@@ -58,13 +58,14 @@ def solve(wave: Wave, cameras: Array, offset_s: Array, metric: bool) -> Solution
     free = [LENS, *(part for part in clocks if _tells(few, part, wave.period_s))]
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
-    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY)
+    corrected = [few.state.lens(k, lens) for k, lens in enumerate(wave.lenses)]
+    problem, start, observations = _around(wave.seen_through(corrected), few.state.cameras, offset_s, MANY)
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     problem = replace(problem, lens_sigma=settle(wave.lenses, few.state.lenses, few.covariance(LENS)))
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     problem = replace(problem.freeing(POSE, *free), density=density)
     observations = with_disc_centres(wave, problem, start, observations)
-    adjusted = adjust(problem, observations, find_robustly(problem, observations, start))
+    adjusted = adjust(problem, observations, start)
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)

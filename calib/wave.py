@@ -2,7 +2,7 @@
 """A labelled recording as a least squares problem: which moments, where the wand was at them, what was observed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,19 @@ class Wave:
     period_s: float
     gap_s: float
     middle_s: float
+
+    def seen_through(self, lenses: Sequence[Lens]) -> "Wave":
+        """The same, its tracks as other lenses saw them; the lenses that were given stay."""
+        tracks = [
+            [
+                Track.of(
+                    track.t_s, new.normalise(old.project(np.column_stack([track.at, np.ones(len(track.at))])))
+                )
+                for track in mine
+            ]
+            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
+        ]
+        return replace(self, tracks=tracks)
 
     def pose_problem(
         self, cameras: Array, offset_s: Array, budget: int
