@@ -17,6 +17,7 @@ Index = NDArray[np.intp]
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+POSE_SIGMA, CLOCK_SIGMA = [np.inf] * 6, [0.5, 5e-4]  # before anything is seen; clocks may be slewed
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +104,7 @@ class Problem:
         gap_s: knots further apart say nothing of each other.
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: the stamp to which time offsets refer.
+        lens_sigma: (C, 4) standard deviations of log f, cx, cy and k1 before anything is seen.
         free: which of a camera's 12 parameters are sought.
         fixed_distance: two cameras and their distance, where no wand length carries the scale.
         sought: the cameras that are sought; the others stand where they stand. All, unless given.
@@ -114,9 +116,15 @@ class Problem:
     gap_s: float
     density: float
     middle_s: float
+    lens_sigma: Array
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
     sought: tuple[int, ...] | None = None
+
+    def prior_sigma(self) -> Array:
+        """(C, d) how well the free parameters are known before anything is seen; infinite for poses."""
+        rest = np.tile(POSE_SIGMA + CLOCK_SIGMA, (len(self.lenses), 1))
+        return np.concatenate([rest, self.lens_sigma], axis=1)[:, self.free]
 
     def cameras(self) -> tuple[int, ...]:
         """The cameras that are sought."""

@@ -46,10 +46,13 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, time.process_time() - start
 
 
-def simulated(wave: Wave, goal_s: float) -> tuple[list[Row], float]:
-    """Errors against the truth; offsets against their mean, as nothing observes what all clocks share."""
+def simulated(
+    wave: Wave, goal_s: float, lenses: Callable[[Recorded], Rig] = lambda recorded: recorded.intrinsics
+) -> tuple[list[Row], float]:
+    """Errors against the truth, given its lenses or others; offsets against their mean, as nothing observes what all
+    clocks share."""
     recorded = record(wave)
-    result, cost = timed(lambda: calibrate(recorded.intrinsics, wave.wand, recorded.messages))
+    result, cost = timed(lambda: calibrate(lenses(recorded), wave.wand, recorded.messages))
     placed = list(result.rig.placed())
     shift, turn = camera_errors(result.rig, recorded.truth)
     squared, degrees = joint_error(result, recorded.truth)
@@ -194,6 +197,11 @@ def _intersect(centres: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArr
 ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "simulated-8": lambda: simulated(Wave(cameras=8), 5),
     "simulated-16": lambda: simulated(Wave(cameras=16), 10),
+    "lenses-as-told": lambda: simulated(
+        Wave(cameras=8), 5, lambda recorded: recorded.roughly(6e-4, 0.5, 5e-4, told=True)
+    ),
+    "lenses-0.4-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: recorded.roughly(4e-3, 2.0, 5e-3)),
+    "lenses-2-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: recorded.roughly(0.02, 10.0, 0.03)),
     "simulated-numbered": lambda: simulated(Wave(cameras=8, numbered=True, sized=False, seed=1), 5),
     "waved-led": waved_led,
     "webcams-wand": webcams_wand,

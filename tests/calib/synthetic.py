@@ -18,6 +18,7 @@ from camera_node.roundels import Roundels
 
 Array = NDArray[np.float64]
 
+CALIBRATED = (0.5, 0.5, 0.3, 0.3, 5e-4, 0.0, 0.0, 0.0, 0.0)  # lens_sigma, by a careful calibration
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
 
@@ -92,6 +93,7 @@ def ring(cameras: int = 4, **options) -> Arena:
             cx=402.0,
             cy=297.0,
             distortion=(-0.1, 0.03, 0.0002, -0.0001, 0.0),
+            lens_sigma=CALIBRATED,
             T_world_cam=Pose.from_matrix(look_at(place, [0.0, 0.0, 0.8])),
         )
     return Arena(Rig(cameras=entries), **options)

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How well a lens is known before the wand is waved: by its own calibration, or as lenses without figures are.
+
+Files without figures range from a data sheet to a careful calibration. How far off such lenses are, the wave itself
+tells, as it changes many of them (empirical Bayes: Efron and Morris 1973): by the marginal likelihood of the deviation
+that those of a kind share, which is uniform between none and the usual before anything is seen (Gelman 2006).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjustment import Adjusted
+from calib.camera import Camera
+from calib.problem import LENS
+from camera_node.lens import Lens
+
+Array = NDArray[np.float64]
+
+# Of log f, the principal point (part of the longer side) and k1, for a lens whose file says nothing: what lies between
+# a data sheet, or a sloppy board, and the lens that is there.
+FOCAL, CENTRE, K1 = 0.03, 0.02, 0.1
+# No lens is as it was calibrated to better than this: focus, temperature, a camera that was taken off its mount.
+FLOOR = np.array([5e-4, 0.3, 0.3, 5e-4])
+WRONG = 1e-4  # probability below which a lens is not what its figures say
+PARTS = np.geomspace(1e-3, 1.0, 31)  # of the usual deviations, by which lenses may be off
+KINDS = np.array([0, 1, 1, 2])  # of the four, that are off alike: focal length, principal point, distortion
+SWEEPS = 4  # over the kinds, each given the others
+
+
+def usual_sigma(lens: Lens) -> Array:
+    """(4,) standard deviations of log f, cx, cy and k1 of a lens without figures."""
+    size = max(lens.width, lens.height)
+    return np.array([FOCAL, CENTRE * size, CENTRE * size, K1])
+
+
+def told_sigma(lens: Lens) -> Array | None:
+    """(4,) those that stand with the lens; None where none do."""
+    if not isinstance(lens, Camera) or lens.lens_sigma is None:
+        return None
+    fx, fy, cx, cy, *distortion = lens.lens_sigma
+    focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
+    return np.maximum([focal, cx, cy, distortion[0] if distortion else K1], FLOOR)
+
+
+def settle(adjusted: Adjusted) -> Array:
+    """(C, 4) standard deviations of lenses, by what a wave tells of them.
+
+    Figures that stand with a lens hold unless the wave contradicts them. Of all others the wave itself tells how far
+    off they are, by kind of parameter. Cameras that are not sought keep theirs.
+    """
+    sought, sigma = list(adjusted.problem.cameras()), adjusted.problem.lens_sigma.copy()
+    lenses = [adjusted.problem.lenses[k] for k in sought]
+    information, gradient = _told_by_wave(adjusted)
+    usual, rough = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), 4), bool)
+    covariance = np.linalg.inv(information + np.diag(usual.ravel() ** -2))
+    off, settled = (covariance @ gradient).reshape(-1, 4), usual.copy()
+    for k, lens in enumerate(lenses):
+        mine, figures = slice(4 * k, 4 * k + 4), told_sigma(lens)
+        if figures is not None and _holds(off[k], covariance[mine, mine] + np.diag(figures**2)):
+            settled[k], rough[k] = figures, False
+    sigma[sought] = _narrowed(information, gradient, settled, rough)
+    return sigma
+
+
+def _holds(off: Array, covariance: Array) -> bool:
+    from scipy.special import chdtrc
+
+    return bool(chdtrc(len(off), off @ np.linalg.solve(covariance, off)) > WRONG)
+
+
+def _narrowed(information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_]) -> Array:
+    """`sigma` (S, 4) times what part of it the `rough` lenses are off by, those of a kind alike: the root of the
+    posterior mean of its square, one kind after the other."""
+    parts = np.ones(len(KINDS))
+    for kind in np.tile(np.unique(KINDS), SWEEPS if rough.any() else 0):
+        tried = np.where(kind == KINDS, PARTS[:, None], parts)
+        trials = np.where(rough, tried[:, None], 1.0) * sigma
+        likely = np.array([_log_marginal(information, gradient, trial.ravel()) for trial in trials])
+        weight = np.exp(likely - likely.max()) * PARTS  # steps of equal ratio, for a uniform prior
+        parts[kind == KINDS] = np.sqrt(weight @ PARTS**2 / weight.sum())
+    return np.where(rough, parts, 1.0) * sigma
+
+
+def _told_by_wave(adjusted: Adjusted) -> tuple[Array, Array]:
+    """(4S, 4S) information on the S sought lenses by what was seen alone, and (4S,) its product with their estimate."""
+    problem = adjusted.problem
+    sought, d = list(problem.cameras()), len(problem.free)
+    mine = np.ravel(np.arange(len(sought))[:, None] * d + [problem.free.index(p) for p in LENS])
+    noise = adjusted.scale**2 * adjusted.dependence
+    whole = np.linalg.inv(adjusted.inverse()[np.ix_(mine, mine)])
+    known = np.diag(problem.lens_sigma[sought].ravel() ** -2)
+    return (whole - known) / noise, whole @ adjusted.state.lenses[sought].ravel() / noise
+
+
+def _log_marginal(information: Array, gradient: Array, sigma: Array) -> float:
+    """Log likelihood of parameters' deviations (n,), the parameters integrated out: with S = diag(sigma),
+    g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
+    root = np.linalg.cholesky(np.eye(len(sigma)) + sigma[:, None] * information * sigma)
+    pulled = np.linalg.solve(root, sigma * gradient)
+    return float(pulled @ pulled / 2 - np.log(np.diag(root)).sum())
+
+
+def written(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:
+    """`Camera.lens_sigma` of an adjusted lens by `sigma` (4,); what is not adjusted stays as it was, or counts as
+    known."""
+    focal, cx, cy, k1 = sigma.tolist()
+    rest = (*(before or ()), *[0.0] * len(lens.parameters))[5 : len(lens.parameters)]
+    return (focal * lens.fx, focal * lens.fy, cx, cy, k1, *rest)
