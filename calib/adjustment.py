@@ -69,9 +69,11 @@ class Adjusted:
         return self._among_all(self.scale**2 * self.dependence * (inverse - pulled @ pulled.T), 2)
 
     def by_prior(self) -> Array:
-        """(C, d, S d) the other part, P P^T: what each parameter is off by where the prior mean of another, which the
-        last axis counts, is one standard deviation off. More of the same waving would not change it."""
-        return np.asarray(self._among_all(self.inverse() * self._prior_root(), 1), float)
+        """(C, d, S d) the other part, P P^T: what each parameter is off by where another, which the last axis counts,
+        is off by its doubt from what was given, and is held there. More of the same waving would not change it."""
+        root, sought = self._prior_root(), list(self.problem.cameras())
+        doubts = np.where(root > 0, self.problem.doubt()[sought].ravel(), 0.0)
+        return np.asarray(self._among_all(self.inverse() * (root**2 * doubts), 1), float)
 
     def inverse(self) -> Array:
         """(S d, S d) inverse of the information on what is observed."""

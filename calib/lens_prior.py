@@ -3,15 +3,20 @@
 
 Files without figures range from a data sheet to a careful calibration. How far off such lenses are, the wave itself
 tells, as it changes many of them (empirical Bayes: Efron and Morris 1973): by the marginal likelihood of the deviation
-that those of a kind share, which is uniform between none and the usual before anything is seen (Gelman 2006).
+that those of a kind share, of any order of magnitude up to the usual one before anything is seen.
+
+Lenses are held as if they were exact in one file of two (a spike; Mitchell and Beauchamp 1988): good ones cost nothing.
+Covariances do not believe that: what a lens may be off by without the wave showing it counts in full.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.camera import Camera
-from calib.problem import LENS
+from calib.problem import LENS, Problem
 from camera_node.lens import Lens
 
 Array = NDArray[np.float64]
@@ -22,7 +27,9 @@ FOCAL, CENTRE, K1 = 0.03, 0.02, 0.1
 # No lens is as it was calibrated to better than this: focus, temperature, a camera that was taken off its mount.
 FLOOR = np.array([5e-4, 0.3, 0.3, 5e-4])
 WRONG = 1e-4  # probability below which a lens is not what its figures say
-PARTS = np.geomspace(1e-3, 1.0, 31)  # of the usual deviations, by which lenses may be off
+# Of the usual deviations, what lenses may be off by: exactly nothing, or any order of magnitude.
+PARTS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
+LEAST = 1e-5  # of the usual deviations: exact, and yet a number
 KINDS = np.array([0, 1, 1, 2])  # of the four, that are off alike: focal length, principal point, distortion
 SWEEPS = 4  # over the kinds, each given the others
 
@@ -42,24 +49,37 @@ def told_sigma(lens: Lens) -> Array | None:
     return np.maximum([focal, cx, cy, distortion[0] if distortion else K1], FLOOR)
 
 
-def settle(adjusted: Adjusted) -> Array:
-    """(C, 4) standard deviations of lenses, by what a wave tells of them.
+def settle(problem: Problem, adjusted: Adjusted) -> Problem:
+    """The problem with lenses held by what a wave tells of them.
 
     Figures that stand with a lens hold unless the wave contradicts them. Of all others the wave itself tells how far
     off they are, by kind of parameter. Cameras that are not sought keep theirs.
+
+    Args:
+        problem: to change.
+        adjusted: the wave, adjusted with lenses held by whatever there was.
     """
-    sought, sigma = list(adjusted.problem.cameras()), adjusted.problem.lens_sigma.copy()
-    lenses = [adjusted.problem.lenses[k] for k in sought]
+    sought = list(adjusted.problem.cameras())
     information, gradient = _told_by_wave(adjusted)
-    usual, rough = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), 4), bool)
-    covariance = np.linalg.inv(information + np.diag(usual.ravel() ** -2))
-    off, settled = (covariance @ gradient).reshape(-1, 4), usual.copy()
+    sigma, rough = _known(adjusted.problem, information, gradient)
+    held, doubt = problem.lens_sigma.copy(), problem.lens_sigma.copy()
+    held[sought] = sigma * _parts(information, gradient, sigma, rough, exact=0.5)
+    doubt[sought] = np.maximum(sigma * _parts(information, gradient, sigma, rough, exact=0.0), held[sought])
+    return replace(problem, lens_sigma=held, lens_doubt=doubt)
+
+
+def _known(problem: Problem, information: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(S, 4) deviations of the sought lenses, by their figures where these hold, else the usual ones, which are
+    `rough`."""
+    lenses = [problem.lenses[k] for k in problem.cameras()]
+    sigma, rough = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), 4), bool)
+    covariance = np.linalg.inv(information + np.diag(sigma.ravel() ** -2))
+    off = (covariance @ gradient).reshape(-1, 4)
     for k, lens in enumerate(lenses):
         mine, figures = slice(4 * k, 4 * k + 4), told_sigma(lens)
         if figures is not None and _holds(off[k], covariance[mine, mine] + np.diag(figures**2)):
-            settled[k], rough[k] = figures, False
-    sigma[sought] = _narrowed(information, gradient, settled, rough)
-    return sigma
+            sigma[k], rough[k] = figures, False
+    return sigma, rough
 
 
 def _holds(off: Array, covariance: Array) -> bool:
@@ -68,17 +88,21 @@ def _holds(off: Array, covariance: Array) -> bool:
     return bool(chdtrc(len(off), off @ np.linalg.solve(covariance, off)) > WRONG)
 
 
-def _narrowed(information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_]) -> Array:
-    """`sigma` (S, 4) times what part of it the `rough` lenses are off by, those of a kind alike: the root of the
-    posterior mean of its square, one kind after the other."""
-    parts = np.ones(len(KINDS))
+def _parts(
+    information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_], exact: float
+) -> Array:
+    """(S, 4) what part of `sigma` the lenses are off by, those of a kind alike: the root of its square's posterior
+    mean, one kind after the other, with the probability `exact` of nothing before anything is seen; 1 where they are
+    not `rough`."""
+    parts, prior = np.ones(len(KINDS)), np.full(len(PARTS), (1 - exact) / (len(PARTS) - 1))
+    prior[0] = exact
     for kind in np.tile(np.unique(KINDS), SWEEPS if rough.any() else 0):
         tried = np.where(kind == KINDS, PARTS[:, None], parts)
         trials = np.where(rough, tried[:, None], 1.0) * sigma
         likely = np.array([_log_marginal(information, gradient, trial.ravel()) for trial in trials])
-        weight = np.exp(likely - likely.max()) * PARTS  # steps of equal ratio, for a uniform prior
-        parts[kind == KINDS] = np.sqrt(weight @ PARTS**2 / weight.sum())
-    return np.where(rough, parts, 1.0) * sigma
+        weight = prior * np.exp(likely - likely.max())
+        parts[kind == KINDS] = max(np.sqrt(weight @ PARTS**2 / weight.sum()), LEAST)
+    return np.where(rough, parts, 1.0)
 
 
 def _told_by_wave(adjusted: Adjusted) -> tuple[Array, Array]:

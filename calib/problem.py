@@ -104,10 +104,11 @@ class Problem:
         gap_s: knots further apart say nothing of each other.
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: the stamp to which time offsets refer.
-        lens_sigma: (C, 4) standard deviations of log f, cx, cy and k1 before anything is seen.
+        lens_sigma: (C, 4) standard deviations that hold log f, cx, cy and k1 to what was given.
         free: which of a camera's 12 parameters are sought.
         fixed_distance: two cameras and their distance, where no wand length carries the scale.
         sought: the cameras that are sought; the others stand where they stand. All, unless given.
+        lens_doubt: (C, 4) what covariances take these four to be off by, `lens_sigma` unless given.
     """
 
     lenses: list[Lens]
@@ -120,11 +121,19 @@ class Problem:
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
     sought: tuple[int, ...] | None = None
+    lens_doubt: Array | None = None
 
     def prior_sigma(self) -> Array:
-        """(C, d) how well the free parameters are known before anything is seen; infinite for poses."""
+        """(C, d) what holds the free parameters before anything is seen; infinite for poses."""
+        return self._before(self.lens_sigma)
+
+    def doubt(self) -> Array:
+        """(C, d) what covariances take the free parameters to be off by before anything is seen."""
+        return self._before(self.lens_sigma if self.lens_doubt is None else self.lens_doubt)
+
+    def _before(self, lenses: Array) -> Array:
         rest = np.tile(POSE_SIGMA + CLOCK_SIGMA, (len(self.lenses), 1))
-        return np.concatenate([rest, self.lens_sigma], axis=1)[:, self.free]
+        return np.concatenate([rest, lenses], axis=1)[:, self.free]
 
     def cameras(self) -> tuple[int, ...]:
         """The cameras that are sought."""

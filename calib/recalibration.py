@@ -88,8 +88,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     observations = with_disc_centres(wave, problem, state, observations)
     first = widen(adjust(problem.freeing(POSE, OFFSET, LENS), observations, state), observations)
     check_lenses(recording.names, first)
-    problem = replace(first.problem, lens_sigma=settle(first))
-    adjusted = widen(adjust(problem, observations, first.state), observations)
+    adjusted = widen(adjust(settle(first.problem, first), observations, first.state), observations)
     check_agreement(recording.names, adjusted, observations)
     return _conclude(rig, name, this, adjusted, observations)
 

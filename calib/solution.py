@@ -72,8 +72,7 @@ def solve(
     problem = replace(problem.freeing(POSE, *free), density=density)
     observations = with_disc_centres(wave, problem, start, observations)
     first = replace(adjust(problem, observations, start, rounds=1), dependence=judged.dependence)
-    problem = replace(problem, lens_sigma=settle(first))
-    adjusted = adjust(problem, observations, first.state)
+    adjusted = adjust(settle(problem, first), observations, first.state)
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)

@@ -125,7 +125,7 @@ def placed(result: "Calibration") -> Placed:
     pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
     noise = adjusted.by_noise()[:, pose][:, :, :, pose].reshape(6 * count, 6 * count)
     by_prior = adjusted.by_prior().reshape(count, len(free), count, len(free))[:, pose][:, :, :, lens]
-    sigma = adjusted.problem.prior_sigma()[:, lens]
+    sigma = adjusted.problem.doubt()[:, lens]
     lenses = {
         name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
         for k, name in enumerate(result.names)
