@@ -23,7 +23,7 @@ from calib.wand import Calibration, calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.observations import read_observations
-from tests.calib.synthetic import camera_errors, joint_error
+from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -198,10 +198,10 @@ ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "simulated-8": lambda: simulated(Wave(cameras=8), 5),
     "simulated-16": lambda: simulated(Wave(cameras=16), 10),
     "lenses-as-told": lambda: simulated(
-        Wave(cameras=8), 5, lambda recorded: recorded.roughly(6e-4, 0.5, 5e-4, told=True)
+        Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, CAREFUL, told=True)
     ),
-    "lenses-0.4-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: recorded.roughly(4e-3, 2.0, 5e-3)),
-    "lenses-2-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: recorded.roughly(0.02, 10.0, 0.03)),
+    "lenses-0.4-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, OLD)),
+    "lenses-2-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, SHEET)),
     "simulated-numbered": lambda: simulated(Wave(cameras=8, numbered=True, sized=False, seed=1), 5),
     "waved-led": waved_led,
     "webcams-wand": webcams_wand,

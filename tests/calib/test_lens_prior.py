@@ -13,11 +13,10 @@ from calib.recalibration import place_one
 from calib.rig import Rig
 from calib.trust import assess
 from calib.wand import Calibration, calibrate
-from tests.calib.synthetic import camera_errors, joint_error
+from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 
 SEEDS = (1, 2)
-EXACT, CAREFUL, OLD, SHEET = (0.0, 0.0, 0.0), (6e-4, 0.5, 5e-4), (4e-3, 2.0, 5e-3), (0.02, 10.0, 0.03)
 
 
 @cache
@@ -26,7 +25,9 @@ def recorded(seed: int) -> Recorded:
 
 
 def placed(seed: int, off: tuple[float, float, float], told: bool) -> Calibration:
-    result = calibrate(recorded(seed).roughly(*off, told=told), Wave().wand, recorded(seed).messages)
+    result = calibrate(
+        roughly(recorded(seed).intrinsics, off, told, seed), Wave().wand, recorded(seed).messages
+    )
     assert len(result.names) == 6
     return result
 
@@ -54,7 +55,7 @@ def test_the_lens_is_named_where_it_spoils_the_rig():
     """Four cameras, twelve seconds, focal lengths 2 % off: places are known to centimetres, and the report says why."""
     wave = Wave(cameras=4, seconds=12, rate_hz=30, seed=1)
     recorded = record(wave)
-    trust = assess(calibrate(recorded.roughly(*SHEET), wave.wand, recorded.messages), wave.wand)
+    trust = assess(calibrate(roughly(recorded.intrinsics, SHEET), wave.wand, recorded.messages), wave.wand)
     assert trust.grade > "A"
     assert trust.spoilt()
     assert "known too roughly" in trust.spoilt()[0]
@@ -62,7 +63,7 @@ def test_the_lens_is_named_where_it_spoils_the_rig():
 
 def test_figures_that_a_wave_contradicts_do_not_count():
     """A focal length 2 % off that claims 0.06 %: found to 0.6 %, three times what this wave leaves open."""
-    rig, truth = recorded(2).roughly(*CAREFUL, told=True), recorded(2).truth
+    rig, truth = roughly(recorded(2).intrinsics, CAREFUL, told=True), recorded(2).truth
     wrong = rig.cameras["cam02"]
     wrong = msgspec.structs.replace(wrong, fx=1.02 * wrong.fx, fy=1.02 * wrong.fy)
     result = calibrate(Rig(cameras={**rig.cameras, "cam02": wrong}), Wave().wand, recorded(2).messages)
@@ -77,7 +78,10 @@ def test_one_camera_is_placed_through_a_rough_lens_as_well_as_claimed(off: tuple
     """The squared Mahalanobis errors of the pose, over waves, are below the 99.9 % quantile of chi-square."""
     squared = 0.0
     for seed in SEEDS:
-        truth, rough = recorded(seed).truth, recorded(seed).roughly(*off).cameras["cam02"]
+        truth, rough = (
+            recorded(seed).truth,
+            roughly(recorded(seed).intrinsics, off, seed=seed).cameras["cam02"],
+        )
         rig = Rig(cameras={**truth.cameras, "cam02": rough})
         here = place_one(rig, Wave().wand, recorded(seed).messages, "cam02").rig.cameras["cam02"]
         D = np.linalg.inv(here.matrix()) @ truth.cameras["cam02"].matrix()
@@ -87,7 +91,7 @@ def test_one_camera_is_placed_through_a_rough_lens_as_well_as_claimed(off: tuple
 
 
 def test_figures_that_stand_with_a_lens_are_read_and_checked():
-    camera = recorded(1).roughly(*CAREFUL, told=True).cameras["cam00"]
+    camera = roughly(recorded(1).intrinsics, CAREFUL, told=True).cameras["cam00"]
     assert told_sigma(camera) == pytest.approx([6e-4, 0.5, 0.5, 5e-4], rel=0.01)
     assert told_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
     with pytest.raises(ValueError, match="lens_sigma"):

@@ -58,7 +58,6 @@ class Recorded:
     truth: Rig
     drift_ppm: dict[str, float]
     messages: list[Detections]
-    seed: int = 0
 
     @property
     def intrinsics(self) -> Rig:
@@ -68,19 +67,6 @@ class Recorded:
             for n, c in self.truth.cameras.items()
         }
         return Rig(cameras=bare)
-
-    def roughly(self, focal: float, centre_px: float, k1: float, told: bool = False, seed: int = 0) -> Rig:
-        """The same with lenses that are off by so much (1 sigma; of the focal length, its part), and say so if `told`;
-        otherwise they have no figures."""
-        rng, cameras = np.random.default_rng([self.seed, seed]), {}
-        for name, camera in self.intrinsics.cameras.items():
-            off = rng.standard_normal(4) * [focal, centre_px, centre_px, k1]
-            parameters = np.array(camera.parameters)
-            parameters[:2] *= np.exp(off[0])
-            parameters[2:5] += off[1:]
-            sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1) if told else None
-            cameras[name] = msgspec.structs.replace(camera.with_parameters(parameters), lens_sigma=sigma)
-        return Rig(cameras=cameras)
 
 
 class Hand:
@@ -141,8 +127,7 @@ def record(wave: Wave) -> Recorded:
         stamp_s = wave.seconds / 2 + (t_s - wave.seconds / 2 - camera.time_offset_ms * 1e-3) / rate
         stamp_s = stamp_s + 1e-3 * wave.jitter_ms * rng.standard_normal(len(t_s))
         messages += _film(name, camera, wave, hand, t_s, stamp_s, rng)
-    in_order = sorted(messages, key=lambda message: (message.t_ns, message.camera))
-    return Recorded(truth, drift, in_order, wave.seed)
+    return Recorded(truth, drift, sorted(messages, key=lambda message: (message.t_ns, message.camera)))
 
 
 def _film(
