@@ -3,10 +3,10 @@
 
 Files without figures range from a data sheet to a careful calibration. How far off such lenses are, the wave itself
 tells, as it changes many of them (empirical Bayes: Efron and Morris 1973): by the marginal likelihood of the deviation
-that those of a kind share, of any order of magnitude up to the usual one before anything is seen.
-
-Lenses are held as if they were exact in one file of two (a spike; Mitchell and Beauchamp 1988): good ones cost nothing.
-Covariances do not believe that: what a lens may be off by without the wave showing it counts in full.
+that those of a kind share. Lenses are held as if they were exact in one file of two, else off by any order of
+magnitude (spike and slab; Mitchell and Beauchamp 1988): good ones cost nothing. Covariances do not believe that. For
+them the deviation is uniform between none and the usual before anything is seen (Gelman 2006): what a lens may be off
+by without the wave showing it counts in full.
 """
 
 from dataclasses import replace
@@ -27,8 +27,11 @@ FOCAL, CENTRE, K1 = 0.03, 0.02, 0.1
 # No lens is as it was calibrated to better than this: focus, temperature, a camera that was taken off its mount.
 FLOOR = np.array([5e-4, 0.3, 0.3, 5e-4])
 WRONG = 1e-4  # probability below which a lens is not what its figures say
-# Of the usual deviations, what lenses may be off by: exactly nothing, or any order of magnitude.
-PARTS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
+PARTS = np.concatenate(
+    [[0.0], np.geomspace(1e-3, 1.0, 31)]
+)  # of the usual deviations, by which lenses may be off
+# Probabilities of these before anything is seen: to hold lenses by, and for covariances.
+SPIKE, UNIFORM = np.where(PARTS > 0, 0.5 / (len(PARTS) - 1), 0.5), PARTS / PARTS.sum()
 LEAST = 1e-5  # of the usual deviations: exact, and yet a number
 KINDS = np.array([0, 1, 1, 2])  # of the four, that are off alike: focal length, principal point, distortion
 SWEEPS = 4  # over the kinds, each given the others
@@ -63,8 +66,8 @@ def settle(problem: Problem, adjusted: Adjusted) -> Problem:
     information, gradient = _told_by_wave(adjusted)
     sigma, rough = _known(adjusted.problem, information, gradient)
     held, doubt = problem.lens_sigma.copy(), problem.lens_sigma.copy()
-    held[sought] = sigma * _parts(information, gradient, sigma, rough, exact=0.5)
-    doubt[sought] = np.maximum(sigma * _parts(information, gradient, sigma, rough, exact=0.0), held[sought])
+    held[sought] = sigma * _parts(information, gradient, sigma, rough, SPIKE)
+    doubt[sought] = np.maximum(sigma * _parts(information, gradient, sigma, rough, UNIFORM), held[sought])
     return replace(problem, lens_sigma=held, lens_doubt=doubt)
 
 
@@ -89,13 +92,11 @@ def _holds(off: Array, covariance: Array) -> bool:
 
 
 def _parts(
-    information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_], exact: float
+    information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_], prior: Array
 ) -> Array:
     """(S, 4) what part of `sigma` the lenses are off by, those of a kind alike: the root of its square's posterior
-    mean, one kind after the other, with the probability `exact` of nothing before anything is seen; 1 where they are
-    not `rough`."""
-    parts, prior = np.ones(len(KINDS)), np.full(len(PARTS), (1 - exact) / (len(PARTS) - 1))
-    prior[0] = exact
+    mean, one kind after the other, by the `prior` of PARTS; 1 where they are not `rough`."""
+    parts = np.ones(len(KINDS))
     for kind in np.tile(np.unique(KINDS), SWEEPS if rough.any() else 0):
         tried = np.where(kind == KINDS, PARTS[:, None], parts)
         trials = np.where(rough, tried[:, None], 1.0) * sigma
