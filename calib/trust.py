@@ -57,6 +57,7 @@ class CameraTrust:
         useful: (rows, columns) cells in which another camera could see the wand too.
         figures: by criterion, of those in LIMITS that a camera has.
         lens: the camera whose lens spoils `pose_px` most; empty where lenses make up less than half of its square.
+        noise_px: as `pose_px`, by the noise of what was seen alone: more of the same waving makes it smaller.
     """
 
     name: str
@@ -64,6 +65,7 @@ class CameraTrust:
     useful: NDArray[np.bool_]
     figures: dict[str, float]
     lens: str = ""
+    noise_px: float = 0.0
 
     @property
     def missing(self) -> NDArray[np.bool_]:
@@ -72,8 +74,8 @@ class CameraTrust:
 
     @property
     def strain(self) -> float:
-        """What the camera's covariance moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
-        return self.figures["pose_px"] / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
+        """What the wave's noise moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
+        return self.noise_px / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
 
     @property
     def grade(self) -> str:
@@ -242,14 +244,19 @@ def _assess_camera(
     coverage = Coverage.of(uv, camera.width, camera.height, CELLS)
     distances = np.linalg.norm(wave - camera.matrix()[:3, 3], axis=1)
     useful = shared_cells(camera, list(others.values()), np.quantile(distances, DEPTHS))
+    distance, adjusted = float(np.median(distances)), result.adjusted
+    noise_px, known_px = (
+        pose_px(result, k, uv, distance, covariance)
+        for covariance in (adjusted.by_noise(), adjusted.joint_covariance())
+    )
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": pose_px(result, k, uv, float(np.median(distances))),
+        "pose_px": known_px,
         "unused": 1 - coverage.share(useful),
     }
-    lens = lens_to_blame(result, k, uv, float(np.median(distances)))
-    return CameraTrust(row.name, coverage, useful, figures, lens)
+    lens = lens_to_blame(result, k, uv, distance)
+    return CameraTrust(row.name, coverage, useful, figures, lens, noise_px)
 
 
 def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> NDArray[np.bool_]:
@@ -270,12 +277,13 @@ def joint_of(result: Calibration) -> Joint:
     return Joint(result.adjusted.problem.free, covariance.reshape(size, size))
 
 
-def pose_px(result: Calibration, k: int, uv: Array, distance: float) -> float:
-    """RMS, per coordinate, by which the covariance of camera k moves points at a distance in its image; pixels."""
+def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> float:
+    """RMS, per coordinate, by which a `covariance` (C, d, C, d) of camera k moves points at a distance in its image;
+    pixels."""
     if not len(uv):
         return float("nan")
     J = _image_jacobians(result, k, uv, distance)
-    moved = J @ result.adjusted.joint_covariance()[k, :, k] @ np.swapaxes(J, 1, 2)
+    moved = J @ covariance[k, :, k] @ np.swapaxes(J, 1, 2)
     return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))
 
 
