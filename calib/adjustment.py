@@ -22,6 +22,7 @@ CAUCHY = 2.3849  # 95 % efficient on normal residuals
 REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
 BREAK = 4.0  # sigmas, over all coordinates: the hand was knocked, or frames are missing from the count
 MAX_ITERATIONS = 60
+ROUNDS = 5
 MIN_DAMPING = 1e-9
 ROUGHLY, NOTHING = 5e-3, 1e-4  # of the cost: gained by a step that is the last
 TINY = 1e-4  # of half of chi-square
@@ -38,7 +39,8 @@ class Adjusted:
         residuals: (n, 2) seen less expected, pixels, of all observations.
         scale: what the residuals are over what their covariances claim; all covariances are scaled by it.
         information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
-            translation; its null space is the choice of the world, and of the clock that all others are compared with.
+            translation, by what was seen at the noise it claims and by what was known before; its null space is the
+            choice of the world, and of the clock that all others are compared with.
         iterations: of all rounds together.
         dependence: by what covariances, beside `scale`, are widened because errors of neighbouring moments are alike
             (`calib.dependence`).
@@ -57,16 +59,45 @@ class Adjusted:
         """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
         and the time what their clocks say on average (inner constraints; Triggs et al., Bundle Adjustment, section
         9.3). Where only some cameras were sought, it is theirs in the world of the others, which are taken as known."""
-        count, d = len(self.state.cameras), len(self.problem.free)
+        by_prior = self.by_prior()
+        return np.asarray(self.by_noise() + np.einsum("cpm,eqm->cpeq", by_prior, by_prior), float)
+
+    def by_noise(self) -> Array:
+        """(C, d, C, d) the part of it that comes from the noise of what was seen, as this turned out."""
+        inverse, root = self.inverse(), self._prior_root()
+        pulled = inverse * root
+        return self._among_all(self.scale**2 * self.dependence * (inverse - pulled @ pulled.T), 2)
+
+    def by_prior(self) -> Array:
+        """(C, d, S d) the other part, P P^T: what each parameter is off by where another, which the last axis counts,
+        is off by its doubt from what was given, and is held there. More of the same waving would not change it."""
+        root, sought = self._prior_root(), list(self.problem.cameras())
+        doubts = np.where(root > 0, self.problem.doubt()[sought].ravel(), 0.0)
+        return np.asarray(self._among_all(self.inverse() * (root**2 * doubts), 1), float)
+
+    def inverse(self) -> Array:
+        """(S d, S d) inverse of the information on what is observed."""
         if self.problem.sought is not None:
-            full = np.zeros((count, d, count, d))
-            rows = np.ix_(self.problem.sought, range(d), self.problem.sought, range(d))
-            full[rows] = np.linalg.inv(self.information).reshape(full[rows].shape)
-            return full
+            return np.asarray(np.linalg.inv(self.information), float)
         gauge = unobserved(self.state, self.problem.free)
         rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-        full = np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
-        return full.reshape(count, d, count, d)
+        return np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
+
+    def fixed_by_data(self) -> float:
+        """The number of parameters that what was seen fixes; those that the prior alone fixes do not count."""
+        return float(np.trace(self.inverse() @ (self.information - np.diag(self._prior_root() ** 2))))
+
+    def _prior_root(self) -> Array:
+        """(S d,) square root of the information that was there before."""
+        return 1 / self.problem.prior_sigma()[list(self.problem.cameras())].ravel()
+
+    def _among_all(self, part: Array, axes: int) -> Array:
+        """Rows (and columns, of two `axes`) of the sought cameras among those of all; zero for the others."""
+        count, d, sought = len(self.state.cameras), len(self.problem.free), list(self.problem.cameras())
+        full = np.zeros((count, d, count, d)[: 2 * axes] + part.shape[axes:])
+        split = part.reshape((len(sought), d, len(sought), d)[: 2 * axes] + part.shape[axes:])
+        full[np.ix_(*[sought, range(d)] * axes)] = split
+        return full
 
     def covariance(self, parameters: tuple[int, ...]) -> Array:
         """(C, p, C, p) that of some of a camera's parameters; zero where they were not sought."""
@@ -85,11 +116,12 @@ def find_robustly(problem: Problem, observations: Observations, start: State) ->
     return _descend(every, start, robust=True)[0]
 
 
-def adjust(problem: Problem, observations: Observations, start: State) -> Adjusted:
-    """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals."""
-    every, state, rounds = Linearisation(problem, observations), start, 0
+def adjust(problem: Problem, observations: Observations, start: State, rounds: int = ROUNDS) -> Adjusted:
+    """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals,
+    until these are the same again, or in so many `rounds`."""
+    every, state, iterations = Linearisation(problem, observations), start, 0
     used, broken = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
-    for _ in range(5):
+    for _ in range(rounds):
         every.weigh(state)
         errors = every.errors(state)
         keep = errors.seen < REJECT * max(_spread(errors.seen[used] if used.any() else errors.seen), 1.0)
@@ -100,12 +132,12 @@ def adjust(problem: Problem, observations: Observations, start: State) -> Adjust
         kept = Linearisation(problem, observations.select(used), broken)
         kept.weigh(state)
         state, more = _descend(kept, state, robust=False)
-        rounds += more
+        iterations += more
     kept = Linearisation(problem, observations.select(used), broken)
     kept.weigh(state)
     scale = _variance_factor(kept, state)
-    information = camera_information(kept, state) / scale**2
-    return Adjusted(problem, state, used, every.residuals(state), scale, information, rounds)
+    information = camera_information(kept, state)
+    return Adjusted(problem, state, used, every.residuals(state), scale, information, iterations)
 
 
 def _spread(norms: Array) -> float:
@@ -119,7 +151,8 @@ def _variance_factor(linearisation: Linearisation, state: State) -> float:
     problem = linearisation.problem
     B, knots, linked = len(problem.wand.basis), len(problem.knot_s), linearisation.linked()
     equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
-    free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6
+    known = np.isfinite(problem.prior_sigma()).sum()
+    free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6 - known
     return float(
         np.sqrt(2 * linearisation.errors(state).cost(np.inf, np.inf) / max(equations - free, equations / 10))
     )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Whether two calibrations of the same cameras agree within their covariances, and whose fault it is if not."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -21,11 +21,17 @@ DOUBT = 1e-3  # probability below which chance is no explanation
 @dataclass(frozen=True, slots=True)
 class Placed:
     """Cameras of a calibration: names, T_world_cam (C, 4, 4), and the covariance (6C, 6C) of all poses together, each
-    in its camera's own frame, rotation then translation."""
+    in its own frame, rotation then translation.
+
+    What two calibrations with the same lens files share is no difference between them: `lenses` holds, by camera, how
+    all poses change with its lens (6C, 4), log f, cx, cy and k1, and the standard deviations (4,) of these in the file;
+    `covariance` is then what comes on top.
+    """
 
     names: Sequence[str]
     cameras: Array
     covariance: Array
+    lenses: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
     @classmethod
     def of_rig(cls, rig: Rig) -> "Placed":
@@ -40,7 +46,20 @@ class Placed:
         """These cameras, in this order."""
         rows = [list(self.names).index(name) for name in names]
         joint = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in rows])
-        return Placed(list(names), self.cameras[rows], self.covariance[np.ix_(joint, joint)])
+        lenses = {name: (by_lens[joint], sigma) for name, (by_lens, sigma) in self.lenses.items()}
+        return Placed(list(names), self.cameras[rows], self.covariance[np.ix_(joint, joint)], lenses)
+
+    def apart(self, other: "Placed") -> Array:
+        """(6C, 6C) covariance of the difference from the same cameras in another calibration."""
+        total, unknown = (
+            self.covariance + other.covariance,
+            (np.zeros((6 * len(self.names), 4)), np.full(4, np.inf)),
+        )
+        for name in {*self.lenses, *other.lenses}:
+            (mine, sigma), (theirs, told) = (placed.lenses.get(name, unknown) for placed in (self, other))
+            differ = (mine - theirs) * np.minimum(sigma, told)
+            total = total + differ @ differ.T
+        return total
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +149,7 @@ def _test(a: Placed, b: Placed) -> tuple[float, int, float]:
     off = _differences(a, b, _common(a, b)).ravel()
     gauge = np.vstack([adjoint(invert(T)) for T in a.cameras])  # the world turned and shifted
     rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-    covariance = rest.T @ (a.covariance + b.covariance) @ rest
+    covariance = rest.T @ a.apart(b) @ rest
     values, vectors = np.linalg.eigh(covariance)
     known = values > 1e-9 * values.max()  # a distance that only carries the scale is known without error
     squared = float((((vectors.T @ (rest.T @ off))[known]) ** 2 / values[known]).sum())

@@ -18,12 +18,21 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
     True capture time = stamp + `time_offset_ms`. `covariance` is that of the pose in GTSAM's order (rotation in the
     camera's frame, then translation in the camera's frame), (6, 6), rad and m; None where it is not known.
+    `lens_sigma` are standard deviations of the lens's `parameters`, in their order; None where nobody measured them.
     """
 
     T_world_cam: Pose | None = None
     time_offset_ms: float = 0.0
     covariance: tuple[tuple[float, ...], ...] | None = None
     lens_sigma: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sigma = self.lens_sigma
+        if sigma is not None and not (len(sigma) >= 4 and np.isfinite(sigma).all() and min(sigma) >= 0):
+            raise ValueError(
+                "lens_sigma holds standard deviations of fx, fy, cx, cy and of distortion numbers"
+            )
 
     def project_world(self, p_world: ArrayLike) -> Array:
         """Raw pixels (N, 2) of points (N, 3) in the world; NaN for those not before the camera."""

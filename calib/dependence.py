@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.adjustment import BREAK, Adjusted
 from calib.linearisation import Linearisation
-from calib.problem import Observations, unobserved
+from calib.problem import Observations
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ FEWEST = 4  # blocks: of fewer, nothing is concluded
 def widen(adjusted: Adjusted, observations: Observations) -> Adjusted:
     """The adjustment with covariances widened by what its residuals' dependence asks for."""
     factor = dependence(adjusted, observations)
-    return replace(adjusted, information=adjusted.information / factor, dependence=factor)
+    return replace(adjusted, dependence=factor)
 
 
 def dependence(adjusted: Adjusted, observations: Observations) -> float:
@@ -41,14 +41,10 @@ def dependence(adjusted: Adjusted, observations: Observations) -> float:
     scores = _block_scores(linear)
     if len(scores) < FEWEST:
         return 1.0
-    information = adjusted.information * adjusted.scale**2
-    if problem.sought is None:
-        gauge = unobserved(state, problem.free)
-        rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-        scores, information = scores @ rest, rest.T @ information @ rest
-    squares = np.einsum("bi,ib->b", scores, np.linalg.solve(information, scores.T)) / adjusted.scale**2
-    # Scores sum to zero at the optimum, which takes one block's worth.
-    return max(float(squares.sum()) / len(information) * len(scores) / (len(scores) - 1), 1.0)
+    # At the optimum scores sum to what the prior pulls, which takes one block's worth.
+    scores = scores - scores.mean(axis=0)
+    squares = float(np.einsum("bi,ij,bj->", scores, adjusted.inverse(), scores)) / adjusted.scale**2
+    return max(squares / adjusted.fixed_by_data() * len(scores) / (len(scores) - 1), 1.0)
 
 
 def _block_scores(linear: Linearisation) -> Array:

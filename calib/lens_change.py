@@ -46,9 +46,7 @@ class LensChange:
 
 
 def find_changes(names: Sequence[str], adjusted: Adjusted) -> dict[str, LensChange]:
-    """By camera; empty where the wave did not fix the lenses, which then are as they were given."""
-    if LENS[0] not in adjusted.problem.free:
-        return {}
+    """By camera."""
     covariance, changes = adjusted.covariance(LENS), {}
     for k, (name, lens) in enumerate(zip(names, adjusted.problem.lenses, strict=True)):
         off, cov = adjusted.state.lenses[k], covariance[k, :, k]
@@ -59,10 +57,8 @@ def find_changes(names: Sequence[str], adjusted: Adjusted) -> dict[str, LensChan
 
 def describe(changes: dict[str, LensChange]) -> list[str]:
     """What a person should know, line by line."""
-    if not changes:
-        return []
     clear = {name: change for name, change in changes.items() if change.sigmas > CLEAR}
-    lines = ["the wave fixes the lenses too: those of the rig that is written are adjusted (before -> now)"]
+    lines = ["the wave corrects lenses: the rig that is written has them (before -> now)"] if clear else []
     lines += [f"lens of {name}: {change.sentence()}" for name, change in clear.items()]
     if rest := [name for name in changes if name not in clear]:
         lines.append(

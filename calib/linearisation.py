@@ -22,8 +22,6 @@ RIGID_M = 2e-4  # by which a wand bends while it is waved
 SPEED_SIGMA = 3.0  # metres per second: a waving hand
 STEP_M = 0.5  # about what a place changes by in one step: holds what too few cameras see, and weighs nothing elsewhere
 FIXED = 1e-6  # to which a distance that carries the scale is kept
-# What is known of a camera before: of clocks, which may be slewed, and of lenses that were calibrated some time ago.
-PRIOR_SIGMA = np.array([np.inf] * 6 + [0.5, 5e-4, 0.02, 20.0, 20.0, 0.05])
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +139,10 @@ class Linearisation:
         known = np.column_stack([np.zeros((len(state.cameras), len(POSE))), state.clocks, state.lenses])[
             :, free
         ]
-        sigma = PRIOR_SIGMA[free]
-        terms: list[Term] = [((c,), (np.diag(1 / sigma),), -values / sigma) for c, values in enumerate(known)]
+        terms: list[Term] = [
+            ((c,), (np.diag(1 / sigma),), -values / sigma)
+            for c, (values, sigma) in enumerate(zip(known, self.problem.prior_sigma(), strict=True))
+        ]
         if self.problem.fixed_distance:
             a, b, distance = self.problem.fixed_distance
             gap = state.cameras[a, :3, 3] - state.cameras[b, :3, 3]

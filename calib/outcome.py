@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.lengths import measure_lengths
-from calib.problem import DRIFT, OFFSET, POSE, Observations
+from calib.lens_prior import written
+from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
 from calib.rig import Rig
 from calib.scale import Distance, compare, loosen
@@ -98,6 +99,7 @@ def clock_values(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tupl
 
 def _place(rig: Rig, solution: Solution, told: Told, joint: Array, offset_ms: Array) -> Rig:
     state, cameras = solution.adjusted.state, dict(rig.cameras)
+    lens_sigma = np.sqrt(np.einsum("cpcp->cp", solution.adjusted.covariance(LENS)))
     for name in told.unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
     for k, name in enumerate(told.names):
@@ -112,6 +114,7 @@ def _place(rig: Rig, solution: Solution, told: Told, joint: Array, offset_ms: Ar
             T_world_cam=Pose.from_matrix(state.cameras[k]),
             time_offset_ms=float(offset_ms[k]),
             covariance=tuple(tuple(row) for row in joint[k, :, k].tolist()),
+            lens_sigma=written(lens, cameras[name].lens_sigma, lens_sigma[k]),
         )
     T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
     return move(msgspec.structs.replace(rig, cameras=cameras), T_world)

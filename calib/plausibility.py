@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted
 from calib.errors import CalibrationError, CameraFault
 from calib.lengths import distances, free_markers
+from calib.lens_prior import usual_sigma
 from calib.linearisation import Linearisation
 from calib.problem import LENS, Observations
 from calib.sightings import Sightings, ranges
@@ -18,20 +19,20 @@ from camera_node.lens import Lens
 
 Array = NDArray[np.float64]
 
-FOCAL, CENTRE = 0.05, 0.04  # of the focal length and of the image: what no lens that was calibrated is off by
 AGREE = 0.5  # of a camera's sightings must fit the rig
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
 SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
 FEW = 8  # moments at which a distance is measured
 MOVES = 0.02  # of an image's longer side: a wand that stays within is not waved
+WRONG = 3.0  # usual standard deviations of a lens without figures: beyond, it is another lens
 SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
 
 
-def check_lenses(names: Sequence[str], lenses: Sequence[Lens], freed: Adjusted) -> None:
-    """Raise CameraFault where lenses that were adjusted are other cameras', or far from those that were given."""
-    found = [freed.state.lens(k, lens) for k, lens in enumerate(lenses)]
-    cov = freed.covariance(LENS)
-    for a, b in combinations(range(len(names)), 2):
+def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
+    """Raise CameraFault where lenses are other cameras', or far from those that were given."""
+    lenses, cov = adjusted.problem.lenses, adjusted.covariance(LENS)
+    found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
+    for a, b in combinations(adjusted.problem.cameras(), 2):
         crossed = _apart(found[a], lenses[b], cov[a, :, a]), _apart(found[b], lenses[a], cov[b, :, b])
         straight = _apart(found[a], lenses[a], cov[a, :, a]), _apart(found[b], lenses[b], cov[b, :, b])
         if max(crossed) < SAME < min(straight):
@@ -39,9 +40,8 @@ def check_lenses(names: Sequence[str], lenses: Sequence[Lens], freed: Adjusted) 
             raise CameraFault({names[a]: told.format(names[b]), names[b]: told.format(names[a])})
     reasons = {}
     for name, given, lens in zip(names, lenses, found, strict=True):
-        size = np.array([lens.width, lens.height])
-        shift = np.abs([lens.cx - given.cx, lens.cy - given.cy])
-        if abs(np.log(lens.fx / given.fx)) > FOCAL or (shift > CENTRE * size).any():
+        off = np.array([np.log(lens.fx / given.fx), lens.cx - given.cx, lens.cy - given.cy])
+        if (np.abs(off) > WRONG * usual_sigma(given)[:3]).any():
             reasons[name] = (
                 f"wrong intrinsics: what it saw fits f = {lens.fx:.0f} px and a centre at "
                 f"({lens.cx:.0f}, {lens.cy:.0f}), its file says {given.fx:.0f} px and "

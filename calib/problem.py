@@ -17,6 +17,7 @@ Index = NDArray[np.intp]
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+POSE_SIGMA, CLOCK_SIGMA = [np.inf] * 6, [0.5, 5e-4]  # before anything is seen; clocks may be slewed
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +104,11 @@ class Problem:
         gap_s: knots further apart say nothing of each other.
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: the stamp to which time offsets refer.
+        lens_sigma: (C, 4) standard deviations that hold log f, cx, cy and k1 to what was given.
         free: which of a camera's 12 parameters are sought.
         fixed_distance: two cameras and their distance, where no wand length carries the scale.
         sought: the cameras that are sought; the others stand where they stand. All, unless given.
+        lens_doubt: (C, 4) what covariances take these four to be off by, `lens_sigma` unless given.
     """
 
     lenses: list[Lens]
@@ -114,9 +117,23 @@ class Problem:
     gap_s: float
     density: float
     middle_s: float
+    lens_sigma: Array
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
     sought: tuple[int, ...] | None = None
+    lens_doubt: Array | None = None
+
+    def prior_sigma(self) -> Array:
+        """(C, d) what holds the free parameters before anything is seen; infinite for poses."""
+        return self._before(self.lens_sigma)
+
+    def doubt(self) -> Array:
+        """(C, d) what covariances take the free parameters to be off by before anything is seen."""
+        return self._before(self.lens_sigma if self.lens_doubt is None else self.lens_doubt)
+
+    def _before(self, lenses: Array) -> Array:
+        rest = np.tile(POSE_SIGMA + CLOCK_SIGMA, (len(self.lenses), 1))
+        return np.concatenate([rest, lenses], axis=1)[:, self.free]
 
     def cameras(self) -> tuple[int, ...]:
         """The cameras that are sought."""

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.dependence import widen
 from calib.errors import CalibrationError
+from calib.lens_prior import settle, written
 from calib.outcome import clock_values
 from calib.pairwise import Pairs
-from calib.plausibility import check_agreement
-from calib.problem import OFFSET, POSE, Observations
+from calib.plausibility import check_agreement, check_lenses
+from calib.problem import LENS, OFFSET, POSE, Observations
 from calib.rig import Rig
 from calib.solution import with_disc_centres
 from calib.wand import check_recording, gather_wave, read
@@ -53,7 +54,8 @@ class Recalibration:
 
 
 def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Recalibration:
-    """Place camera `name` of a rig by a wand that it and placed cameras saw; its lens and all others stay.
+    """Place camera `name` of a rig by a wand that it and placed cameras saw, and adjust its lens within what is known
+    of it; all others stay.
 
     Args:
         rig: intrinsics of `name`, and other cameras with poses and time offsets.
@@ -61,7 +63,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
         messages: detections of `name` and of others, any order.
 
     Raises:
-        CalibrationError: the camera or its intrinsics are missing, or no placed camera saw enough with it.
+        CalibrationError: the camera or its intrinsics are missing or another's, or no placed camera saw enough with it.
     """
     if name not in rig.cameras:
         raise CalibrationError(
@@ -84,7 +86,9 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     problem = replace(problem.freeing(POSE, OFFSET), sought=(this,))
     state = find_robustly(problem, observations, state)
     observations = with_disc_centres(wave, problem, state, observations)
-    adjusted = widen(adjust(problem, observations, state), observations)
+    first = widen(adjust(problem.freeing(POSE, OFFSET, LENS), observations, state), observations)
+    check_lenses(recording.names, first)
+    adjusted = widen(adjust(settle(first.problem, first), observations, first.state), observations)
     check_agreement(recording.names, adjusted, observations)
     return _conclude(rig, name, this, adjusted, observations)
 
@@ -117,11 +121,14 @@ def _conclude(rig: Rig, name: str, this: int, adjusted: Adjusted, seen: Observat
     before, T = rig.cameras[name], adjusted.state.cameras[this]
     cov = adjusted.covariance(POSE)[this, :, this]
     offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted, OFFSET, 1e3))
+    lens_sigma = np.sqrt(np.diag(adjusted.covariance(LENS)[this, :, this]))
+    lens = adjusted.state.lens(this, before)
     camera = msgspec.structs.replace(
-        before,
+        before.with_parameters(lens.parameters),
         T_world_cam=Pose.from_matrix(T),
         time_offset_ms=float(offset_ms),
         covariance=tuple(tuple(row) for row in cov.tolist()),
+        lens_sigma=written(lens, before.lens_sigma, lens_sigma),
     )
     used = adjusted.used & (seen.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T

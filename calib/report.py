@@ -133,7 +133,15 @@ def print_report(result: "Calibration", trust: "Trust", console: Console) -> Non
     foretold = trust.expected.lines() if trust.expected else []
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
     lenses = describe(find_changes(result.names, result.adjusted))
-    for line in [*_remarks(report), *_drifts(result), *lenses, *foretold, *wave, trust.sentence()]:
+    for line in [
+        *_remarks(report),
+        *_drifts(result),
+        *lenses,
+        *foretold,
+        *wave,
+        *trust.spoilt(),
+        trust.sentence(),
+    ]:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
@@ -145,11 +153,9 @@ def _drifts(result: "Calibration") -> list[str]:
 
 
 def lenses_as_dict(result: "Calibration") -> dict[str, Any]:
-    """What a wave changed of the lenses, for the `calibration` map of `rig.yaml`; empty where they are as given."""
+    """What a wave changed of the lenses, for the `calibration` map of `rig.yaml`."""
     changes = find_changes(result.names, result.adjusted)
-    return (
-        {"adjusted_lenses": {name: change.as_dict() for name, change in changes.items()}} if changes else {}
-    )
+    return {"adjusted_lenses": {name: change.as_dict() for name, change in changes.items()}}
 
 
 def clocks_as_dict(result: "Calibration") -> dict[str, Any]:

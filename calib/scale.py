@@ -95,9 +95,9 @@ def compare(distance: Distance, names: Sequence[str], adjusted: Adjusted) -> Com
 
 def loosen(adjusted: Adjusted, distance: Distance) -> Adjusted:
     """The adjustment with the distance that carried its scale taken as uncertain: S + s^2 g g' for its covariance S,
-    the cameras' change g with the world's scale, the choice of the world apart, and its relative deviation s; of the
-    information, a downdate of rank one (Sherman and Morrison)."""
-    relative = distance.sigma_m / distance.metres
+    the cameras' change g with the world's scale, the choice of the world apart, and its relative deviation s, at the
+    noise that observations claim; of the information, a downdate of rank one (Sherman and Morrison)."""
+    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.dependence**0.5)
     if relative == 0:
         return adjusted
     free = adjusted.problem.free

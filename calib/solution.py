@@ -10,6 +10,7 @@ from calib.adjustment import Adjusted, adjust, find_robustly
 from calib.dependence import widen
 from calib.discs import centre_offsets
 from calib.errors import CalibrationError
+from calib.lens_prior import settle
 from calib.linearisation import Linearisation
 from calib.plausibility import check_agreement, check_lenses, check_sizes, check_spacing
 from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
@@ -19,8 +20,6 @@ from calib.wave import Wave
 Array = NDArray[np.float64]
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
-# Of log f, cx, cy and k1: a recording that leaves more open fixes no lens.
-LENS_SIGMA = (0.005, 4.0, 4.0, 0.01)
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
 
 
@@ -56,45 +55,29 @@ def solve(
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
+    problem = problem.freeing(problem.free, LENS)
     centred = with_disc_centres(wave, problem, state, observations)
     few = adjust(problem, centred, state)
+    check_lenses(wave.names, few)
     judged = widen(few, centred)
-    free = [part for part in clocks if _tells(judged, part)]
-    few = _with_lenses(replace(few, problem=few.problem.freeing(POSE, *free)), wave, observations)
-    free += [LENS] if LENS[0] in few.problem.free else []
+    free = [LENS, *(part for part in clocks if _tells(judged, part))]
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
-    problem, start, observations = _around(wave, few.state.cameras, offset_s, MANY, known)
+    corrected = [few.state.lens(k, lens) for k, lens in enumerate(wave.lenses)]
+    problem, start, observations = _around(
+        wave.seen_through(corrected), few.state.cameras, offset_s, MANY, known
+    )
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     problem = replace(problem.freeing(POSE, *free), density=density)
     observations = with_disc_centres(wave, problem, start, observations)
-    adjusted = adjust(problem, observations, start)
+    first = replace(adjust(problem, observations, start, rounds=1), dependence=judged.dependence)
+    adjusted = adjust(settle(problem, first), observations, first.state)
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)
         check_spacing(wave.wand, adjusted, observations)
     return Solution(widen(adjusted, observations), observations)
-
-
-def _with_lenses(few: Adjusted, wave: Wave, observations: Observations) -> Adjusted:
-    """The adjustment with lenses sought too, where the recording fixes every one of them well, and they are not those
-    that were given; else as it is.
-
-    Raises:
-        CameraFault: a lens is another camera's, or far from what was given.
-    """
-    if any(lens.model != "pinhole" for lens in wave.lenses):
-        return few
-    problem = few.problem.freeing(few.problem.free, LENS)
-    freed = adjust(problem, with_disc_centres(wave, problem, few.state, observations), few.state)
-    cov, values = freed.covariance(LENS), freed.state.lenses.ravel()
-    sigma = np.sqrt(np.einsum("cpcp->cp", cov))
-    squared = values @ np.linalg.solve(cov.reshape(len(values), -1), values)
-    if (sigma > LENS_SIGMA).any() or squared < len(values) * np.log(2 * freed.used.sum()):
-        return few
-    check_lenses(wave.names, problem.lenses, freed)
-    return freed
 
 
 def _around(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calib.camera import Camera, transform
 from calib.coverage import Coverage, cell_centres, enumerate_words
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
+from calib.problem import LENS
 from calib.report import CameraReport
 from calib.triangulation import Joint, camera_jacobians
 from calib.wand import Calibration
@@ -55,12 +56,16 @@ class CameraTrust:
         coverage: the wand's used markers in cells of the image.
         useful: (rows, columns) cells in which another camera could see the wand too.
         figures: by criterion, of those in LIMITS that a camera has.
+        lens: the camera whose lens spoils `pose_px` most; empty where lenses make up less than half of its square.
+        noise_px: as `pose_px`, by the noise of what was seen alone: more of the same waving makes it smaller.
     """
 
     name: str
     coverage: Coverage
     useful: NDArray[np.bool_]
     figures: dict[str, float]
+    lens: str = ""
+    noise_px: float = 0.0
 
     @property
     def missing(self) -> NDArray[np.bool_]:
@@ -69,8 +74,8 @@ class CameraTrust:
 
     @property
     def strain(self) -> float:
-        """What the camera's covariance moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
-        return self.figures["pose_px"] / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
+        """What the wave's noise moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
+        return self.noise_px / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
 
     @property
     def grade(self) -> str:
@@ -81,6 +86,16 @@ class CameraTrust:
     def worst(self) -> str:
         """The criterion that gives the grade: the one farthest beyond its limits."""
         return max(self.figures, key=lambda name: _strain(name, self.figures[name]))
+
+    @property
+    def advice(self) -> str:
+        """What to do about the worst criterion."""
+        if self.worst == "pose_px" and self.lens:
+            return (
+                f"the lens of '{self.lens}' is known too roughly: wave longer, or run python -m calib intrinsics "
+                f"--camera {self.lens}"
+            )
+        return self.wave_next if self.worst == "unused" else ADVICE[self.worst]
 
     @property
     def wave_next(self) -> str:
@@ -123,9 +138,22 @@ class Trust:
             return f"grade {self.grade}: the wand's length is {self.length:.2%} off; {ADVICE['length']}"
         if self.grade == "A":
             return "grade A: every camera is placed well"
-        advice = worst.wave_next if worst.worst == "unused" else ADVICE[worst.worst]
         said = _describe(worst.worst, worst.figures[worst.worst])
-        return f"grade {self.grade}: camera '{worst.name}', {said}" + (f"; {advice}" if advice else "")
+        return f"grade {self.grade}: camera '{worst.name}', {said}" + (
+            f"; {worst.advice}" if worst.advice else ""
+        )
+
+    def spoilt(self) -> list[str]:
+        """Which lenses keep cameras from being placed better, line by line."""
+        blamed: dict[str, list[str]] = {}
+        for camera in self.cameras:
+            if camera.lens and grade("pose_px", camera.figures["pose_px"]) > "A":
+                blamed.setdefault(camera.lens, []).append(camera.name)
+        return [
+            f"warning: the lens of {lens} is known too roughly, and so is the place of {enumerate_words(names)}: wave "
+            f"longer, or run python -m calib intrinsics --camera {lens}"
+            for lens, names in blamed.items()
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """For the `calibration` map of `rig.yaml`."""
@@ -216,13 +244,19 @@ def _assess_camera(
     coverage = Coverage.of(uv, camera.width, camera.height, CELLS)
     distances = np.linalg.norm(wave - camera.matrix()[:3, 3], axis=1)
     useful = shared_cells(camera, list(others.values()), np.quantile(distances, DEPTHS))
+    distance, adjusted = float(np.median(distances)), result.adjusted
+    noise_px, known_px = (
+        pose_px(result, k, uv, distance, covariance)
+        for covariance in (adjusted.by_noise(), adjusted.joint_covariance())
+    )
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": pose_px(result, k, uv, float(np.median(distances))),
+        "pose_px": known_px,
         "unused": 1 - coverage.share(useful),
     }
-    return CameraTrust(row.name, coverage, useful, figures)
+    lens = lens_to_blame(result, k, uv, distance)
+    return CameraTrust(row.name, coverage, useful, figures, lens, noise_px)
 
 
 def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> NDArray[np.bool_]:
@@ -243,12 +277,40 @@ def joint_of(result: Calibration) -> Joint:
     return Joint(result.adjusted.problem.free, covariance.reshape(size, size))
 
 
-def pose_px(result: Calibration, k: int, uv: Array, distance: float) -> float:
-    """RMS, per coordinate, by which the covariance of camera k moves points at a distance in its image; pixels."""
+def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> float:
+    """RMS, per coordinate, by which a `covariance` (C, d, C, d) of camera k moves points at a distance in its image;
+    pixels."""
     if not len(uv):
         return float("nan")
-    camera, free = result.rig.cameras[result.names[k]], result.adjusted.problem.free
-    rays = camera.rays(uv)
-    J = camera_jacobians(camera, rays[np.isfinite(rays).all(axis=1)] * distance, free)
-    moved = J @ result.adjusted.joint_covariance()[k, :, k] @ np.swapaxes(J, 1, 2)
+    J = _image_jacobians(result, k, uv, distance)
+    moved = J @ covariance[k, :, k] @ np.swapaxes(J, 1, 2)
     return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))
+
+
+def lens_to_blame(result: Calibration, k: int, uv: Array, distance: float) -> str:
+    """The camera by whose lens, were it known, these points would be known best; empty where all lenses together would
+    not halve the variance."""
+    J, adjusted = _image_jacobians(result, k, uv, distance), result.adjusted
+    covariance, lens = adjusted.joint_covariance(), [adjusted.problem.free.index(p) for p in LENS]
+    of_lenses = covariance[:, lens][:, :, :, lens]
+    moved = np.einsum("nip,pcl->nicl", J, covariance[k][:, :, lens])
+    told = [_explained(moved[:, :, c], of_lenses[c, :, c]) for c in range(len(of_lenses))]
+    together = _explained(moved.reshape(*J.shape[:2], -1), of_lenses.reshape(4 * len(told), -1))
+    whole = float(np.einsum("nip,pq,niq->", J, covariance[k, :, k], J))
+    return result.names[int(np.argmax(told))] if together > whole / 2 else ""
+
+
+def _explained(moved: Array, covariance: Array) -> float:
+    """The variance, summed over pixels, that is gone once parameters are known with which it has covariances."""
+    unit = np.sqrt(np.diag(covariance))
+    scaled = moved / unit
+    return float(np.einsum("nip,pq,niq->", scaled, np.linalg.inv(covariance / np.outer(unit, unit)), scaled))
+
+
+def _image_jacobians(result: Calibration, k: int, uv: Array, distance: float) -> Array:
+    """(n, 2, d) how points at a distance, where camera k saw `uv`, move in its image with its parameters."""
+    camera = result.rig.cameras[result.names[k]]
+    rays = camera.rays(uv)
+    return camera_jacobians(
+        camera, rays[np.isfinite(rays).all(axis=1)] * distance, result.adjusted.problem.free
+    )

@@ -2,12 +2,13 @@
 """A labelled recording as a least squares problem: which moments, where the wand was at them, what was observed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.instants import choose_instants, group_instants
+from calib.lens_prior import usual_sigma
 from calib.problem import Observations, Problem, State
 from calib.sightings import Sightings
 from calib.start import triangulate
@@ -37,6 +38,19 @@ class Wave:
     period_s: float
     gap_s: float
     middle_s: float
+
+    def seen_through(self, lenses: Sequence[Lens]) -> "Wave":
+        """The same, its tracks as other lenses saw them; the lenses that were given stay."""
+        tracks = [
+            [
+                Track.of(
+                    track.t_s, new.normalise(old.project(np.column_stack([track.at, np.ones(len(track.at))])))
+                )
+                for track in mine
+            ]
+            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
+        ]
+        return replace(self, tracks=tracks)
 
     def pose_problem(
         self, cameras: Array, offset_s: Array, budget: int
@@ -69,7 +83,8 @@ class Wave:
         rows, knot = rows[good[knot]], renumbered[knot[good[knot]]]
         knot_s, basis = knot_s[good], basis[good]
         density = acceleration_density(knot_s, basis, self.gap_s)
-        problem = Problem(list(self.lenses), affine, knot_s, self.gap_s, density, self.middle_s)
+        lens_sigma = np.array([usual_sigma(lens) for lens in self.lenses])
+        problem = Problem(list(self.lenses), affine, knot_s, self.gap_s, density, self.middle_s, lens_sigma)
         motion = np.stack([basis, finite_velocities(knot_s, basis, self.gap_s)], axis=1)
         return problem, State.of(cameras, offset_s, motion), self._observe(rows, knot)
 

@@ -14,6 +14,7 @@ from calib.commands.choice import require_one
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.errors import CalibrationError
+from calib.problem import LENS, POSE
 from calib.report import print_report
 from calib.rig import Rig, load_rig
 from camera_node.body import Body
@@ -119,7 +120,17 @@ def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detect
 
 def placed(result: "Calibration") -> Placed:
     """The cameras of a calibration, for comparing."""
-    return Placed(result.names, result.adjusted.state.cameras, result.covariance)
+    adjusted = result.adjusted
+    free, count = list(adjusted.problem.free), len(result.names)
+    pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
+    noise = adjusted.by_noise()[:, pose][:, :, :, pose].reshape(6 * count, 6 * count)
+    by_prior = adjusted.by_prior().reshape(count, len(free), count, len(free))[:, pose][:, :, :, lens]
+    sigma = adjusted.problem.doubt()[:, lens]
+    lenses = {
+        name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
+        for k, name in enumerate(result.names)
+    }
+    return Placed(result.names, adjusted.state.cameras, noise, lenses)
 
 
 def _figures(agreement: Agreement | None) -> dict[str, Any] | None:

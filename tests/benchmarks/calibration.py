@@ -23,7 +23,7 @@ from calib.wand import Calibration, calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.observations import read_observations
-from tests.calib.synthetic import camera_errors, joint_error
+from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -46,10 +46,13 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, time.process_time() - start
 
 
-def simulated(wave: Wave, goal_s: float) -> tuple[list[Row], float]:
-    """Errors against the truth; offsets against their mean, as nothing observes what all clocks share."""
+def simulated(
+    wave: Wave, goal_s: float, lenses: Callable[[Recorded], Rig] = lambda recorded: recorded.intrinsics
+) -> tuple[list[Row], float]:
+    """Errors against the truth, given its lenses or others; offsets against their mean, as nothing observes what all
+    clocks share."""
     recorded = record(wave)
-    result, cost = timed(lambda: calibrate(recorded.intrinsics, wave.wand, recorded.messages))
+    result, cost = timed(lambda: calibrate(lenses(recorded), wave.wand, recorded.messages))
     placed = list(result.rig.placed())
     shift, turn = camera_errors(result.rig, recorded.truth)
     squared, degrees = joint_error(result, recorded.truth)
@@ -194,6 +197,11 @@ def _intersect(centres: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArr
 ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "simulated-8": lambda: simulated(Wave(cameras=8), 5),
     "simulated-16": lambda: simulated(Wave(cameras=16), 10),
+    "lenses-as-told": lambda: simulated(
+        Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, CAREFUL, told=True)
+    ),
+    "lenses-0.4-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, OLD)),
+    "lenses-2-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, SHEET)),
     "simulated-numbered": lambda: simulated(Wave(cameras=8, numbered=True, sized=False, seed=1), 5),
     "waved-led": waved_led,
     "webcams-wand": webcams_wand,

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
+# How far off lenses are, 1 sigma: part of the focal length, pixels of the centre, k1.
+EXACT, CAREFUL, OLD, SHEET = (0.0, 0.0, 0.0), (6e-4, 0.5, 5e-4), (4e-3, 2.0, 5e-3), (0.02, 10.0, 0.03)
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,20 @@ def _add_clutter(roundels: Roundels, count: int, rng: np.random.Generator) -> Ro
     major = rng.uniform(10, 40, count)
     false = _with_sizes(false, np.column_stack([major, 0.7 * major]), rng.uniform(-1.5, 1.5, count))
     return Roundels(*(np.concatenate([getattr(roundels, n), getattr(false, n)]) for n in Roundels.__slots__))
+
+
+def roughly(rig: Rig, off: tuple[float, float, float], told: bool = False, seed: int = 0) -> Rig:
+    """The rig with lenses that are off by so much (1 sigma: part of the focal length, pixels of the centre, k1), and
+    say so if `told`; otherwise they have no figures."""
+    rng, cameras, (focal, centre_px, k1) = np.random.default_rng(seed), {}, off
+    for name, camera in rig.cameras.items():
+        change = rng.standard_normal(4) * [focal, centre_px, centre_px, k1]
+        parameters = np.array(camera.parameters)
+        parameters[:2] *= np.exp(change[0])
+        parameters[2:5] += change[1:]
+        sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1) if told else None
+        cameras[name] = msgspec.structs.replace(camera.with_parameters(parameters), lens_sigma=sigma)
+    return Rig(cameras=cameras)
 
 
 def errors(found: Rig, truth: Rig) -> tuple[float, float]:

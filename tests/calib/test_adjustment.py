@@ -114,13 +114,13 @@ def test_a_jump_of_the_wand_costs_no_sighting():
 
 def test_clocks_and_lenses_are_adjusted_where_the_data_say_so(recorded: Recorded):
     """Offsets within four standard deviations and 0.3 ms; a focal length that is two percent off is found, to three
-    times its standard deviation of 0.2 %; true lenses stay as they are given."""
+    times its standard deviation of 0.2 %, whatever its figures say; true lenses stay within theirs."""
     result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
     truth = np.array([recorded.truth.cameras[n].time_offset_ms for n in result.names])
     error = result.time_offset_ms - truth
     error -= error.mean()
     assert (np.abs(error) < np.minimum(4 * result.time_sigma_ms, 0.3)).all()
-    assert not result.adjusted.state.lenses.any()
+    assert (np.abs(result.adjusted.state.lenses) < 4 * result.adjusted.problem.lens_sigma).all()
     wrong = scale_focal(recorded, "cam02", 1.02)
     result = calibrate(wrong, Wave().wand, recorded.messages)
     assert result.rig.cameras["cam02"].fx == pytest.approx(recorded.truth.cameras["cam02"].fx, rel=0.006)

@@ -13,7 +13,7 @@ from calib.errors import CalibrationError
 from calib.rig import Rig
 from calib.wand import calibrate
 from camera_node.pose import Pose, rotation_from_vector
-from tests.calib.synthetic import Arena, record, ring
+from tests.calib.synthetic import CAREFUL, Arena, record, ring, roughly
 
 Array = NDArray[np.float64]
 
@@ -72,14 +72,15 @@ def test_a_camera_that_moved_is_named():
 
 
 def test_halves_of_a_wave_agree_and_a_knock_between_them_is_found():
-    """The solver's own covariances: 10 s of a wave in halves; then one camera is knocked by 10 mm after 5 s."""
+    """The solver's own covariances: 10 s of a wave in halves; then one camera is knocked by 10 mm after 5 s. Lenses
+    have figures: three cameras see in 5 s too little to tell them from such a knock."""
     arena = ring(3)
-    messages = record(arena, 10.0, sigma_px=0.1)
-    first, second = (placed(calibrate(arena.intrinsics, arena.wand, half)) for half in split(messages))
+    messages, lenses = record(arena, 10.0, sigma_px=0.1), roughly(arena.intrinsics, CAREFUL, told=True)
+    first, second = (placed(calibrate(lenses, arena.wand, half)) for half in split(messages))
     assert compare(first, second).holds
     knocked = _knock(arena, "cam1", 0.01)
     late = [m for m in record(knocked, 10.0, sigma_px=0.1, seed=1) if m.t_ns > 5e9]
-    told = compare(first, placed(calibrate(arena.intrinsics, arena.wand, late)))
+    told = compare(first, placed(calibrate(lenses, arena.wand, late)))
     assert not told.holds
     assert told.guilty == "cam1"
 

