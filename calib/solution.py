@@ -56,6 +56,8 @@ def solve(
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
+    # Of rough places, noise looks like acceleration: a weak prior takes it up, and what is left seems too precise.
+    problem = replace(problem, density=acceleration_density(problem.knot_s, state.motion[:, 0], wave.gap_s))
     centred = with_disc_centres(wave, problem, state, observations)
     few = adjust(problem, centred, state)
     judged = widen(few, centred)
