@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.ends import label_ends
 from calib.errors import CalibrationError
 from calib.sightings import Frames, Sightings, ranges
 from calib.tracks import follow
@@ -76,15 +77,18 @@ def label(
     numbered = seen.label >= 0
     labels = np.full(len(seen), -1, np.intp)
     counts = np.bincount(seen.frame, minlength=len(frames.t_s))
-    reason = np.where(
-        counts < min(3, len(wand.markers)), "too few roundels in the frame", "no wand among the roundels"
-    )
+    few = counts < min(3, len(wand.markers))
+    reason = np.where(few, "too few roundels in the frame", "no wand among the roundels").astype(object)
     if numbered.any():
         reason[counts > 0] = "no marker of the wand in the frame"
         labels = _by_number(seen, len(wand.markers))
     elif len(wand.markers) == 1:
         reason[counts > 1] = "ambiguous"
         labels[counts[seen.frame] == 1] = 0
+    elif len(wand.markers) == 2:
+        reason[counts == 2] = "which end is which can't be told"
+        reason[counts > 2] = "ambiguous"
+        labels = follow(frames, seen, label_ends(frames, seen, wand, lenses), 2)
     else:
         require_distinct(wand)
         reason[counts > MAX_ROUNDELS] = f"more than {MAX_ROUNDELS} roundels in the frame"

@@ -26,6 +26,21 @@ class Distance:
     metres: float
     sigma_m: float = SIGMA_M
 
+    @classmethod
+    def of(
+        cls, told: tuple[str, str, float] | None, sigma_m: float, names: Sequence[str]
+    ) -> "Distance | None":
+        """What the options of a command say, where they say something.
+
+        Raises:
+            CalibrationError: see `check`.
+        """
+        if told is None:
+            return None
+        distance = cls(*told, sigma_m)
+        distance.check(names)
+        return distance
+
     def check(self, names: Sequence[str]) -> None:
         """Raise CalibrationError where it is no distance of two of the rig's cameras."""
         if unknown := [name for name in (self.a, self.b) if name not in names]:

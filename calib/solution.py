@@ -55,7 +55,9 @@ def solve(
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
     problem = problem.freeing(POSE, *clocks)
     state = find_robustly(problem, observations, state)
-    problem = problem.freeing(problem.free, LENS)
+    # Of rough places, noise looks like acceleration: a weak prior takes it up, and what is left seems too precise.
+    density = acceleration_density(problem.knot_s, state.motion[:, 0], wave.gap_s)
+    problem = replace(problem.freeing(problem.free, LENS), density=density)
     centred = with_disc_centres(wave, problem, state, observations)
     few = adjust(problem, centred, state)
     check_lenses(wave.names, few)

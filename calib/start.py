@@ -103,7 +103,7 @@ def explain_unplaced(
         elif refused and (share := max(refused.values())) > 0:
             reasons[names[k]] = (
                 f"what it saw fits no other camera (at best {share:.0%} of the sightings it shares); "
-                "is it named right, and are its intrinsics its own?"
+                "is it named right, is its clock right, and are its intrinsics its own?"
             )
         else:
             reasons[names[k]] = (

@@ -23,6 +23,7 @@ import zenoh
 from calib.errors import CalibrationError
 from calib.live import Heard, listen
 from calib.rig import Rig
+from calib.scale import Distance
 from camera_node.body import Body
 from camera_node.messages import Detections
 
@@ -99,6 +100,7 @@ def wave(
     by_itself: bool = True,
     trials: bool = True,
     every_s: float = TRIAL_EVERY_S,
+    distance: Distance | None = None,
 ) -> tuple[Heard, str]:
     """Collect the detections of all cameras of an arena while a wand is waved.
 
@@ -112,6 +114,7 @@ def wave(
         by_itself: whether it ends when a trial solution says that it is enough.
         trials: whether trial solutions are made.
         every_s: how long to wait from one to the next.
+        distance: of two cameras, that trial solutions are scaled by where the wand has one marker.
 
     Returns:
         what was heard, and why it ended.
@@ -120,7 +123,7 @@ def wave(
         CalibrationError: nothing came.
     """
     rule = Rule()
-    with _Trials(rig, wand, trials, every_s) as solver:
+    with _Trials(rig, wand, distance, trials, every_s) as solver:
 
         def look(heard: Heard, passed: float) -> str:
             if ended is not None and ended.is_set():
@@ -184,8 +187,8 @@ def _stand_back() -> None:
 class _Trials:
     """Trial solutions, one at a time, in a process of their own."""
 
-    def __init__(self, rig: Rig, wand: Body, wanted: bool, every_s: float) -> None:
-        self._rig, self._wand, self._every_s = rig, wand, every_s
+    def __init__(self, rig: Rig, wand: Body, distance: Distance | None, wanted: bool, every_s: float) -> None:
+        self._told, self._every_s = (rig, wand, distance), every_s
         self._pool = get_context("spawn").Pool(1, _stand_back) if wanted else None
         self._running: AsyncResult[Trial] | None = None
         self._latest: Trial | None = None
@@ -207,7 +210,7 @@ class _Trials:
         if self._pool is not None and self._running is None and now >= self._due and messages:
             part = thin(messages)
             share = len(part) / len(messages)
-            self._running = self._pool.apply_async(try_part, (self._rig, self._wand, part, share))
+            self._running = self._pool.apply_async(try_part, (*self._told, part, share))
         return self._latest
 
 
@@ -219,13 +222,15 @@ def thin(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Det
     return [m for m in messages if int((m.t_ns - start) * 1e-9 / BLOCK_S) % stride == 0]
 
 
-def try_part(rig: Rig, wand: Body, part: Sequence[Detections], share: float) -> Trial:
+def try_part(
+    rig: Rig, wand: Body, distance: Distance | None, part: Sequence[Detections], share: float
+) -> Trial:
     """Solve a part, `share` of all frames, and say what all of them would give."""
     from calib.trust import assess
     from calib.wand import calibrate
 
     try:
-        result = calibrate(rig, wand, part)
+        result = calibrate(rig, wand, part, distance)
     except CalibrationError as error:
         return Trial(fault=str(error))
     except Exception as error:  # a wave that somebody took trouble over is not lost by a trial

@@ -2,7 +2,7 @@
 """`calib check`: whether a rig can be trusted, by a recording of a waved wand."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from calib.errors import CalibrationError
 from calib.problem import LENS, POSE
 from calib.report import print_report
 from calib.rig import Rig, load_rig
+from calib.scale import SIGMA_M, Distance
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.messages import Detections
@@ -40,6 +41,10 @@ class Check:
     """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
     recording: Path | None = None
     """Or take what calib wand --live kept, or python -m fusion record wrote (MCAP)."""
+    distance: tuple[str, str, float] | None = None
+    """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
+    distance_sigma: float = SIGMA_M
+    """Standard deviation of that distance, metres."""
     height: float = 0.1
     """Metres above the floor at which robots carry their roundels."""
     maps: Path | None = None
@@ -56,23 +61,29 @@ class Check:
         if self.out is not None:
             check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        distance = Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
         messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
-        said = self._judge(rig, wand, messages, console)
+        said = self._judge(rig, wand, messages, distance, console)
         if self.out is not None:
             told = {**rig.calibration, "check": {**provenance(), **said}}
             write_rig(msgspec.structs.replace(rig, calibration=told), self.out, console)
 
     def _judge(
-        self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console
+        self,
+        rig: Rig,
+        wand: Body,
+        messages: Sequence[Detections],
+        distance: Distance | None,
+        console: Console,
     ) -> dict[str, Any]:
         from calib.trust import assess
         from calib.wand import calibrate
 
         with console.status("placing cameras"):
-            result = calibrate(rig, wand, messages)
+            result = calibrate(rig, wand, messages, distance)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
-        halves = _compare_halves(result.rig, wand, messages, console)
+        halves = _compare_halves(result.rig, wand, messages, distance, console)
         stands = _compare_with_rig(rig, result, console)
         if self.maps is not None:
             save_maps(self.maps, result, trust, console)
@@ -80,15 +91,16 @@ class Check:
 
 
 def _compare_halves(
-    rig: Rig, wand: Body, messages: Sequence[Detections], console: Console
+    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None, console: Console
 ) -> Agreement | None:
     """Both halves start from the lenses that the whole recording gave: where these were refined, a half that refines
-    them less would turn its cameras instead."""
+    them less would turn its cameras instead. What is not known of a measured distance is the same in both."""
     from calib.wand import calibrate
 
+    same = distance and replace(distance, sigma_m=0.0)
     try:
         with console.status("placing cameras by each half"):
-            first, second = (calibrate(rig, wand, half) for half in split(messages))
+            first, second = (calibrate(rig, wand, half, same) for half in split(messages))
             agreement = compare(placed(first), placed(second))
     except CalibrationError as error:
         say(console, f"warning: the halves of the recording can't be compared: {error}")

@@ -69,31 +69,35 @@ class Wand:
         if self.seconds is not None and not self.seconds > 0:
             raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
-        if (distance := self._distance()) is not None:
-            distance.check(list(rig.cameras))
+        distance = self._distance(rig)
         if self.live:
-            self._run_live(rig, wand, console)
+            self._run_live(rig, wand, distance, console)
         else:
             messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
-            self._place(rig, wand, messages, console)
+            self._place(rig, wand, messages, distance, console)
 
-    def _distance(self) -> Distance | None:
-        if self.distance is None:
-            return None
-        if self.only is not None:
+    def _distance(self, rig: Rig) -> Distance | None:
+        if self.distance is not None and self.only is not None:
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"
             )
-        return Distance(*self.distance, self.distance_sigma)
+        return Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
 
-    def _place(self, rig: Rig, wand: Body, messages: Sequence[Detections], console: Console) -> Rig:
+    def _place(
+        self,
+        rig: Rig,
+        wand: Body,
+        messages: Sequence[Detections],
+        distance: Distance | None,
+        console: Console,
+    ) -> Rig:
         from calib.trust import assess
         from calib.wand import calibrate
 
         if self.only is not None:
             return self._place_one(rig, wand, messages, self.only, console)
         with console.status("placing cameras"):
-            result = calibrate(rig, wand, messages, self._distance())
+            result = calibrate(rig, wand, messages, distance)
         trust = assess(result, wand, self.height)
         print_report(result, trust, console)
         if self.maps is not None:
@@ -123,15 +127,15 @@ class Wand:
         write_rig(placed, self.out, console)
         return placed
 
-    def _run_live(self, rig: Rig, wand: Body, console: Console) -> None:
+    def _run_live(self, rig: Rig, wand: Body, distance: Distance | None, console: Console) -> None:
         with self.server.open() as session:
-            heard, why = self._wave(session, rig, wand, console)
+            heard, why = self._wave(session, rig, wand, distance, console)
         say(console, f"the wave ended: {why}")
         if heard.bad:
             say(console, f"warning: {heard.bad} messages were none and were skipped")
         kept = self._keep(heard.messages, console)
         try:
-            placed = self._place(rig, wand, heard.messages, console)
+            placed = self._place(rig, wand, heard.messages, distance, console)
         except BaseException:
             if kept is not None:
                 say(console, f"the wave is kept; to try it again: {self._again(kept)}")
@@ -160,7 +164,9 @@ class Wand:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
         return shlex.join(["python", "-m", "calib", "wand", *map(str, words)])
 
-    def _wave(self, session: Session, rig: Rig, wand: Body, console: Console) -> tuple[Heard, str]:
+    def _wave(
+        self, session: Session, rig: Rig, wand: Body, distance: Distance | None, console: Console
+    ) -> tuple[Heard, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
         trials = self.seconds is None or console.is_terminal
         with Live(console=console, transient=True) as live:
@@ -173,6 +179,7 @@ class Wand:
                 lambda told: live.update(show_progress(told)),
                 by_itself=trials and self.seconds is None,
                 trials=trials,
+                distance=distance,
             )
 
 

@@ -12,6 +12,7 @@ from calib.errors import CalibrationError
 from calib.rig import load_rig, save_rig
 from calib.scale import Distance, compare
 from calib.wand import calibrate
+from calib.waving import try_part
 from camera_node.body import Body
 from camera_node.errors import ConfigError
 from camera_node.observations import write_observations
@@ -96,3 +97,24 @@ def test_faults_are_named(tmp_path: Path):
     execute([*options, "--distance", "cam0", "cam1", "2"])
     places = [camera.matrix()[:3, 3] for camera in load_rig(tmp_path / "out.yaml").placed().values()]
     assert np.linalg.norm(places[0] - places[1]) == pytest.approx(2, abs=1e-6)
+
+
+def test_a_check_and_the_trials_of_a_live_wave_know_the_distance(tmp_path: Path):
+    """By a light and a distance both foretell millimetres; without it there are none."""
+    arena = ring(3, wand=LIGHT)
+    messages, true = record(arena, 20.0, sigma_px=0.1, sized=False), apart(arena, "cam0", "cam1")
+    told = Distance("cam0", "cam1", true)
+    given, missing = (try_part(arena.intrinsics, LIGHT, d, messages, 1.0) for d in (told, None))
+    assert given.expected_mm is not None
+    assert missing.expected_mm is None
+    save_rig(arena.intrinsics, tmp_path / "rig.yaml")
+    (tmp_path / "wand.yaml").write_text("diameter_m: 0.1\n")
+    write_observations(tmp_path / "light.csv", messages)
+    files = {"rig": "rig.yaml", "wand": "wand.yaml", "observations": "light.csv", "out": "out.yaml"}
+    options = [word for name, file in files.items() for word in (f"--{name}", str(tmp_path / file))]
+    execute(["check", *options, "--distance", "cam0", "cam1", str(true)])
+    said = load_rig(tmp_path / "out.yaml").calibration["check"]
+    assert said["halves"]["agree"]
+    assert said["expected_mm"]["median"] > 0
+    with pytest.raises(CalibrationError, match="names camera 'north'"):
+        execute(["check", *options, "--distance", "cam0", "north", "2"])

@@ -86,10 +86,10 @@ def test_a_camera_that_shares_too_little_is_named_with_the_reason():
 
 @pytest.mark.parametrize("markers", [1, 2, 4])
 def test_wands_of_other_numbers_of_markers(markers: int):
-    """One roundel of known size gives the scale by its size, to about a percent; two need numbers; four are a plane."""
+    """One roundel of known size gives the scale by its size, to about a percent; four are a plane."""
     points = ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.25, 0.0), (0.33, 0.13, 0.0))[:markers]
     arena = ring(wand=Body(diameter_m=0.1, markers=points))
-    result = run(arena, record(arena, 15.0, sigma_px=0.02, numbered=markers == 2))
+    result = run(arena, record(arena, 15.0, sigma_px=0.02))
     assert len(result.rig.placed()) == 4
     limit = 0.05 if markers == 1 else 1e-3
     assert errors(result.rig, arena.truth) < (limit, limit)
