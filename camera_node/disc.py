@@ -154,8 +154,8 @@ def _adjust(
     centre = lens.normalise(ellipses[:, :2] + offset)
     seen = np.concatenate([shape_of(np.linalg.inv(Q)), centre], axis=1)
     cov = covariance_through(lens, ellipses, covariance)
-    of_both = (np.repeat(column, 2, axis=0) for column in (seen, cov))
-    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, *of_both)
+    seen, cov = np.repeat(seen, 2, axis=0), np.repeat(cov, 2, axis=0)  # of both poses
+    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, seen, cov)
     return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
 
 

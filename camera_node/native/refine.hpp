@@ -49,7 +49,8 @@ struct Fit {
 /// (Le Cam's one-step estimator). Large roundels are sampled: no more than 6144 pixels are used.
 ///
 /// Known prints tell the ratio to 0.002: that of the one nearest to what the fit says without them, unless it
-/// is three standard deviations away and so another print. Small roundels owe it most of what they know of their size.
+/// is three standard deviations away and so another print. Small roundels owe it most of what they know of
+/// their size.
 ///
 /// The covariance is that of the M-estimate, its noise from the residuals, at least one grey level. Nothing
 /// comes back where the fit leaves the start's neighbourhood or its equations are singular.

@@ -48,8 +48,8 @@ def test_what_is_left_is_chi_square():
     cov, n = measured_covariance(40), 400
     noise = np.random.default_rng(3).standard_normal((n, 7)) @ np.linalg.cholesky(cov[0]).T
     seen = shown(position, normal) + noise
-    parts = (np.repeat(column[None], n, axis=0) for column in (position, normal))
-    chi2 = adjust(*parts, RADIUS, seen, np.repeat(cov, n, axis=0))[2]
+    positions, normals = np.tile(position, (n, 1)), np.tile(normal, (n, 1))
+    chi2 = adjust(positions, normals, RADIUS, seen, np.repeat(cov, n, axis=0))[2]
     assert chi2.mean() == pytest.approx(2, abs=0.4)
 
 

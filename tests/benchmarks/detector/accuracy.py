@@ -83,7 +83,8 @@ def _errors(run: Run, image: np.ndarray, sight: Sight, limit: Bound, noise: floa
     if poses is None:
         return None
     distance = poses[0].position_m[2] / sight.distance_m - 1
-    located = sum(pose.probability * (_ellipse_centre(sight, pose) - true) for pose in poses)
+    likelier, other = (pose.probability * (_ellipse_centre(sight, pose) - true) for pose in poses)
+    located = likelier + other
     known, blind = (limit.centre_variance(noise, knows_lens) for knows_lens in (True, False))
     squared = located @ located / 2, known, error @ error / 2, blind
     return np.array([*squared, chi2, distance, limit.distance_variance(noise)])
