@@ -15,10 +15,11 @@ class Detector:
         by_paper: bool,
     ) -> None: ...
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One row of 16 a roundel.
+        """One row of 38 a roundel.
 
-        u, v, cov_uu, cov_uv, cov_vv, major, minor, angle, ratio, contrast; then the disc's own centre:
-        offset_u, offset_v from the ellipse's, and their covariance uu, uv, vv; and the track's number.
+        u, v, major, minor, angle, ratio, contrast; offset_u, offset_v from the ellipse's centre to the disc's own;
+        the track's number; then the upper triangle, row by row, of the covariance (7, 7) of what the pose follows
+        from: u, v, the shape xx, xy, yy (the ellipse is centre + A q, |q| = 1), offset_u and offset_v.
         """
 
     def take_over(self, other: Detector) -> None: ...

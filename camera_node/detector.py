@@ -75,7 +75,7 @@ class Detector:
             detector == "paper",
         )
         self._name: Literal["chords", "paper"] = detector
-        self._offsets = np.empty((0, 5))
+        self._offsets, self._covariance = np.empty((0, 2)), np.empty((0, 7, 7))
         self.settings: dict[str, Any] = {
             "inner_ratios": tuple(inner_ratios),
             "ratio_tolerance": ratio_tolerance,
@@ -115,9 +115,10 @@ class Detector:
         Measured by the inner ellipse's place in the outer one.
 
         Returns:
-            (N, 2) offsets, pixels, and (N, 2, 2) their covariance.
+            (N, 2) offsets, pixels, and (N, 7, 7) the covariance of all that tells a pose: of `uv`, of the ellipse's
+            shape xx, xy, yy (it is `uv` + A q, |q| = 1, A symmetric), and of the offset; pixels.
         """
-        return self._offsets[:, :2], self._offsets[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        return self._offsets, self._covariance
 
     def detect(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Roundels:
         """All roundels of a grey image (h, w), uint8, or uint16 of 10 to 16 bits, which are narrowed to 8.
@@ -132,12 +133,17 @@ class Detector:
         pixels = grey(image)
         table = self._core.detect(pixels)
         table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
-        self._offsets = table[:, 10:15]
-        uv, axes = table[:, :2], table[:, 5:7]
-        cov = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        self._offsets, self._covariance = table[:, 7:9], _symmetric(table[:, 10:])
         none = np.full(len(table), -1, np.int32)
         return Roundels(
-            uv, cov, axes, table[:, 7], table[:, 8], table[:, 9], none, table[:, 15].astype(np.int32)
+            table[:, :2],
+            self._covariance[:, :2, :2],
+            table[:, 2:4],
+            table[:, 4],
+            table[:, 5],
+            table[:, 6],
+            none,
+            table[:, 9].astype(np.int32),
         )
 
     def _is_masked(self, uv: Array) -> bool:
@@ -150,3 +156,11 @@ def _check_polygon(polygon: ArrayLike) -> NDArray[np.float32]:
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
     return corners
+
+
+def _symmetric(upper: Array) -> Array:
+    """Matrices (N, 7, 7) from their upper triangles (N, 28)."""
+    full = np.empty((len(upper), 7, 7))
+    i, j = np.triu_indices(7)
+    full[:, i, j] = full[:, j, i] = upper
+    return full

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
+from camera_node.disc_adjustment import adjust, covariance_through, shape_of
 from camera_node.lens import Lens
 from camera_node.roundels import Roundel, Roundels
 
@@ -87,9 +88,10 @@ def locate_all(
     ellipse then costs nothing to first order. The conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et al.
     1992).
 
-    The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: the probability is that
-    of chi-square with two degrees of the measured `offsets` from the ellipses' centres (N, 2) and their covariances
-    (N, 2, 2), as `Detector.disc_offsets` gives them, widened by `SCATTER`. Without them all are 0.5.
+    The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: `offsets` are those from
+    the ellipses' centres (N, 2) and the covariance (N, 7, 7) of all that was measured, as `Detector.disc_offsets` gives
+    them. Both poses are then adjusted to ellipse and offset, and the probability is that of the chi-square with two
+    degrees that is left, widened by `SCATTER`. Without them all are 0.5.
     """
     ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
     return _locate(ellipses, lens, diameter_m, offsets)
@@ -125,13 +127,36 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array
     xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
     seen = np.isfinite(xy).all(axis=(1, 2))
     position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
+    odds = np.full((n, 2), 0.5)
     if seen.any():
-        position[seen], normal[seen] = _decompose(_fit_conics(xy[seen]), diameter_m / 2)
+        Q, radius = _fit_conics(xy[seen]), diameter_m / 2
+        position[seen], normal[seen] = _decompose(Q, radius)
+        if offsets is not None:
+            parts = position[seen], normal[seen], ellipses[seen], offsets[0][seen], offsets[1][seen]
+            position[seen], normal[seen], odds[seen] = _adjust(Q, radius, lens, *parts)
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
-    odds = np.full((n, 2), 0.5) if offsets is None else _odds(uv - ellipses[:, None, :2], *offsets)
     order = np.argsort(-odds, axis=1, kind="stable")
     pick = np.arange(n)[:, None], order
     return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick])
+
+
+def _adjust(
+    Q: Array,
+    radius: float,
+    lens: Lens,
+    position: Array,
+    normal: Array,
+    ellipses: Array,
+    offset: Array,
+    covariance: Array,
+) -> tuple[Array, Array, Array]:
+    """Positions and normals (N, 2, 3) adjusted to ellipse and offset at once, and their odds (N, 2)."""
+    centre = lens.normalise(ellipses[:, :2] + offset)
+    seen = np.concatenate([shape_of(np.linalg.inv(Q)), centre], axis=1)
+    cov = covariance_through(lens, ellipses, covariance)
+    seen, cov = np.repeat(seen, 2, axis=0), np.repeat(cov, 2, axis=0)  # of both poses
+    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, seen, cov)
+    return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
 
 
 def _boundaries(ellipses: Array) -> Array:
@@ -187,12 +212,10 @@ def _at_right_angles(n: Array, towards: Array) -> Array:
     return t / np.linalg.norm(t, axis=-1, keepdims=True)
 
 
-def _odds(predicted: Array, offset: Array, cov: Array) -> Array:
-    """Probabilities (N, 2) of predicted offsets (N, 2, 2) by their chi-square; 0.5 where nothing was predicted."""
-    error = predicted - offset[:, None]
-    chi2 = np.einsum("nki,nij,nkj->nk", error, np.linalg.inv(cov), error)
+def _odds(chi2: Array) -> Array:
+    """Probabilities (N, 2) of two poses by their chi-square."""
     weight = np.exp(-(chi2 - chi2.min(axis=1, keepdims=True)) / 2 / SCATTER)
-    return np.nan_to_num(weight / weight.sum(axis=1, keepdims=True), nan=0.5)
+    return weight / weight.sum(axis=1, keepdims=True)
 
 
 def _look_along(ray: Array) -> Array:

@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "detector.hpp"
+#include "table.hpp"
 
 namespace nb = nanobind;
 using Grey = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
@@ -16,20 +17,14 @@ static roundel::ImageView view(const Grey& image) {
     return {image.data(), int(image.shape(1)), int(image.shape(0)), ptrdiff_t(image.stride(0))};
 }
 
-/// One row a roundel, in the order that `_core.pyi` states.
+/// One row a roundel.
 static Table table(const std::vector<roundel::Roundel>& roundels) {
-    constexpr size_t kColumns = 16;
-    auto* rows = new double[roundels.size() * kColumns + 1];
+    auto* rows = new double[roundels.size() * roundel::kColumns + 1];
     const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
     double* to = rows;
-    for (const auto& [f, track] : roundels) {
-        const roundel::Symmetric centre = f.centre_covariance(), offset = f.offset_covariance();
-        for (const double value : {f.outer.x, f.outer.y, centre.xx, centre.xy, centre.yy, f.outer.major,
-                                   f.outer.minor, f.outer.angle, f.ratio, f.bright - f.dark, f.offset_x,
-                                   f.offset_y, offset.xx, offset.xy, offset.yy, double(track)})
-            *to++ = value;
-    }
-    return Table(rows, {roundels.size(), kColumns}, owner);
+    for (const auto& roundel : roundels)
+        for (const double value : row_of(roundel)) *to++ = value;
+    return Table(rows, {roundels.size(), roundel::kColumns}, owner);
 }
 
 NB_MODULE(_core, m) {

@@ -103,7 +103,7 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
         const Hidden hidden = find_hidden(image, fit.p, noise, slack * (fit.bright - fit.dark));
         if (is_hidden_too_much(hidden)) return std::nullopt;
         if (hidden == start.hidden) continue;
-        start = {fit.outer, fit.ratio, fit.dark, fit.bright, start.print, hidden};
+        start = {fit.outer, fit.ratio, fit.dark, fit.bright, start.prints, hidden};
         const auto rest = refine(image, start);
         if (!rest) return std::nullopt;
         fit = *rest;

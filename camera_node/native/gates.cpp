@@ -55,7 +55,7 @@ bool has_limits(const Fit& fit, const Settings& settings) {
 
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
                                bool known) {
-    start.print = settings.nearest_ratio(start.ratio);
+    start.prints = settings.inner_ratios;
     const auto fit = refine(image, start);
     if (!fit) return std::nullopt;
     const bool whole = is_whole(image, *fit, settings, noise, kMisfit);

@@ -8,6 +8,7 @@
 #include "edge_pixels.hpp"
 #include "normal_equations.hpp"
 #include "pose_outputs.hpp"
+#include "settings.hpp"
 #include "starting_point.hpp"
 
 namespace roundel {
@@ -192,7 +193,7 @@ Fit Fitter::fit() const {
 std::optional<Fit> refine(const ImageView& image, const Start& start) {
     Fitter fitter(image, start);
     if (!fitter.solve()) return std::nullopt;
-    if (start.print > 0) fitter.learn_print(start.print);
+    if (!start.prints.empty()) fitter.learn_print(nearest_ratio(start.prints, fitter.p[kRatio]));
     return fitter.fit();
 }
 

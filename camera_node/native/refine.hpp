@@ -2,6 +2,7 @@
 #pragma once
 #include <array>
 #include <optional>
+#include <span>
 
 #include "ellipse.hpp"
 #include "image.hpp"
@@ -13,8 +14,8 @@ namespace roundel {
 struct Start {
     Ellipse outer;
     double ratio, dark, bright;
-    double print = 0;  // ratio that the print in use was made with; 0 where it is not known
-    Hidden hidden{};   // what is covered, and left out of the fit
+    std::span<const double> prints{};  // ratios that the prints in use were made with, where they are known
+    Hidden hidden{};                   // what is covered, and left out of the fit
 };
 
 /// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
@@ -47,8 +48,9 @@ struct Fit {
 /// A few steps on a part of the pixels come near enough for the last one, on all of them, to be efficient
 /// (Le Cam's one-step estimator). Large roundels are sampled: no more than 6144 pixels are used.
 ///
-/// A known print tells the ratio to 0.002, unless the fit without it says another by three standard
-/// deviations: then it is another print. Small roundels owe it most of what they know of their size.
+/// Known prints tell the ratio to 0.002: that of the one nearest to what the fit says without them, unless it
+/// is three standard deviations away and so another print. Small roundels owe it most of what they know of
+/// their size.
 ///
 /// The covariance is that of the M-estimate, its noise from the residuals, at least one grey level. Nothing
 /// comes back where the fit leaves the start's neighbourhood or its equations are singular.

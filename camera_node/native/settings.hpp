@@ -3,10 +3,18 @@
 
 #include <algorithm>
 #include <cmath>
+#include <span>
 #include <utility>
 #include <vector>
 
 namespace roundel {
+
+/// The ratio of the print that a measured ratio is nearest to; there is one at least.
+inline double nearest_ratio(std::span<const double> prints, double measured) {
+    return *std::min_element(prints.begin(), prints.end(), [&](double a, double b) {
+        return std::abs(a - measured) < std::abs(b - measured);
+    });
+}
 
 /// What counts as a roundel.
 struct Settings {
@@ -22,13 +30,9 @@ struct Settings {
         const auto [low, high] = std::minmax_element(inner_ratios.begin(), inner_ratios.end());
         return {*low, *high};
     }
-    /// The ratio of the print in use that a measured ratio is nearest to.
-    double nearest_ratio(double measured) const {
-        return *std::min_element(inner_ratios.begin(), inner_ratios.end(), [&](double a, double b) {
-            return std::abs(a - measured) < std::abs(b - measured);
-        });
+    double ratio_error(double measured) const {
+        return std::abs(nearest_ratio(inner_ratios, measured) - measured);
     }
-    double ratio_error(double measured) const { return std::abs(nearest_ratio(measured) - measured); }
 };
 
 }  // namespace roundel

@@ -85,6 +85,14 @@ def test_a_known_print_tells_the_size_of_small_roundels():
     assert np.std(known) < 0.8 * np.std(unknown)
 
 
+def test_blur_does_not_make_another_print_of_it():
+    """The rays that a fit starts from see a blurred hole smaller, near the other configured ratio; the fit does not."""
+    disc = Disc((80.3, 60.6), 20, 0.5)
+    for image in frames(disc, 10, 1, blur=1.5, ground=190):
+        both, one = (Detector(inner_ratios=ratios).detect(image)[0] for ratios in ((0.6, 0.41), (0.6,)))
+        assert both.axes_px == pytest.approx(one.axes_px, rel=1e-4)
+
+
 @pytest.mark.parametrize(("dark", "bright"), [(60, 275), (-15, 120)])
 def test_clipped_levels_do_not_move_the_edges(dark: float, bright: float):
     """Whites beyond the scale: taken for 255 they would shift each edge, by 0.3 % of a diameter of 32 px here."""
