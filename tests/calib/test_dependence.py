@@ -46,7 +46,7 @@ def test_halves_agree_within_what_is_claimed(wandering: bool, expected: float):
     deviation (2 D)^1/2, of which it keeps 4 where errors are independent; and nothing is widened by more than chance.
 
     Of errors that last up to 4 s, blocks of 1 s see a part: what is claimed is right within a factor of 2, where
-    without widening it was wrong by more than 4.
+    without widening it was wrong by more than 3.5: lenses that are adjusted take up some of such errors.
     """
     arena, chi2, degrees, plain, factors = ring(3), 0.0, 0, 0.0, []
     for seed in SEEDS:
@@ -59,7 +59,7 @@ def test_halves_agree_within_what_is_claimed(wandering: bool, expected: float):
         plain, factors = plain + told.chi2 * factor, [*factors, factor]
     if wandering:
         assert np.mean(factors) > expected
-        assert plain / degrees > 4.0**2
+        assert plain / degrees > 3.5**2
         assert chi2 / degrees < 2.0**2
     else:
         assert np.mean(factors) == pytest.approx(expected, abs=0.15)

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.recalibration import place_one
 from calib.rig import Rig
+from tests.calib.synthetic import CAREFUL, roughly
 from tests.calib.wave import Recorded, Wave, record
 
 NAME = "cam02"
@@ -27,13 +28,16 @@ def without(rig: Rig, name: str) -> Rig:
 
 
 def test_a_camera_is_placed_and_its_clock_set_as_well_as_claimed(recorded: Recorded):
-    """The squared Mahalanobis error of the pose is below the 99.9 % quantile of chi-square with 6 degrees."""
-    found = place_one(without(recorded.truth, NAME), Wave().wand, recorded.messages, NAME)
+    """The squared Mahalanobis error of the pose is below the 99.9 % quantile of chi-square with 6 degrees. The
+    lens is off by what its figures say, half a pixel: 2 mm at 3 m."""
+    lens = roughly(recorded.truth, CAREFUL, told=True).cameras[NAME]
+    rig = without(Rig(cameras={**recorded.truth.cameras, NAME: lens}), NAME)
+    found = place_one(rig, Wave().wand, recorded.messages, NAME)
     here, there = found.rig.cameras[NAME], recorded.truth.cameras[NAME]
     D = np.linalg.inv(here.matrix()) @ there.matrix()
     error = np.array([D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]])
     assert error @ np.linalg.solve(np.array(here.covariance), error) < chi2.ppf(0.999, 6)
-    assert found.sigma_mm < 1
+    assert found.sigma_mm < 2
     assert here.time_offset_ms == pytest.approx(there.time_offset_ms, abs=4 * found.time_sigma_ms)
     assert found.time_sigma_ms < 0.3
     assert found.moved_mm is None
