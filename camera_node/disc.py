@@ -152,7 +152,8 @@ def _adjust(
 ) -> tuple[Array, Array, Array]:
     """Positions and normals (N, 2, 3) adjusted to ellipse and offset at once, and their odds (N, 2)."""
     centre = lens.normalise(ellipses[:, :2] + offset)
-    seen = np.concatenate([shape_of(np.linalg.inv(Q)), centre], axis=1)
+    dual = np.asarray(np.linalg.inv(Q), float)
+    seen = np.concatenate([shape_of(dual), centre], axis=1)
     cov = covariance_through(lens, ellipses, covariance)
     seen, cov = np.repeat(seen, 2, axis=0), np.repeat(cov, 2, axis=0)  # of both poses
     c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, seen, cov)
