@@ -19,7 +19,7 @@ from camera_node.lens import Lens
 
 Array = NDArray[np.float64]
 
-AGREE = 0.5  # of a camera's sightings must fit the rig
+AGREE = 0.5  # of a camera's sightings must fit the rig, beside those that its own parameters fit anyway
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
 SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
 FEW = 8  # moments at which a distance is measured
@@ -61,16 +61,22 @@ def _apart(found: Lens, given: Lens, cov: Array) -> float:
 
 
 def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> None:
-    """Raise CameraFault where much of what a camera saw fits nothing that the others saw: the worst one, as one that
-    is wrong makes others look wrong."""
-    share = np.array([adjusted.used[seen.camera == k].mean() for k in range(len(names))])
+    """Raise CameraFault where much of what a camera saw fits nothing that the others saw.
+
+    The worst one, as one that is wrong makes others look wrong. A camera's d parameters fit d coordinates wherever it
+    stands: those tell nothing.
+    """
+    sightings = np.bincount(seen.camera, minlength=len(names))
+    fitting = np.bincount(seen.camera[adjusted.used], minlength=len(names))
+    share = (fitting - len(adjusted.problem.free) / 2) / sightings
     if share.min() < AGREE:
-        name = names[int(share.argmin())]
+        k = int(share.argmin())
         told = (
-            f"only {share.min():.0%} of what it saw fits what the others saw: are its name and its intrinsics its "
-            f"own? else did it move? run python -m calib intrinsics --camera {name}, or leave it out"
+            f"only {fitting[k]} of its {sightings[k]} sightings fit what the others saw: if these are few, wave before "
+            "it; else are its name and its intrinsics its own, and did it stand still? run python -m calib intrinsics "
+            f"--camera {names[k]}, or leave it out"
         )
-        raise CameraFault({name: told}, certain=False)
+        raise CameraFault({names[k]: told}, certain=False)
 
 
 def check_motion(wave: Sightings, names: Sequence[str], lenses: Sequence[Lens]) -> None:
