@@ -2,6 +2,7 @@
 """Time a frame, of one thread: cold and tracked, beside one pass over the memory, OpenCV's contours, and tags."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle, product
 
 import cv2
@@ -20,7 +21,7 @@ from tests.benchmarks.detector.pictures import (
     missed,
     paste,
 )
-from tests.benchmarks.detector.table import Run, Verdict, milliseconds, table
+from tests.benchmarks.detector.table import Run, Verdict, milliseconds, milliseconds_anew, table
 from tests.benchmarks.detector.tags import measure_tags, tag_detectors
 from tests.camera_node.tracing import Array
 
@@ -83,7 +84,7 @@ def measure_frame(run: Run, ground: Array, there: list[Card], seconds: float) ->
     tracker, turns = run.make(), cycle(frames)
     return Times(
         len(there) - missed(there, run.make().detect(image).uv),
-        milliseconds(lambda: run.make().detect(image), seconds),
+        milliseconds_anew(lambda: partial(run.make().detect, image), seconds),
         milliseconds(lambda: tracker.detect(next(turns)), seconds),
         milliseconds(lambda: np.copyto(scratch, image), seconds / 2),
         milliseconds(lambda: contours(image), seconds / 2),

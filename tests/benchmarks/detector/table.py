@@ -55,8 +55,14 @@ def milliseconds(work: Callable[[], object], seconds: float) -> float:
 
     Not the least of all, since a virtual machine's thread clock stands still now and then.
     """
+    return milliseconds_anew(lambda: work, seconds)
+
+
+def milliseconds_anew(prepare: Callable[[], Callable[[], object]], seconds: float) -> float:
+    """The same of work that can be done once: what prepares it each time is not counted."""
     times, end = [], time.perf_counter() + seconds
     while time.perf_counter() < end or len(times) < 2:
+        work = prepare()
         start = time.thread_time_ns()
         work()
         times.append(time.thread_time_ns() - start)
