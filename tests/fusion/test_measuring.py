@@ -63,10 +63,12 @@ def test_a_robot_as_measured_is_tracked_where_it_stands():
 
 
 def test_what_moves_or_comes_and_goes_does_not_stand():
-    """Of a robot that drives, one that is hidden for most of the time, and one that stands, the last is measured."""
-    robots = {"moves": SINGLE, "hides": SINGLE, "stands": SINGLE}
+    """Of a robot that drives, one that creeps (25 mm in the second), one that is hidden for most of it, and one that
+    stands, the last is measured."""
+    robots = {"moves": SINGLE, "creeps": SINGLE, "hides": SINGLE, "stands": SINGLE}
     motions = {
         "moves": line((0.5, 0.0, 0.2), (0.3, 0.0, 0.0)),
+        "creeps": line((0.0, 0.6, 0.2), (0.025, 0.0, 0.0)),
         "hides": line((0.0, -0.6, 0.2)),
         "stands": line((-0.5, 0.3, 0.2)),
     }
