@@ -52,9 +52,14 @@ def tabulate_robots(latest: Latest) -> Table:
         speed, sigma = float(np.linalg.norm(pose.velocity)), position_sigma_mm(pose)
         misfit = misfits.get(name)
         told = f"{state}, markers off by {misfit:.1f} px" if misfit is not None else state
-        rows.append((name, told, place, f"{speed:.2f}", f"{sigma:.1f}", str(pose.n_markers)))
+        rows.append((name, told, place, f"{speed:.2f}", describe_sigma(sigma), str(pose.n_markers)))
         hues.append("warn" if misfit is not None and state == "tracked" else HUE_OF.get(state, "bad"))
     return Table(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, hues)
+
+
+def describe_sigma(sigma_mm: float) -> str:
+    """Millimetres; a robot that has long been lost may be anywhere."""
+    return f"{sigma_mm:.1f}" if sigma_mm < 1000 else "> 1 m"
 
 
 def position_sigma_mm(pose: RobotPose) -> float:

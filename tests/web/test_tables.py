@@ -12,7 +12,7 @@ from fusion.messages import CameraHealth, FusionStatus
 from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen
-from web.tables import STALE_S, describe, describe_server, tabulate_cameras, tabulate_robots
+from web.tables import STALE_S, describe, describe_server, describe_sigma, tabulate_cameras, tabulate_robots
 from web.trails import LENGTH, Trails, fade
 
 
@@ -85,6 +85,10 @@ def test_a_robot_whose_markers_are_off_is_told(played: Played, feed: Feed):
     table = tabulate_robots(feed.latest())
     assert table.rows[0][1] == "tracked, markers off by 2.3 px"
     assert table.hues == ["warn"]
+
+
+def test_where_a_lost_robot_may_be_is_no_column_of_digits():
+    assert [describe_sigma(mm) for mm in (0.44, 999.0, 1_327_600.6)] == ["0.4", "999.0", "> 1 m"]
 
 
 def test_a_silent_robot_is_away(played: Played, feed: Feed):
