@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.blame import lens_to_blame, pose_px
 from calib.camera import Camera, transform
 from calib.coverage import Coverage, cell_centres, enumerate_words
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
-from calib.problem import LENS
 from calib.report import CameraReport
-from calib.triangulation import Joint, camera_jacobians
+from calib.triangulation import Joint
 from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.pose import invert
@@ -275,42 +275,3 @@ def joint_of(result: Calibration) -> Joint:
     covariance = result.adjusted.joint_covariance()
     size = covariance.shape[0] * covariance.shape[1]
     return Joint(result.adjusted.problem.free, covariance.reshape(size, size))
-
-
-def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> float:
-    """RMS, per coordinate, by which a `covariance` (C, d, C, d) of camera k moves points at a distance in its image;
-    pixels."""
-    if not len(uv):
-        return float("nan")
-    J = _image_jacobians(result, k, uv, distance)
-    moved = J @ covariance[k, :, k] @ np.swapaxes(J, 1, 2)
-    return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))
-
-
-def lens_to_blame(result: Calibration, k: int, uv: Array, distance: float) -> str:
-    """The camera by whose lens, were it known, these points would be known best; empty where all lenses together would
-    not halve the variance."""
-    J, adjusted = _image_jacobians(result, k, uv, distance), result.adjusted
-    covariance, lens = adjusted.joint_covariance(), [adjusted.problem.free.index(p) for p in LENS]
-    of_lenses = covariance[:, lens][:, :, :, lens]
-    moved = np.einsum("nip,pcl->nicl", J, covariance[k][:, :, lens])
-    told = [_explained(moved[:, :, c], of_lenses[c, :, c]) for c in range(len(of_lenses))]
-    together = _explained(moved.reshape(*J.shape[:2], -1), of_lenses.reshape(4 * len(told), -1))
-    whole = float(np.einsum("nip,pq,niq->", J, covariance[k, :, k], J))
-    return result.names[int(np.argmax(told))] if together > whole / 2 else ""
-
-
-def _explained(moved: Array, covariance: Array) -> float:
-    """The variance, summed over pixels, that is gone once parameters are known with which it has covariances."""
-    unit = np.sqrt(np.diag(covariance))
-    scaled = moved / unit
-    return float(np.einsum("nip,pq,niq->", scaled, np.linalg.inv(covariance / np.outer(unit, unit)), scaled))
-
-
-def _image_jacobians(result: Calibration, k: int, uv: Array, distance: float) -> Array:
-    """(n, 2, d) how points at a distance, where camera k saw `uv`, move in its image with its parameters."""
-    camera = result.rig.cameras[result.names[k]]
-    rays = camera.rays(uv)
-    return camera_jacobians(
-        camera, rays[np.isfinite(rays).all(axis=1)] * distance, result.adjusted.problem.free
-    )
