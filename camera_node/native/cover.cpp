@@ -5,7 +5,8 @@
 #include <cmath>
 #include <iterator>
 
-#include "ray.hpp"
+#include "bar.hpp"
+#include "sector_view.hpp"
 
 namespace roundel {
 
@@ -28,29 +29,8 @@ bool is_below(const Fit& fit, double noise, double misfit) {
     return fit.edge_residual < std::hypot(1.2 * noise, misfit * (fit.bright - fit.dark));
 }
 
-/// Sectors by what they show, over ink (0) and paper (1), at some radii.
-class View {
-  public:
-    View(const ImageView& image, const Fit& fit) : image_(image), fit_(fit) {}
-    template <typename Test>
-    Sectors find(double radius, const Test& test) const {
-        Sectors found = 0;
-        for (int s = 0; s < kSectors; ++s) {
-            const auto [x, y] = point_in_sector(fit_.p, s, radius);
-            const float level = sample(image_, x, y);
-            found |= Sectors(level >= 0 && test((double(level) - fit_.dark) / (fit_.bright - fit_.dark)))
-                     << s;
-        }
-        return found;
-    }
-
-  private:
-    const ImageView& image_;
-    const Fit& fit_;
-};
-
 /// The sectors in which the ring shows a level that is neither ink nor paper.
-Sectors find_foreign(const View& view, const Fit& fit, double noise) {
+Sectors find_foreign(const SectorView& view, const Fit& fit, double noise) {
     const double limit = std::max(kInk, kSure * noise / (fit.bright - fit.dark));
     const double ring = (1 - fit.ratio) * fit.outer.minor / 2;
     Sectors foreign = 0;
@@ -63,10 +43,13 @@ Sectors find_foreign(const View& view, const Fit& fit, double noise) {
 }
 
 /// Whether nothing but ink and paper meets the eye in a place where the ring is covered: so do letters look,
-/// which have ink in the hole or just outside where their ring is whole.
+/// which have ink in the hole or just outside where their ring is whole. A dark bar from end to end is none.
 bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, double noise) {
-    const View view(image, fit);
-    const Sectors foreign = find_foreign(view, fit, noise), covered = hidden.outer | hidden.inner;
+    const SectorView view(image, fit);
+    const Sectors covered = hidden.outer | hidden.inner;
+    Sectors foreign = find_foreign(view, fit, noise);
+    const auto bar = find_bar(image, fit, noise);
+    if (bar) foreign |= bar->hides(1) | bar->hides(fit.ratio);
     Sectors bright = 0;
     for (const double share : {0.25, 0.5, 0.75})
         bright |=
@@ -75,7 +58,7 @@ bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, dou
     Sectors inked = 0;
     for (const double radius : {0.8 * fit.ratio, 1.12, 1.2})
         inked |= view.find(radius, [](double level) { return std::abs(level) < kInked; });
-    if (inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
+    if (!bar && inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
     for (Sectors left = covered; left;) {
         const Sectors run = any_run(left);
         if (2 * count_sectors(run & foreign) < count_sectors(run) - kBlurred) return true;
