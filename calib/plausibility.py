@@ -19,7 +19,7 @@ from camera_node.lens import Lens
 
 Array = NDArray[np.float64]
 
-AGREE = 0.5  # of a camera's sightings must fit the rig, beside those that its own parameters fit anyway
+AGREE = 0.5  # of a camera's sightings must fit the rig, beside those that its pose and clock fit anyway
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
 SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
 FEW = 8  # moments at which a distance is measured
@@ -63,12 +63,12 @@ def _apart(found: Lens, given: Lens, cov: Array) -> float:
 def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> None:
     """Raise CameraFault where much of what a camera saw fits nothing that the others saw.
 
-    The worst one, as one that is wrong makes others look wrong. A camera's d parameters fit d coordinates wherever it
-    stands: those tell nothing.
+    The worst one, as one that is wrong makes others look wrong. The d parameters of a camera's pose and clock
+    fit d coordinates wherever it stands: those tell nothing.
     """
     sightings = np.bincount(seen.camera, minlength=len(names))
     fitting = np.bincount(seen.camera[adjusted.used], minlength=len(names))
-    share = (fitting - len(adjusted.problem.free) / 2) / sightings
+    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / sightings
     if share.min() < AGREE:
         k = int(share.argmin())
         told = (

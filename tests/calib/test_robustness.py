@@ -56,7 +56,7 @@ def test_sixty_frames_far_apart_are_enough():
 
 def test_a_camera_that_saw_next_to_nothing_is_named_and_spoils_nothing():
     """The wand before it for half a second, a clock that is 150 ms off: 21 of 36 sightings fit it where it stands wrong
-    by half a metre, since 12 parameters fit much."""
+    by half a metre, four of them whatever its pose and its clock."""
     recorded = record(Wave(cameras=4, seconds=12, rate_hz=30, seed=5))
     result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
     assert set(result.report.unplaced) == {"cam03"}
