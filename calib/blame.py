@@ -4,9 +4,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.outcome import Calibration
 from calib.problem import LENS
 from calib.triangulation import camera_jacobians
-from calib.wand import Calibration
 
 Array = NDArray[np.float64]
 

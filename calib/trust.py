@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from calib.blame import lens_to_blame, pose_px
 from calib.camera import Camera, transform
 from calib.coverage import Coverage, cell_centres, enumerate_words
+from calib.outcome import Calibration
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.report import CameraReport
 from calib.triangulation import Joint
-from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.pose import invert
 

@@ -24,6 +24,8 @@ from calib.errors import CalibrationError
 from calib.live import Heard, listen
 from calib.rig import Rig
 from calib.scale import Distance
+from calib.trust import assess
+from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 
@@ -226,9 +228,6 @@ def try_part(
     rig: Rig, wand: Body, distance: Distance | None, part: Sequence[Detections], share: float
 ) -> Trial:
     """Solve a part, `share` of all frames, and say what all of them would give."""
-    from calib.trust import assess
-    from calib.wand import calibrate
-
     try:
         result = calibrate(rig, wand, part, distance)
     except CalibrationError as error:

@@ -13,7 +13,9 @@ import tyro
 
 from camera_node.config import is_name
 from camera_node.errors import ConfigError, run
-from camera_node.source import Replay, SourceSettings, open_source
+from camera_node.frame import SourceSettings
+from camera_node.replay import Replay
+from camera_node.source import open_source
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,14 @@ from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
+from calib.commands.report import print_report, show_progress
 from calib.live import Heard
+from calib.recalibration import place_one
 from calib.recording import save_wave
-from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
 from calib.rig import Rig, load_rig
 from calib.scale import SIGMA_M, Distance
+from calib.trust import assess
+from calib.wand import calibrate
 from calib.waving import wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
@@ -91,9 +94,6 @@ class Wand:
         distance: Distance | None,
         console: Console,
     ) -> Rig:
-        from calib.trust import assess
-        from calib.wand import calibrate
-
         if self.only is not None:
             return self._place_one(rig, wand, messages, self.only, console)
         with console.status("placing cameras"):
@@ -102,8 +102,7 @@ class Wand:
         print_report(result, trust, console)
         if self.maps is not None:
             save_maps(self.maps, result, trust, console)
-        told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
-        told |= {**lenses_as_dict(result), **_of_lenses(rig)}
+        told = {**provenance(), **trust.as_dict(), **result.as_dict(), **_of_lenses(rig)}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed
@@ -111,8 +110,6 @@ class Wand:
     def _place_one(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str, console: Console
     ) -> Rig:
-        from calib.recalibration import place_one
-
         with console.status(f"placing {name}"):
             result = place_one(rig, wand, messages, name)
         moved = (

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera, transform
+from calib.outcome import Calibration
 from calib.rig import Rig
-from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.pose import Pose, invert, look_at, rotation_from_vector
