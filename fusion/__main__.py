@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from camera_node.errors import run
+from camera_node.errors import check_command, run
 
 # imported when asked for: what runs on a robot's computer has neither GTSAM nor SciPy
 COMMANDS = {
@@ -75,6 +75,7 @@ def main() -> None:
 
 
 def _program() -> int:
+    check_command(sys.argv[1:], tuple(COMMANDS))
     name, *arguments = sys.argv[1:] or [""]
     if name not in COMMANDS:
         return tyro.cli(Serve, prog="fusion").run()
