@@ -29,6 +29,7 @@ from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 
+MOST_S = 180.0  # that a wave may last when it ends by itself
 TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions
 TRIAL_FRAMES = 150  # of each camera: a solution of a second or less
 BLOCK_S = 0.5  # frames that are taken or left together, so that the motion between them is known

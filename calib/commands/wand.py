@@ -18,18 +18,16 @@ from calib.commands.recording import read_recording
 from calib.commands.report import print_report, show_progress
 from calib.live import Heard
 from calib.recalibration import place_one
-from calib.recording import save_wave
+from calib.recording import save_wave, wave_beside
 from calib.rig import Rig, load_rig
 from calib.scale import SIGMA_M, Distance
 from calib.trust import assess
 from calib.wand import calibrate
-from calib.waving import wave
+from calib.waving import MOST_S, wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
-
-MOST_S = 180.0  # that a wave may last when it ends by itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +139,7 @@ class Wand:
 
     def _keep(self, messages: Sequence[Detections], console: Console) -> Path | None:
         """Write the wave before it is solved, so that nothing that goes wrong there can lose it."""
-        path = self.out.with_name(f"{self.out.stem}.wave.mcap")
+        path = wave_beside(self.out)
         try:
             before = save_wave(path, self.server.arena, messages)
         except ConfigError as error:

@@ -177,6 +177,13 @@ def errors(found: Rig, truth: Rig) -> tuple[float, float]:
     return float(shift.max()), float(turn.max())
 
 
+def assert_near(found: Rig, truth: Rig, metres: float, radians: float) -> None:
+    """Every camera is where it should be, and turned as it should be."""
+    shift, turn = errors(found, truth)
+    assert shift < metres
+    assert turn < radians
+
+
 def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
     """Errors of positions, m, and orientations, rad, by camera, after the best rigid motion of the world."""
     names = list(found.placed())

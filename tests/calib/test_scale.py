@@ -16,7 +16,7 @@ from calib.waving import try_part
 from camera_node.body import Body
 from camera_node.errors import ConfigError
 from camera_node.observations import write_observations
-from tests.calib.synthetic import Arena, errors, record, ring
+from tests.calib.synthetic import Arena, assert_near, record, ring
 
 LIGHT = Body(diameter_m=0.1)
 
@@ -37,7 +37,7 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
         for sigma in (0.0, 0.02)
     )
     assert exact.report.metric
-    assert errors(exact.rig, arena.truth) < (2e-3, 1e-3)
+    assert_near(exact.rig, arena.truth, 2e-3, 1e-3)
     for a, b in combinations(exact.names, 2):
         wanted = Distance(a, b, apart(arena, a, b), 0.0)
         sure, loose = (compare(wanted, told.names, told.adjusted) for told in (exact, rough))
@@ -49,7 +49,7 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
     sized = record(arena, 12.0, sigma_px=0.1)  # a roundel's size, a tenth off, gives way
     wrong = Body(diameter_m=0.11)
     by_tape = calibrate(arena.intrinsics, wrong, sized, Distance("cam0", "cam2", true))
-    assert errors(by_tape.rig, arena.truth) < (5e-3, 2e-3)
+    assert_near(by_tape.rig, arena.truth, 5e-3, 2e-3)
 
 
 def test_a_wand_that_knows_metres_is_compared():
@@ -62,7 +62,7 @@ def test_a_wand_that_knows_metres_is_compared():
         told = result.report.compared
         assert told is not None
         assert told.sentence().startswith("warning: ") == warned
-        assert errors(result.rig, plain.rig) < (1e-12, 1e-7)  # what rounding leaves
+        assert_near(result.rig, plain.rig, 1e-12, 1e-7)  # what rounding leaves
         assert told.off_m / given == pytest.approx(true / given - 1, abs=1e-3)
 
 
