@@ -85,7 +85,7 @@ class Server:
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
         log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
         if self._tracker is None:
-            log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
+            log.warning("no camera has a place yet: wave the wand, python -m calib wand --live --help")
         return self
 
     def __exit__(self, *exception: object) -> None:
