@@ -51,8 +51,8 @@ class Calibrating:
         self._closed = False
         with server.gui.add_folder("Calibrate"):
             self._button = server.gui.add_button(WAVE)
-            self._seen = server.gui.add_html("")
             self._answer = server.gui.add_markdown("")
+            self._seen = server.gui.add_html("")
         self._button.on_click(lambda _: self.press())
 
     def update(self, latest: Latest) -> None:

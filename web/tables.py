@@ -12,6 +12,7 @@ from web.feed import Latest, Seen
 STALE_S = 2.0  # a robot or a camera that was silent for so long is away
 NONE = "–"
 HUE_OF = {"tracked": "ok", "coasting": "warn"}  # of a robot's state; else bad
+MARGIN_PX = 6
 CELL = "padding:3px 6px 3px 0"
 HUES = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b"}
 
@@ -45,10 +46,11 @@ class Table:
     def html(self) -> str:
         """The table for the panel; whatever the network said is escaped."""
         if not self.rows:
-            return f'<div style="font-size:11px;opacity:.6">{html.escape(self.nothing)}</div>'
+            return f'<div style="margin:0 {MARGIN_PX}px;font-size:11px;opacity:.6">{html.escape(self.nothing)}</div>'
         head = f'</th><th style="{CELL}">'.join(html.escape(text) for text in self.header)
         body = "".join(row.html() for row in self.rows)
-        style = "width:100%;border-collapse:collapse;font-size:11px;text-align:left"
+        place = f"width:calc(100% - {2 * MARGIN_PX}px);margin:0 {MARGIN_PX}px"
+        style = f"{place};border-collapse:collapse;font-size:11px;text-align:left"
         return (
             f'<table style="{style}"><tr style="opacity:.6;vertical-align:bottom;line-height:1.2">'
             f'<th style="{CELL}">{head}</th></tr>{body}</table>'
