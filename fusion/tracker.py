@@ -14,7 +14,7 @@ from fusion.inspection import Inspection
 from fusion.instants import Instant
 from fusion.messages import RobotPose, ShardPoses, State
 from fusion.optics import Optics
-from fusion.report import Fused, Move, look, report, tell_poses
+from fusion.report import Fused, Move, Seen, look, report, tell_poses
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
@@ -86,7 +86,7 @@ class Tracker:
         self.watch = Watch()
         self.shapes = Shapes(self.names, single)
         self._inspection = Inspection(self)
-        self._last: tuple[Instant, Sightings, Matches] | None = None
+        self._last: tuple[Instant, Sightings, Matches, Seen] | None = None
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
@@ -121,20 +121,24 @@ class Tracker:
         seen = look(self, sightings, matches)
         self.shapes.note(seen.residual_px)
         self._told = tell_poses(self, instant.t_ns, seen, rows.tolist())
-        self._last = instant, sightings, matches
+        self._last = instant, sightings, matches, seen
         return tuple(self._told.values())
 
     def complete(self) -> Fused:
         """After `advance`: look for robots that are not tracked, and tell the whole instant."""
         assert self._last is not None
-        instant, sightings, matches = self._last
+        instant, sightings, matches, seen = self._last
         missing = np.flatnonzero(~self.predicted[1])
+        if not self.owned[missing].any():  # others' are for their own shards to look for
+            missing = missing[:0]
         n_known = len(matches)
         matches, free = self.search.find(missing, sightings, matches)
         if len(matches) != n_known:
             self._note(instant.t_ns, matches)
-        self._last = instant, sightings, matches
-        return report(self, self._trusted(instant), sightings, matches, free, self._told)
+        if len(missing):
+            seen = look(self, sightings, matches)
+        self._last = instant, sightings, matches, seen
+        return report(self, self._trusted(instant), sightings, matches, seen, free, self._told)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
@@ -164,7 +168,7 @@ class Tracker:
 
     def inspect(self) -> tuple[Move, ...]:
         """After an instant was told: which cameras are found to be moved, and where they stand; see `Inspection`."""
-        return () if self._last is None else self._inspection.inspect(*self._last)
+        return () if self._last is None else self._inspection.inspect(*self._last[:3])
 
     def _begin(self, t_ns: int) -> "_Begun":
         """The instant at `t_ns`, begun now if it was not yet."""
@@ -245,8 +249,7 @@ class Tracker:
         seen[self.catalogue.robot[matches.disc]] = True
         self._seen, self._seen_ns[seen & self.owned] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
-        worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
-        vague = worst > self.limits.tracked_sigma_m**2
+        vague = self._is_vague()
         for k, status in enumerate(self.status):
             if not self.owned[k]:
                 self.status[k] = "lost" if status is not None and silent[k] else status
@@ -256,6 +259,13 @@ class Tracker:
                 self.status[k] = "lost" if silent[k] else "coasting"
                 if silent[k]:
                     self.states.v[k] = self.states.omega[k] = 0
+
+    def _is_vague(self) -> NDArray[np.bool_]:
+        """(N,) robots whose place is known worse than `tracked_sigma_m` along some direction."""
+        place, most = self.states.P[:, POSITION, POSITION], self.limits.tracked_sigma_m**2
+        vague = np.einsum("nii->n", place) > most  # or else no eigenvalue is
+        vague[vague] = np.linalg.eigvalsh(place[vague])[:, -1] > most
+        return vague
 
     def tell(self) -> ShardPoses:
         """For the other shards, after `advance`: where this one's robots are."""

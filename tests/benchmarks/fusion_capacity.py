@@ -77,7 +77,7 @@ class Series:
     """Numbers, in memory that is taken before the first: what a benchmark keeps must not grow while it runs."""
 
     def __init__(self, room: int) -> None:
-        self._numbers, self._n = np.zeros(room), 0
+        self._numbers, self._n = np.full(room, np.nan), 0  # written, so that the memory is really taken
 
     def __len__(self) -> int:
         return self._n
