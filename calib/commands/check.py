@@ -137,7 +137,9 @@ def placed(result: Calibration) -> Placed:
         name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
         for k, name in enumerate(result.names)
     }
-    return Placed(result.names, adjusted.state.cameras, noise, lenses)
+    scaled_by = result.report.scaled_by
+    metric = adjusted.problem.fixed_distance is None or (scaled_by is not None and scaled_by.sigma_m > 0)
+    return Placed(result.names, adjusted.state.cameras, noise, lenses, metric)
 
 
 def _figures(agreement: Agreement | None) -> dict[str, Any] | None:
