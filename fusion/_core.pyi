@@ -73,9 +73,6 @@ class ExpectedMarkers:
         N detections in order of their frames: xy (2, N), scale and cov (2, 2, N), major (N,); focal (F,) by frame.
         """
 
-def assign(pairs: Index, costs: Array, frame: Index, /) -> Index:
-    """Rows of pairs (2, K) with costs (K,), each less than 1e4, that go together best; `frame` (N,) of detections."""
-
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
     """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) the derivatives of pixels by these.
 

@@ -4,13 +4,14 @@
 Each marker is predicted into each frame at the frame's own time; within a gate of its covariance and apparent size,
 detections are assigned globally, frame by frame: no detection is of two markers. The cost of a pair is its negative
 log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits:
-`native/candidates.cpp` finds the pairs and their costs, `native/assignment.cpp` chooses among them.
+`native/candidates.cpp` finds the pairs and their costs.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from fusion import _core
 from fusion.instants import Frame, Instant
@@ -20,6 +21,8 @@ from fusion.state import States
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
+TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
 
 
 class Association:
@@ -80,6 +83,38 @@ class Association:
             sightings.axes_px[0],
             self._optics.focal[exposures.camera],
         )
-        chosen = _core.assign(pairs, cost, sightings.frame)
-        marker, sighting = pairs[:, chosen]
+        marker, sighting = pairs[:, assign(pairs, cost, sightings.frame)]
         return Matches.of(sighting, self._markers[marker])
+
+
+def assign(pairs: Index, cost: Array, frame: Index) -> Index:
+    """The rows of the cheapest pairs, as many as there can be in each frame; what has no rival needs no search.
+
+    Args:
+        pairs: (2, K) markers and sightings.
+        cost: (K,), each less than `UNMATCHED`.
+        frame: (N,) of the sightings.
+    """
+    marker, sighting = pairs
+    place = frame[sighting] * (np.max(marker, initial=0) + 1) + marker  # of a marker in a frame
+    rivals = np.maximum(np.bincount(place)[place], np.bincount(sighting)[sighting])
+    alone, contested = np.flatnonzero(rivals == 1), np.flatnonzero(rivals > 1)
+    at = frame[sighting[contested]]
+    parts = [contested] if len(contested) < TOGETHER else [contested[at == k] for k in set(at.tolist())]
+    chosen = [rows[_assign_rivals(place[rows], sighting[rows], cost[rows])] for rows in parts]
+    return np.concatenate([alone, *chosen])
+
+
+def _assign_rivals(place: Index, sighting: Index, cost: Array) -> Index:
+    i, n = _renumber(place)
+    j, m = _renumber(sighting)
+    costs, number = np.full((n, m), UNMATCHED), np.full((n, m), -1)
+    costs[i, j], number[i, j] = cost, np.arange(len(cost))
+    chosen = number[linear_sum_assignment(costs)]
+    return chosen[chosen >= 0]
+
+
+def _renumber(rows: Index) -> tuple[Index, int]:
+    """Rows counted from 0 without gaps, and how many there are."""
+    new = np.cumsum(np.bincount(rows) > 0)
+    return new[rows] - 1, int(new[-1]) if len(new) else 0

@@ -1,17 +1,14 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include <nanobind/stl/tuple.h>
 
-#include <algorithm>
-
 #include "arrays.hpp"
-#include "assignment.hpp"
+#include "candidates.hpp"
 #include "inverse_lens.hpp"
 
 namespace roundel::fusion {
 namespace {
 
 using Markers = std::vector<ExpectedMarker>;
-constexpr size_t kMostMarkers = size_t(1) << 24;  // a number beyond is none of an arena's
 
 /// R and P are those of the bodies, `body` that of each marker.
 void make_expected(Markers* self, const In<double, -1, 3, 3>& R, const In<double, -1, 12, 12>& P,
@@ -57,23 +54,6 @@ auto candidates(const Markers& markers, const Poses& poses, const Index& frame, 
     return std::make_tuple(pairs, costs);
 }
 
-OutOf<int64_t> assign_pairs(const In<int64_t, 2, -1>& pairs, const Numbers& costs, const Index& frame) {
-    const size_t n = costs.size();
-    require_equal(n, {pairs.shape(1)});
-    std::vector<Candidate> candidates;
-    for (size_t k = 0; k < n; ++k) {
-        require_below(kMostMarkers, pairs(0, k));
-        require_below(frame.size(), pairs(1, k));
-        if (!(std::abs(costs(k)) < kUnmatched)) throw nb::value_error("a cost that is none");
-        candidates.push_back({pairs(0, k), pairs(1, k), costs(k)});
-    }
-    std::vector<int64_t> rows;
-    unlocked([&] { rows = assign(candidates, frame.data()); });
-    auto [chosen, to] = make<int64_t>({rows.size()});
-    std::copy(rows.begin(), rows.end(), to);
-    return chosen;
-}
-
 auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
@@ -91,7 +71,6 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
-    m.def("assign", &assign_pairs);
     m.def("look_up", &look_up_pixels);
 }
 

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.roundels import Roundels
 from fusion import _core
+from fusion.association import assign
 from fusion.instants import Frame, Instant
 from fusion.optics import Discs, Optics
 from fusion.sightings import Observations, Sightings
@@ -133,7 +134,7 @@ def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_le
     marker, detection = np.nonzero(random.random((25, len(frame))) < random.uniform(0.02, 1))
     order = np.argsort(frame[detection], kind="stable")
     pairs, costs = np.stack([marker, detection])[:, order], random.normal(size=len(order))
-    chosen = _core.assign(pairs, costs, frame)
+    chosen = assign(pairs, costs, frame)
     expected = 0
     for f in range(3):
         dense = np.full((25, len(frame)), 1e4)
