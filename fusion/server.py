@@ -17,10 +17,11 @@ import numpy as np
 import zenoh
 
 from calib.camera import Camera
+from calib.messages import RigMessage
 from calib.rig import load_rig, save_rig
 from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.requests import encode_reply, parse_request, payload_of
-from fusion.calibration import Calibration, parse_rig
+from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Instant, Instants
@@ -84,7 +85,7 @@ class Server:
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
         log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
         if self._tracker is None:
-            log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
+            log.warning("no camera has a place yet: wave the wand, python -m calib wand --live --help")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -141,7 +142,7 @@ class Server:
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            rig = parse_rig(data)
+            rig = decode(data, RigMessage).rig()
         except MessageError as error:
             self.health.count("rig that is no rig")
             log.warning("a published rig is refused, the old one stays: %s", error)
