@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What an instant tells the world: poses, markers, and how much of each camera was of use."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
 from typing import Protocol
@@ -12,6 +13,7 @@ from calib.camera import Camera
 from camera_node.pose import skew
 from fusion.grouping import Marker
 from fusion.instants import Instant
+from fusion.loose import Free
 from fusion.messages import Latency, Markers, RobotPose, State
 from fusion.optics import Optics
 from fusion.shards import Shard
@@ -77,7 +79,7 @@ def report(
     sightings: Sightings,
     matches: Matches,
     seen: Seen,
-    free: list[Marker],
+    free: Free,
     told: dict[int, RobotPose],
 ) -> Fused:
     """What to tell of an instant after its observations; the poses in `told`, by robot, stay as they were told.
@@ -87,7 +89,7 @@ def report(
     rest = [k for k in np.flatnonzero(tracker.owned).tolist() if k not in told]
     poses = told | tell_poses(tracker, instant.t_ns, seen, rest)
     markers = _markers(tracker, instant.t_ns, seen, free)
-    usage = _usage(tracker, sightings, matches, free)
+    usage = _usage(tracker, sightings, matches, free.markers)
     return Fused(instant.t_ns, tuple(poses[k] for k in sorted(poses)), markers, usage)
 
 
@@ -149,32 +151,35 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
     }
 
 
-def _markers(tracker: Told, t_ns: int, seen: Seen, free: list[Marker]) -> Markers:
+def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
     owner = tracker.catalogue.robot[discs]
     R, marker = tracker.states.R[owner], tracker.catalogue.marker[:, discs].T
     J = np.concatenate([-R @ skew(marker), np.tile(np.eye(3), (len(discs), 1, 1))], 2)
     labelled = J @ tracker.states.P[owner, :6, :6] @ J.transpose(0, 2, 1)
-    n, none = len(free), np.full(len(free), -1)
-    position = tracker.states.p[owner] + np.einsum("nij,nj->ni", R, marker)
-    places = np.array([m.position for m in free]).reshape(n, 3)
-    covariances = np.array([m.covariance for m in free]).reshape(n, 3, 3)
-    free_bits = np.array([_bits(m.cameras) for m in free], np.uint64)
+    none = np.full(len(free.markers), -1)
+    arm = np.einsum("nij,nj->ni", R, marker)
+    position = tracker.states.p[owner] + arm
+    velocity = tracker.states.v[owner] + np.cross(tracker.states.omega[owner], arm)
+    free_bits = np.array([_bits(m.cameras) for m in free.markers], np.uint64)
     return Markers(
         t_ns=t_ns,
         robots=tracker.names,
         camera_names=tracker.optics.names,
-        position=np.concatenate([position, places]).astype("<f8").tobytes(),
-        covariance=np.concatenate([labelled, covariances]).astype("<f4").tobytes(),
-        normal=np.concatenate([R[:, :, 2], np.full((n, 3), np.nan)]).astype("<f4").tobytes(),
+        position=np.concatenate([position, free.position]).astype("<f8").tobytes(),
+        covariance=np.concatenate([labelled, free.covariance]).astype("<f4").tobytes(),
+        normal=np.concatenate([R[:, :, 2], free.normal]).astype("<f4").tobytes(),
+        velocity=np.concatenate([velocity, free.velocity]).astype("<f4").tobytes(),
         robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
         marker=np.concatenate([tracker.catalogue.number[discs], none]).astype("<i4").tobytes(),
         cameras=np.concatenate([_packed(seen.by_marker[discs]), free_bits]).astype("<u8").tobytes(),
     )
 
 
-def _usage(tracker: Told, sightings: Sightings, matches: Matches, free: list[Marker]) -> dict[str, CameraUse]:
+def _usage(
+    tracker: Told, sightings: Sightings, matches: Matches, free: Sequence[Marker]
+) -> dict[str, CameraUse]:
     n, camera = len(tracker.optics.names), sightings.camera
     used = np.zeros(len(sightings), bool)
     used[np.concatenate([matches.sighting, *(m.sightings for m in free)])] = True

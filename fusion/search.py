@@ -136,7 +136,11 @@ class Search:
         count = np.bincount(sightings.frame[free], minlength=len(sightings.exposures.camera))
         free &= (count <= FLOOD)[sightings.frame]
         sizes = np.unique(2 * self.tracker.catalogue.radius)
-        return group(self.tracker.optics, sightings, np.flatnonzero(free), sizes) if free.any() else []
+        return (
+            group(self.tracker.optics, sightings, np.flatnonzero(free), sizes)
+            if free.any() and len(sizes)
+            else []
+        )
 
     def _claim(self, robot: int, numbers: tuple[int, ...], markers: list[Marker]) -> Matches:
         """These markers' sightings are of the robot's markers `numbers`."""

@@ -12,6 +12,7 @@ from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.inspection import Inspection
 from fusion.instants import Instant
+from fusion.loose import Loose
 from fusion.messages import RobotPose, ShardPoses, State
 from fusion.optics import Optics
 from fusion.report import Fused, Move, Seen, look, report, tell_poses
@@ -83,6 +84,7 @@ class Tracker:
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), BIRTH)
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
         self.search = Search(self)
+        self.loose = Loose(self.optics, self.catalogue.radius)
         self.watch = Watch()
         self.shapes = Shapes(self.names, single)
         self._inspection = Inspection(self)
@@ -129,8 +131,7 @@ class Tracker:
         assert self._last is not None
         instant, sightings, matches, seen = self._last
         missing = np.flatnonzero(~self.predicted[1])
-        if not self.owned[missing].any():  # others' are for their own shards to look for
-            missing = missing[:0]
+        missing = missing if self.owned[missing].any() else missing[:0]  # others look for their own
         n_known = len(matches)
         matches, free = self.search.find(missing, sightings, matches)
         if len(matches) != n_known:
@@ -138,7 +139,8 @@ class Tracker:
         if len(missing):
             seen = look(self, sightings, matches)
         self._last = instant, sightings, matches, seen
-        return report(self, self._trusted(instant), sightings, matches, seen, free, self._told)
+        loose = self.loose.follow(instant.t_ns, sightings, free)
+        return report(self, self._trusted(instant), sightings, matches, seen, loose, self._told)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
@@ -281,15 +283,15 @@ class Tracker:
     def _take_others(self) -> None:
         """The robots of other shards as these told of them, at this tracker's last instant."""
         told, self._others = self._others, []
-        for one in told if self._t_ns is not None else ():
+        if self._t_ns is None:
+            return
+        for one in told:
             at = np.array([self._row.get(name, -1) for name in one.robots], np.intp)
             new = np.flatnonzero((at >= 0) & ~self.owned[at] & (one.t_ns > self._seen_ns[at]))
-            if self._t_ns is not None and len(new):
-                rows = at[new]
-                self.states = self.states.with_rows(rows, states_of(one, self._t_ns).select(new))
-                self._seen_ns[rows] = one.t_ns
-                for k, row in zip(new.tolist(), rows.tolist(), strict=True):
-                    self.status[row] = one.states[k]
+            self.states = self.states.with_rows(at[new], states_of(one, self._t_ns).select(new))
+            self._seen_ns[at[new]] = one.t_ns
+            for k in new.tolist():
+                self.status[at[k]] = one.states[k]
 
     def adopt(self, rows: NDArray[np.intp], states: States) -> None:
         """Robots that were found stand there from now on."""

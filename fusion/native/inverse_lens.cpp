@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include "inverse_lens.hpp"
 
-#include <algorithm>
-
 namespace roundel::fusion {
 namespace {
 
@@ -20,8 +18,10 @@ Polynomial evaluate(const double* c, double s, double t) {
 }  // namespace
 
 const double* InverseLens::cell(double column, double row) const {
-    const auto x = int64_t(std::clamp(column, -1.0, double(columns))) + 1;
-    const auto y = int64_t(std::clamp(row, -1.0, double(rows))) + 1;
+    const auto within = [](double place, int64_t n) {  // what is no number lies outside, too
+        return int64_t(std::fmax(-1, std::fmin(place, double(n)))) + 1;
+    };
+    const int64_t x = within(column, columns), y = within(row, rows);
     return coefficients + 20 * (y * (columns + 2) + x);
 }
 

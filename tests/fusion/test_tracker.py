@@ -162,6 +162,29 @@ def test_a_single_marker_has_a_place_and_a_normal_and_says_that_its_turn_is_unkn
         assert pose.covariance_matrix[2, 2] > 9
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.8])
+def test_a_marker_of_nobody_has_position_velocity_and_normal(speed: float):
+    """Squared Mahalanobis errors of place and speed of the last of ten instants follow chi-square with 3 degrees
+    each, the mean of 30 runs being 3 +- 4 sqrt(6 / 30); the normal, from four views, is within its 12 degrees."""
+    squares = []
+    for seed in range(30):
+        motion = line((-0.1, 0.1, 0.3), velocity=(speed, -speed / 2, 0.1 * speed), tilt=(0.2, 0.1, 0.0))
+        arena = Arena({"x": SINGLE}, {"x": motion}, sigma_px=0.1, seed=seed)
+        tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT), Instants(33_333_333)
+        for frame in arena.frames(10):
+            instants.add(frame)
+        *_, last = (tracker.fuse(instant) for instant in instants.finish()[:-1])
+        R, p = motion(arena.seconds(last.t_ns))
+        assert last.markers.robot_index().tolist() == [-1]
+        assert last.markers.normals()[0] @ R[:, 2] > np.cos(np.radians(12))
+        P = np.frombuffer(last.markers.covariance, "<f4").reshape(3, 3).astype(float)
+        e = last.markers.positions()[0] - p
+        off = last.markers.velocities()[0] - np.multiply((1, -0.5, 0.1), speed)
+        V = tracker.loose._tracks.states.P[0, 9:, 9:]
+        squares.append([e @ np.linalg.solve(P, e), off @ np.linalg.solve(V, off)])
+    assert np.mean(squares, 0) == pytest.approx([3, 3], abs=4 * np.sqrt(6 / 30))
+
+
 def test_single_markers_that_nothing_tells_apart_stay_unlabelled(run_arena):
     arena = Arena({"c": SINGLE, "d": SINGLE}, {"c": line((0.3, 0, 0.2)), "d": line((-0.3, 0, 0.2))})
     fused, poses = run_arena(arena, 8)

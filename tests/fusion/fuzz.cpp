@@ -1,0 +1,160 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Fusion's core on numbers made to break it, for a build with sanitizers: `fuzz ROUNDS [SEED]`. Every array
+// lies in memory of exactly its own size, so that a read beyond it is caught; indices and sizes are right, as
+// the bindings see to that. Exits with 1 where a result names what is not there.
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+#include <memory>
+#include <random>
+#include <stdexcept>
+
+#include "assignment.hpp"
+#include "inverse_lens.hpp"
+#include "motion.hpp"
+
+namespace {
+
+using namespace roundel::fusion;
+using Numbers = std::vector<double>;
+using Indices = std::vector<int64_t>;
+
+class Random {
+  public:
+    explicit Random(unsigned seed) : engine_(seed) {}
+    size_t below(size_t n) { return std::uniform_int_distribution<size_t>(0, n - 1)(engine_); }
+    double normal() { return std::normal_distribution<double>()(engine_); }
+    /// As a sane caller has it, or, by the share `wild`, what no sane caller has.
+    double number(double scale, double wild) {
+        constexpr double kNone = std::numeric_limits<double>::quiet_NaN(),
+                         kEndless = std::numeric_limits<double>::infinity();
+        constexpr double kHostile[] = {0,      -0.0,   kNone, kEndless, -kEndless, 1e308,
+                                       -1e308, 1e-320, 1e18,  -1e18,    1e-9,      -1e-9};
+        const bool is_wild = std::uniform_real_distribution<double>()(engine_) < wild;
+        return is_wild ? kHostile[below(std::size(kHostile))] : scale * normal();
+    }
+    Numbers numbers(size_t n, double scale, double wild) {
+        Numbers made(n);
+        for (double& x : made) x = number(scale, wild);
+        return made;
+    }
+    Indices indices(size_t n, size_t below_this) {
+        Indices made(n);
+        for (int64_t& k : made) k = int64_t(below(below_this));
+        return made;
+    }
+    Vector vector(double scale, double wild) {
+        return {number(scale, wild), number(scale, wild), number(scale, wild)};
+    }
+    Matrix matrix(double wild) { return {vector(1, wild), vector(1, wild), vector(1, wild)}; }
+    Square square(double wild) {
+        Square made{};
+        for (int i = 0; i < kErrors; ++i)
+            for (int j = 0; j < kErrors; ++j) made[i][j] = number(0.05, wild) + (i == j);
+        return made;
+    }
+
+  private:
+    std::mt19937 engine_;
+};
+
+Poses poses_of(Random& random, size_t bodies, size_t frames, double wild) {
+    std::vector<Body> all;
+    for (size_t b = 0; b < bodies; ++b)
+        all.push_back({turn(random.vector(1, wild)), random.vector(1, wild), random.vector(3, wild),
+                       random.vector(2, wild)});
+    std::vector<Exposure> exposures;
+    for (size_t f = 0; f < frames; ++f)
+        exposures.push_back(
+            {turn(random.vector(1, wild)), random.vector(3, wild), random.number(0.01, wild)});
+    return {std::move(all), std::move(exposures)};
+}
+
+/// Views, equations, sums and remainders of discs, then the bodies a step later.
+bool estimate(Random& random, double wild) {
+    const size_t bodies = 1 + random.below(6), frames = 1 + random.below(4), n = random.below(40);
+    const Poses poses = poses_of(random, bodies, frames, wild);
+    const Indices frame = random.indices(n, frames), body = random.indices(n, bodies);
+    const Numbers marker = random.numbers(3 * n, 0.2, wild), radius = random.numbers(n, 0.05, wild);
+    const Discs discs{frame.data(), body.data(), {marker.data(), n}, radius.data()};
+    Numbers views(11 * n);
+    view_all(poses, discs, views.data());
+    const Numbers xy = random.numbers(2 * n, 1, wild), four = random.numbers(4 * n, 800, wild),
+                  axes = random.numbers(2 * n, 20, wild), one = random.numbers(n, 1, wild);
+    const std::unique_ptr<bool[]> single(new bool[bodies]());
+    std::vector<Rows> rows(n), outlines(n);
+    linearise(poses, Centres{discs, {xy.data(), n}, {four.data(), n}, single.get()}, rows.data());
+    linearise(poses, Outlines{discs, {axes.data(), n}, one.data(), {four.data(), n}, one.data()},
+              outlines.data());
+    std::vector<Square> H(bodies);
+    std::vector<Step> g(bodies);
+    for (size_t b = 0; b < bodies; ++b) H[b] = random.square(wild), g[b][0] = random.number(1, wild);
+    Numbers weights(n, 1);
+    const System system{rows.data(), body.data(), n, bodies};
+    reweigh(system, H.data(), g.data(), weights.data());
+    const Numbers steps = random.numbers(bodies * kErrors, 0.1, wild);
+    Numbers left(2 * n);
+    remain(system, steps.data(), left.data());
+    for (size_t b = 0; b < bodies; ++b) {
+        Body moving{turn(random.vector(1, wild)), random.vector(1, wild), random.vector(1, wild),
+                    random.vector(1, wild)};
+        predict(moving, H[b], {random.number(0.01, wild), random.number(1, wild), 1, b % 2 == 0});
+        try {
+            inverse(H[b]);
+        } catch (const std::runtime_error&) {  // which a Python program hears of as RuntimeError
+        }
+    }
+    return true;
+}
+
+/// Gates and assignment: pairs of what there is, nothing twice in a frame.
+bool associate(Random& random, double wild) {
+    const size_t bodies = 1 + random.below(5), frames = 1 + random.below(4), n = random.below(80);
+    const Poses poses = poses_of(random, bodies, frames, wild);
+    std::vector<ExpectedMarker> markers;
+    for (size_t k = random.below(20); k > 0; --k) {
+        const Square P = random.square(wild);
+        markers.push_back(ExpectedMarker::of(int64_t(random.below(bodies)), random.vector(0.2, wild),
+                                             random.number(0.05, wild), random.matrix(wild), P[0].data()));
+    }
+    Indices frame = random.indices(n, frames);
+    std::sort(frame.begin(), frame.end());
+    const Numbers xy = random.numbers(2 * n, 0.4, wild), scale = random.numbers(4 * n, 800, wild),
+                  cov = random.numbers(4 * n, 1, wild), major = random.numbers(n, 20, wild),
+                  focal = random.numbers(frames, 800, wild);
+    const Detections seen{frame.data(), {xy.data(), n}, {scale.data(), n}, {cov.data(), n}, major.data()};
+    const std::vector<Candidate> pairs = find_candidates(poses, markers, seen, focal.data());
+    std::vector<char> taken(n), used(frames * markers.size());
+    for (const int64_t row : assign(pairs, frame.data())) {
+        const Candidate& pair = pairs.at(size_t(row));
+        char& detection = taken.at(size_t(pair.detection));
+        char& marker = used.at(size_t(frame[size_t(pair.detection)]) * markers.size() + size_t(pair.marker));
+        if (detection || marker || !std::isfinite(pair.cost)) return false;
+        detection = marker = 1;
+    }
+    return true;
+}
+
+bool undistort(Random& random, double wild) {
+    const size_t columns = 1 + random.below(4), rows = 1 + random.below(4), n = random.below(30);
+    const Numbers cells = random.numbers(20 * (columns + 2) * (rows + 2), 1, wild);
+    const Numbers uv = random.numbers(2 * n, 100, wild);
+    Numbers xy(2 * n), scale(4 * n);
+    look_up({cells.data(), int64_t(columns), int64_t(rows), 32}, uv.data(), n, xy.data(), scale.data());
+    return true;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    const int rounds = argc > 1 ? std::atoi(argv[1]) : 100;
+    Random random(argc > 2 ? unsigned(std::atoi(argv[2])) : 1);
+    for (int round = 0; round < rounds; ++round) {
+        const double wild = round % 4 == 0 ? 0 : 0.3 / (round % 4 * round % 4 + 1);
+        if (!estimate(random, wild) || !associate(random, wild) || !undistort(random, wild)) {
+            std::fprintf(stderr, "round %d: a result that can't be\n", round);
+            return 1;
+        }
+    }
+    return 0;
+}
