@@ -132,9 +132,8 @@ ChordSearch::ChordSearch(const Settings& settings) {
 }
 
 bool ChordSearch::is_diametral(int dark, int inner) const {
-    return dark > 0 && inner + 2 * dark <= limits_.most &&
-           16 * dark <= limits_.thick * inner + limits_.slack &&
-           16 * dark + limits_.slack >= limits_.thin * inner;
+    return dark > 0 && inner + 2 * dark <= fine_.most && 16 * dark <= fine_.thick * inner + fine_.slack &&
+           16 * dark + fine_.slack >= fine_.thin * inner;
 }
 
 void ChordSearch::scan_lines(const BitImage& along, int first, int last) {
@@ -183,6 +182,59 @@ void ChordSearch::try_across(const Stack& stack) {
     seeds_.push_back({along_rows_ ? x : y, along_rows_ ? y : x, reach, m_d, m_b});
 }
 
+bool ChordSearch::is_inside(int x, int y) const {
+    return x >= 0 && x < image_->width && y >= 0 && y < image_->height;
+}
+
+/// How many pixels from (x, y) on, in steps of (dx, dy), are as dark or as bright as the first one.
+int ChordSearch::run_length(int x, int y, int dx, int dy) const {
+    if (!is_inside(x, y)) return 0;
+    const int across = dx > 0 ? image_->width - x : x + 1, down = dy > 0 ? image_->height - y : y + 1;
+    const int most = std::min({across, down, fine_.most});
+    const bool dark = rows_.is_dark(y / 2, x);
+    int n = 1;
+    while (n < most && rows_.is_dark((y + n * dy) / 2, x + n * dx) == dark) ++n;
+    return n;
+}
+
+/// Whether pixel by pixel, too, the chord through a place is one that nothing covers.
+bool ChordSearch::is_free_along(int x, int y, int dx, int dy) const {
+    const int to = run_length(x, y, dx, dy), back = run_length(x, y, -dx, -dy), inner = to + back - 1;
+    const int after = run_length(x + to * dx, y + to * dy, dx, dy);
+    if (!is_diametral(after, inner)) return false;
+    const int before = run_length(x - back * dx, y - back * dy, -dx, -dy);
+    if (!is_diametral(before, inner) ||
+        16 * std::max(before, after) > kUneven * std::min(before, after) + kSlack)
+        return false;
+    const auto level = [&](int k) -> int { return image_->row(y + k * dy)[x + k * dx]; };
+    const int one = darkest(level, to, to + after);
+    const int other = darkest([&](int k) { return level(-k); }, back, back + before);
+    return 4 * std::abs(one - other) < level(0) - std::min(one, other);  // of one ink
+}
+
+/// A stack of diagonal chords is tried across, too: where rows and columns are covered, a diagonal may be
+/// free.
+void ChordSearch::try_across_diagonal(const Stack& stack) {
+    const Raster& r = raster_;
+    const int dx = r.step_x > 0 ? 1 : -1, dy = -1;  // across the diagonal, upwards
+    const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) / 2;
+    const int x = int(r.x + at * r.step_x + line * r.line_x), y = int(r.y + at * r.step_y + line * r.line_y);
+    if (!is_inside(x, y) || rows_.is_dark(y / 2, x)) return;
+    if (!is_free_along(x, y, -dx * dy, 1)) return;
+    const int up = run_length(x, y, dx, dy), down = run_length(x, y, -dx, -dy), inner = up + down - 1;
+    if (6 * (stack.last - stack.first + 1) < inner) return;
+    const int above = run_length(x + up * dx, y + up * dy, dx, dy);
+    const int below = run_length(x - down * dx, y - down * dy, -dx, -dy);
+    if (!is_diametral(above, inner) && !is_diametral(below, inner)) return;
+    const bool upper = above > 0 && (below == 0 || above <= below);
+    const auto level = [&](int k) -> int { return image_->row(y + k * dy)[x + k * dx]; };
+    const int begin = upper ? up : down, end = begin + (upper ? above : below), middle = (up - down) / 2;
+    const int m_d = darkest([&](int k) { return level(upper ? k : -k); }, begin, end), m_b = level(middle);
+    if (m_b - m_d < min_contrast_) return;
+    const float reach = std::max(std::sqrt(2.0f) * float(inner), std::sqrt(8.0f) * float(stack.inner)) + 2;
+    seeds_.push_back({float(x + middle * dx), float(y + middle * dy), reach, m_d, m_b});
+}
+
 /// A stack as long as the bars of a roundel that is smeared along it.
 void ChordSearch::add_streak(const Stack& stack) {
     const int lines = stack.last - stack.first + 1;
@@ -218,11 +270,11 @@ void ChordSearch::scan(const BitImage& along, const BitImage* across, const Rast
     for (const Stack& stack : stacks_) {
         if (stack.goes_on || stack.first == stack.last) continue;
         add_streak(stack);
-        if (across_) try_across(stack);
+        across_ ? try_across(stack) : try_across_diagonal(stack);
     }
 }
 
-/// For smeared ones alone.
+/// For smeared ones, and for those whose rows and columns are covered.
 void ChordSearch::scan_diagonals() {
     if (both_ || turn_ % (kTurns / 2) == 0) thin_out(rows_, thin_);
     for (const bool growing : {true, false}) {

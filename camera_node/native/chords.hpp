@@ -23,7 +23,8 @@ struct Proportions {
     int least, most, thick, thin, slack;
 };
 
-/// Looks for roundels along all rows and columns of a picture, and for smeared ones also along diagonals.
+/// Looks for roundels along all rows and columns of a picture, and for smeared and covered ones also along
+/// diagonals.
 ///
 /// A line through a roundel's centre is dark, bright and dark in the proportions (1 - r) : 2r : (1 - r) at
 /// any slant, r being the ratio of the diameters: an affine picture keeps ratios along a line (1 : 3 : 1 for
@@ -61,6 +62,10 @@ class ChordSearch {
     void scan_lines(const BitImage& along, int first, int last);
     void add_chord(int middle, int inner, int outer, int line);
     void try_across(const Stack& stack);
+    void try_across_diagonal(const Stack& stack);
+    bool is_free_along(int x, int y, int dx, int dy) const;
+    bool is_inside(int x, int y) const;
+    int run_length(int x, int y, int dx, int dy) const;
     void add_streak(const Stack& stack);
     bool is_diametral(int dark, int inner) const;
 

@@ -16,6 +16,8 @@ namespace {
 
 constexpr int kLeast = 9;  // rays of each kind that must agree: what 30 % of a disc covered leaves
 constexpr int kLeastOfHalf = 14, kLeastCovered = 6;
+constexpr float kUnlike =
+    0.35f;  // ratios of rays that nothing covers are less apart, from half a radius off the middle
 constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
 constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
@@ -194,19 +196,41 @@ std::optional<Conics> settle(const Crossings& crossings, const Weights& first, i
     return conics;
 }
 
-/// Of the crossings on half of the rays, side by side, those with which most agree: something covers the
-/// rest.
-std::optional<Conics> settle_half(const Crossings& crossings) {
+/// The rays, a bit each, of which something may have left whole: half of them side by side, or a quarter on
+/// either side of a strip through the middle.
+constexpr std::array<uint16_t, 12> kWhole = [] {
+    std::array<uint16_t, 12> whole{};
+    for (int first = 0; first < kRays; first += 2)
+        for (int k = 0; k < kRays / 2; ++k) whole[size_t(first / 2)] |= uint16_t(1 << (first + k) % kRays);
+    for (int first = 0; first < kRays / 2; first += 2)
+        for (int k = 0; k < kRays / 4; ++k)
+            for (const int side : {0, kRays / 2})
+                whole[size_t(kRays + first) / 2] |= uint16_t(1 << (first + k + side) % kRays);
+    return whole;
+}();
+
+/// How far apart the ratios of such rays are.
+float most_apart(const Crossings& crossings, uint16_t rays) {
+    float least = 1, most = 0;
+    for (int k = 0; k < crossings.count; ++k)
+        if (crossings.ratio[k] > 0 && rays >> crossings.ray[k] & 1) {
+            least = std::min(least, crossings.ratio[k]), most = std::max(most, crossings.ratio[k]);
+        }
+    return most - least;
+}
+
+/// From those rays' crossings with which most of all agree.
+std::optional<Conics> settle_covered(const Crossings& crossings) {
     int most = kLeastCovered - kReweights;  // what no less would do
     std::optional<Weights> best;
-    for (int first = 0; first < kRays; first += 2) {
+    for (const uint16_t whole : kWhole) {
         Weights weights;
         int n = 0;
         for (int k = 0; k < crossings.count; ++k) {
-            const bool in = (crossings.ray[k] - first + kRays) % kRays < kRays / 2;
-            weights.at[k] = in, n += in;
+            const int in = whole >> crossings.ray[k] & 1;
+            weights.at[k] = float(in), n += in;
         }
-        if (n < kLeastOfHalf) continue;
+        if (n < kLeastOfHalf || most_apart(crossings, whole) > kUnlike) continue;
         const auto conics = solve(crossings, weights);
         if (!conics || !Frame(*conics).is_valid()) continue;
         if (const int agree = reweigh(crossings, *conics, weights); agree > most)
@@ -240,7 +264,7 @@ std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const
         if (crossings.count < 2 * kLeastCovered + 2) return std::nullopt;
         auto conics =
             crossings.count < 2 * kLeast ? std::nullopt : settle(crossings, weigh(crossings), kLeast);
-        if (!conics) conics = settle_half(crossings);
+        if (!conics) conics = settle_covered(crossings);
         if (!conics) return std::nullopt;
         const Frame frame(*conics);
         Ellipse outer = outer_ellipse(*conics, frame, crossings.unit);
