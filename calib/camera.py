@@ -68,14 +68,16 @@ def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array,
         J_point: (N, 2, 3) by the point, in the camera's frame.
         J_pose: (N, 2, 6) by a turn w and a shift t of the camera in its own frame, which move points there by
             p x w - t.
-        J_lens: (N, 2, 4) by the log of the focal lengths, cx, cy and k1.
+        J_lens: (N, 2, 8) by the log of the focal lengths, cx, cy and k1; by the log of fx over fy, and by the three
+            distortion numbers after k1.
         All NaN for points not before the camera.
     """
     lens, points = with_distortion(lens), np.asarray(points, float).reshape(-1, 3)
     uv, J_point, by_lens = lens.project_with_jacobians(points)
     J_pose = np.concatenate([J_point @ skew(points), -J_point], axis=2)
-    focal = by_lens[:, :, :1] * lens.fx + by_lens[:, :, 1:2] * lens.fy
-    return uv, J_point, J_pose, np.concatenate([focal, by_lens[:, :, 2:5]], axis=2)
+    fx, fy = by_lens[:, :, :1] * lens.fx, by_lens[:, :, 1:2] * lens.fy
+    J_lens = np.concatenate([fx + fy, by_lens[:, :, 2:5], (fx - fy) / 2, by_lens[:, :, 5:8]], axis=2)
+    return uv, J_point, J_pose, J_lens
 
 
 def with_distortion(lens: AnyLens) -> AnyLens:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import pixel_jacobians
-from calib.problem import PER_CAMERA, POSE, Observations, Problem, State
+from calib.problem import PER_CAMERA, POSE, SHAPE, Observations, Problem, State
 from calib.trajectory import Place, hermite_rate, interpolate, locate, whitened_motion
 
 Array = NDArray[np.float64]
@@ -171,9 +171,9 @@ class Linearisation:
     def _rig_terms(self, state: State) -> list[Term]:
         """What is known of the cameras before: their numbers, Jacobians, and whitened errors with the sign turned."""
         free = list(self.problem.free)
-        known = np.column_stack([np.zeros((len(state.cameras), len(POSE))), state.clocks, state.lenses])[
-            :, free
-        ]
+        zeros = np.zeros((len(state.cameras), len(POSE)))
+        shapes = zeros[:, : len(SHAPE)]
+        known = np.column_stack([zeros, state.clocks, state.lenses, shapes])[:, free]
         terms: list[Term] = [
             ((c,), (np.diag(1 / sigma),), -values / sigma)
             for c, (values, sigma) in enumerate(zip(known, self.problem.prior_sigma(), strict=True))
@@ -197,7 +197,7 @@ class Linearisation:
         points, velocity = passage.points, passage.velocity(self.problem.knot_s)
         since = seen.t_s - self.problem.middle_s
         error, J_point = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 3))
-        J_camera = np.zeros((len(seen), 2, PER_CAMERA))
+        J_camera = np.zeros((len(seen), 2, PER_CAMERA + len(SHAPE)))
         for c, given in enumerate(self.problem.lenses):
             rows, T, lens = np.flatnonzero(seen.camera == c), state.cameras[c], state.lens(c, given)
             local = (points[rows] - T[:3, 3]) @ T[:3, :3]

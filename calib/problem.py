@@ -17,6 +17,13 @@ Index = NDArray[np.intp]
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+SHAPE = (
+    12,
+    13,
+    14,
+    15,
+)  # taken for known, but tested: log fx / fy, and the three distortion numbers after k1
+SHAPE_SIGMA = [0.02, 0.3, 0.02, 0.02]
 POSE_SIGMA, CLOCK_SIGMA = [np.inf] * 6, [0.5, 5e-4]  # before anything is seen; clocks may be slewed
 
 
@@ -79,7 +86,7 @@ class State:
         for T, xi in zip(cameras, by, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:]
+        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:12]
         return State(cameras, clocks, lenses, self.motion + along.reshape(self.motion.shape))
 
     def lens(self, camera: int, lens: Lens) -> Lens:
@@ -133,7 +140,8 @@ class Problem:
 
     def _before(self, lenses: Array) -> Array:
         rest = np.tile(POSE_SIGMA + CLOCK_SIGMA, (len(self.lenses), 1))
-        return np.concatenate([rest, lenses], axis=1)[:, self.free]
+        shapes = np.tile(SHAPE_SIGMA, (len(self.lenses), 1))
+        return np.concatenate([rest, lenses, shapes], axis=1)[:, self.free]
 
     def cameras(self) -> tuple[int, ...]:
         """The cameras that are sought."""
@@ -177,7 +185,7 @@ class Problem:
 
 def unobserved(state: State, free: tuple[int, ...]) -> Array:
     """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
-    columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
+    columns = np.zeros((len(state.cameras), PER_CAMERA + len(SHAPE), 8))
     for T, rows in zip(state.cameras, columns, strict=True):
         rows[:6, :6] = adjoint(invert(T))
         rows[6, 6] = rows[7, 7] = 1.0
