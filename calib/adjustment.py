@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.elimination import camera_information, solve
+from calib.elimination import solve
 from calib.linearisation import Linearisation
+from calib.marginal import marginalise
 from calib.problem import Observations, Problem, State, unobserved
 
 Array = NDArray[np.float64]
@@ -41,6 +42,7 @@ class Adjusted:
         information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
             translation, by what was seen at the noise it claims and by what was known before; its null space is the
             choice of the world, and of the clock that all others are compared with.
+        scores: (L, S d) gradients, by interval between knots, of what was seen.
         iterations: of all rounds together.
         dependence: by what covariances, beside `scale`, are widened because errors of neighbouring moments are alike
             (`calib.dependence`).
@@ -52,6 +54,7 @@ class Adjusted:
     residuals: Array
     scale: float
     information: Array
+    scores: Array
     iterations: int
     dependence: float = 1.0
 
@@ -129,15 +132,16 @@ def adjust(problem: Problem, observations: Observations, start: State, rounds: i
         if (keep == used).all() and (torn == broken).all():
             break
         used, broken = keep, torn
-        kept = Linearisation(problem, observations.select(used), broken)
-        kept.weigh(state)
-        state, more = _descend(kept, state, robust=False)
+        state, more = _descend(every.select(used, broken), state, robust=False)
         iterations += more
-    kept = Linearisation(problem, observations.select(used), broken)
-    kept.weigh(state)
-    scale = _variance_factor(kept, state)
-    information = camera_information(kept, state)
-    return Adjusted(problem, state, used, every.residuals(state), scale, information, iterations)
+    else:
+        every.weigh(state)
+    kept = every.select(used, broken)
+    kept.relinearise(state)
+    cameras, scale = marginalise(kept), _variance_factor(kept, state)
+    return Adjusted(
+        problem, state, used, every.residuals(state), scale, cameras.information, cameras.scores, iterations
+    )
 
 
 def _spread(norms: Array) -> float:

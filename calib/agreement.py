@@ -25,13 +25,15 @@ class Placed:
 
     What two calibrations with the same lens files share is no difference between them: `lenses` holds, by camera, how
     all poses change with its lens (6C, 4), log f, cx, cy and k1, and the standard deviations (4,) of these in the file;
-    `covariance` is then what comes on top.
+    `covariance` is then what comes on top. Where nothing that was seen or measured tells the scale, they are not
+    `metric`, and only their shape is compared.
     """
 
     names: Sequence[str]
     cameras: Array
     covariance: Array
     lenses: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    metric: bool = True
 
     @classmethod
     def of_rig(cls, rig: Rig) -> "Placed":
@@ -47,7 +49,18 @@ class Placed:
         rows = [list(self.names).index(name) for name in names]
         joint = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in rows])
         lenses = {name: (by_lens[joint], sigma) for name, (by_lens, sigma) in self.lenses.items()}
-        return Placed(list(names), self.cameras[rows], self.covariance[np.ix_(joint, joint)], lenses)
+        return Placed(
+            list(names), self.cameras[rows], self.covariance[np.ix_(joint, joint)], lenses, self.metric
+        )
+
+    def sized_as(self, other: "Placed") -> "Placed":
+        """These cameras, as far apart as the same ones of another calibration on average."""
+        mine, wanted = (np.linalg.norm(np.std(p.cameras[:, :3, 3], axis=0)) for p in (self, other))
+        factor = float(wanted / mine)
+        cameras, unit = self.cameras.copy(), np.tile([1.0] * 3 + [factor] * 3, len(self.names))
+        cameras[:, :3, 3] *= factor
+        lenses = {name: (unit[:, None] * by_lens, sigma) for name, (by_lens, sigma) in self.lenses.items()}
+        return Placed(self.names, cameras, unit[:, None] * self.covariance * unit, lenses, self.metric)
 
     def apart(self, other: "Placed") -> Array:
         """(6C, 6C) covariance of the difference from the same cameras in another calibration."""
@@ -113,8 +126,9 @@ class Agreement:
 def compare(first: Placed, second: Placed) -> Agreement:
     """Test whether two independent calibrations of the same cameras differ by no more than their covariances say.
 
-    The difference of the poses in each camera's own frame is projected on what no motion of the world changes; of that,
-    both covariances add, whatever world each was expressed in.
+    The difference of the poses in each camera's own frame is projected on what no motion of the world changes, and no
+    change of its scale where one of the two has none; of that, both covariances add, whatever world each was expressed
+    in.
 
     Raises:
         CalibrationError: fewer than two cameras are in both.
@@ -126,6 +140,7 @@ def compare(first: Placed, second: Placed) -> Agreement:
             "to compare"
         )
     a, b = first.select(names), second.select(names)
+    b = b if a.metric and b.metric else b.sized_as(a)
     chi2, degrees, probability = _test(a, b)
     others = {name: [n for n in names if n != name] for name in names} if len(names) > 2 else {}
     alone = {name: _test(a.select(rest), b.select(rest))[2] for name, rest in others.items()}
@@ -148,12 +163,12 @@ def _test(a: Placed, b: Placed) -> tuple[float, int, float]:
 
     off = _differences(a, b, _common(a, b)).ravel()
     gauge = np.vstack([adjoint(invert(T)) for T in a.cameras])  # the world turned and shifted
+    if not (a.metric and b.metric):  # and grown
+        local = np.einsum("cji,cj->ci", a.cameras[:, :3, :3], a.cameras[:, :3, 3])
+        gauge = np.column_stack([gauge, np.hstack([np.zeros_like(local), local]).ravel()])
     rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-    covariance = rest.T @ a.apart(b) @ rest
-    values, vectors = np.linalg.eigh(covariance)
-    known = values > 1e-9 * values.max()  # a distance that only carries the scale is known without error
-    squared = float((((vectors.T @ (rest.T @ off))[known]) ** 2 / values[known]).sum())
-    degrees = int(known.sum())
+    off, covariance = rest.T @ off, rest.T @ a.apart(b) @ rest
+    squared, degrees = float(off @ np.linalg.solve(covariance, off)), len(off)
     return squared, degrees, float(distribution.sf(squared, degrees))
 
 

@@ -4,9 +4,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.outcome import Calibration
 from calib.problem import LENS
 from calib.triangulation import camera_jacobians
-from calib.wand import Calibration
 
 Array = NDArray[np.float64]
 
@@ -21,11 +21,11 @@ def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance:
     return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))
 
 
-def lens_to_blame(result: Calibration, k: int, uv: Array, distance: float) -> str:
+def lens_to_blame(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> str:
     """The camera by whose lens, were it known, these points would be known best; empty where all lenses together would
-    not halve the variance."""
-    J, adjusted = _image_jacobians(result, k, uv, distance), result.adjusted
-    covariance, lens = adjusted.joint_covariance(), [adjusted.problem.free.index(p) for p in LENS]
+    not halve the variance. `covariance` (C, d, C, d) is that of all cameras' parameters."""
+    J = _image_jacobians(result, k, uv, distance)
+    lens = [result.adjusted.problem.free.index(p) for p in LENS]
     of_lenses = covariance[:, lens][:, :, :, lens]
     moved = np.einsum("nip,pcl->nicl", J, covariance[k][:, :, lens])
     told = [_explained(moved[:, :, c], of_lenses[c, :, c]) for c in range(len(of_lenses))]

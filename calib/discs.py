@@ -100,17 +100,18 @@ def _entries(M: Array) -> Array:
     return np.stack([M[..., 0, 0], M[..., 1, 1], np.sqrt(2) * M[..., 0, 1]], axis=-1)
 
 
-def _misfit(Pn: Array, lacking: Array) -> Array:
-    return _entries(Pn[..., :, None] * Pn[..., None, :]) - _entries(lacking)
-
-
 def _try_directions(count: int, knot: Index, P: Array, lacking: Array, toward: Array) -> Array:
+    """(K, 3) the best of some directions by moment. With m = P n, |m m' - L|^2 = |m|^4 - 2 m' L m + |L|^2."""
     tried = fibonacci_sphere(DIRECTIONS)
-    off = (_misfit((P @ tried.T).swapaxes(1, 2), lacking[:, None]) ** 2).sum(axis=2) / SHAPE_SIGMA**2
-    cost = np.minimum(off, SHAPE_LIMIT) + SHAPE_LIMIT * (toward @ tried.T < 0)
-    total = np.zeros((count, DIRECTIONS))
-    np.add.at(total, knot, cost)
-    return tried[total.argmin(axis=1)]
+    order = np.argsort(knot, kind="stable")
+    P, L, first = P[order], lacking[order], np.flatnonzero(np.diff(knot[order], prepend=-1))
+    x, y = P[:, 0] @ tried.T, P[:, 1] @ tried.T
+    across = L[:, 0, 0, None] * x**2 + 2 * L[:, 0, 1, None] * x * y + L[:, 1, 1, None] * y**2
+    off = ((x**2 + y**2) ** 2 - 2 * across + (L**2).sum(axis=(1, 2))[:, None]) / SHAPE_SIGMA**2
+    cost = np.minimum(off, SHAPE_LIMIT) + SHAPE_LIMIT * (toward[order] @ tried.T < 0)
+    best = np.zeros(count, np.intp)
+    best[knot[order][first]] = np.add.reduceat(cost, first).argmin(axis=1)
+    return tried[best]
 
 
 def fibonacci_sphere(n: int) -> Array:
@@ -128,7 +129,7 @@ def _refine(normals: Array, knot: Index, P: Array, lacking: Array) -> Array:
     e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
     plane = np.stack([e1, np.cross(normals, e1)], axis=2)
     Pn = np.einsum("nij,nj->ni", P, normals[knot])
-    r, Pe = _misfit(Pn, lacking), P @ plane[knot]
+    r, Pe = _entries(Pn[:, :, None] * Pn[:, None] - lacking), P @ plane[knot]
     J = np.stack(
         [_entries(Pe[:, :, k, None] * Pn[:, None] + Pn[:, :, None] * Pe[:, None, :, k]) for k in (0, 1)], 2
     )

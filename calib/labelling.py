@@ -95,8 +95,9 @@ def label(
         _Spacing(wand, lenses, seen).label(labels, reason)
         labels = follow(frames, seen, labels, len(wand.markers))
     left_out = [Counter() for _ in lenses]
-    for frame in np.setdiff1d(np.arange(len(frames.t_s)), seen.frame[labels >= 0]).tolist():
-        left_out[frames.camera[frame]][str(reason[frame])] += 1
+    without = np.setdiff1d(np.arange(len(frames.t_s)), seen.frame[labels >= 0])
+    for camera, why in zip(frames.camera[without].tolist(), reason[without].tolist(), strict=True):
+        left_out[camera][why] += 1
     rows = np.flatnonzero(labels >= 0)
     labelled = seen.select(rows)
     labelled.label[:] = labels[rows]
@@ -142,9 +143,8 @@ class _Spacing:
             best, ambiguous = _choose(fits, len(rows))
             frames = self.seen.frame[rows[:, 0]]
             reason[frames[ambiguous]] = "ambiguous"
-            for at, chosen in zip(fits.frame[best], fits.rows[best], strict=True):
-                known = chosen >= 0
-                labels[rows[at, chosen[known]]] = np.flatnonzero(known)
+            fit, marker = np.nonzero(fits.rows[best] >= 0)
+            labels[rows[fits.frame[best][fit], fits.rows[best][fit, marker]]] = marker
 
     def _batches(self) -> Iterator[Index]:
         """(F, n) rows of frames of n detections."""

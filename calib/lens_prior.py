@@ -100,7 +100,7 @@ def _parts(
     for kind in np.tile(np.unique(KINDS), SWEEPS if rough.any() else 0):
         tried = np.where(kind == KINDS, PARTS[:, None], parts)
         trials = np.where(rough, tried[:, None], 1.0) * sigma
-        likely = np.array([_log_marginal(information, gradient, trial.ravel()) for trial in trials])
+        likely = _log_marginals(information, gradient, trials.reshape(len(PARTS), -1))
         weight = prior * np.exp(likely - likely.max())
         parts[kind == KINDS] = max(np.sqrt(weight @ PARTS**2 / weight.sum()), LEAST)
     return np.where(rough, parts, 1.0)
@@ -117,12 +117,12 @@ def _told_by_wave(adjusted: Adjusted) -> tuple[Array, Array]:
     return (whole - known) / noise, whole @ adjusted.state.lenses[sought].ravel() / noise
 
 
-def _log_marginal(information: Array, gradient: Array, sigma: Array) -> float:
-    """Log likelihood of parameters' deviations (n,), the parameters integrated out: with S = diag(sigma),
+def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:
+    """(t,) log likelihoods of parameters' deviations (t, n), the parameters integrated out: with S = diag(sigma),
     g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
-    root = np.linalg.cholesky(np.eye(len(sigma)) + sigma[:, None] * information * sigma)
-    pulled = np.linalg.solve(root, sigma * gradient)
-    return float(pulled @ pulled / 2 - np.log(np.diag(root)).sum())
+    root = np.linalg.cholesky(np.eye(len(gradient)) + sigma[:, :, None] * information * sigma[:, None])
+    pulled = np.linalg.solve(root, (sigma * gradient)[:, :, None])[:, :, 0]
+    return np.asarray((pulled**2).sum(axis=1) / 2 - np.log(np.einsum("tnn->tn", root)).sum(axis=1), float)
 
 
 def written(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib.camera import pixel_jacobians
 from calib.problem import PER_CAMERA, POSE, Observations, Problem, State
-from calib.trajectory import hermite_rate, interpolate, locate, whitened_motion
+from calib.trajectory import Place, hermite_rate, interpolate, locate, whitened_motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -44,6 +44,26 @@ class Errors:
         smoothness at `slack`; either may be infinite."""
         smooth = self.size * cauchy(self.strain**2, slack)
         return 0.5 * float(cauchy(self.seen**2, scale) + smooth + self.rest)
+
+
+@dataclass(frozen=True, slots=True)
+class _Passage:
+    """What was observed, on the trajectory: when (n,), where in it, Hermite weights `h` (n, 4) of positions, and the
+    marker's places and velocities at the knots before and after, `ends` (n, 4, 3)."""
+
+    t_s: Array
+    place: Place
+    h: Array
+    ends: Array
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) world."""
+        return (self.h[:, None] @ self.ends)[:, 0]
+
+    def velocity(self, knot_s: Array) -> Array:
+        """(n, 3) world."""
+        return (hermite_rate(knot_s, self.t_s, self.place)[:, None] @ self.ends)[:, 0]
 
 
 @dataclass(slots=True)
@@ -84,20 +104,20 @@ class Linearisation:
 
     def positions(self, state: State) -> Array:
         """Where the observed markers were when they were observed, (n, 3), world."""
-        return self._place(state)[2]
+        return self._pass(state).points
 
-    def _place(self, state: State) -> tuple[Index, Array, Array, Array]:
-        """Links (n,), Hermite weights (n, 4) of positions, and positions and velocities (n, 3) of what was observed."""
-        t_s, knot_s = self.times(state), self.problem.knot_s
+    def _pass(self, state: State) -> "_Passage":
+        """Where what was observed was."""
+        t_s, knot_s, motion = self.times(state), self.problem.knot_s, state.motion
         place = locate(knot_s, t_s, self.problem.gap_s)
-        h, rate = interpolate(knot_s, t_s, place), hermite_rate(knot_s, t_s, place)
-        ends = state.motion[place.link[:, None] + [0, 1]].reshape(len(t_s), 4, -1, 3)
-        marker = np.einsum("nb,nhbx->nhx", self.problem.wand.weights[self.observations.label], ends)
-        return place.link, h, np.einsum("nh,nhx->nx", h, marker), np.einsum("nh,nhx->nx", rate, marker)
+        ends = np.concatenate([motion[place.link], motion[place.link + 1]], axis=1)
+        weights = self.problem.wand.weights[self.observations.label]
+        marker = (weights[:, None, None] @ ends)[:, :, 0]
+        return _Passage(t_s, place, interpolate(knot_s, t_s, place), marker)
 
     def residuals(self, state: State) -> Array:
         """Seen less expected (n, 2), pixels; NaN behind the camera."""
-        points, out = self._place(state)[2], np.empty((len(self.observations), 2))
+        points, out = self.positions(state), np.empty((len(self.observations), 2))
         for c, lens in enumerate(self.problem.lenses):
             rows, T = self.observations.camera == c, state.cameras[c]
             local = (points[rows] - T[:3, 3]) @ T[:3, :3]
@@ -106,15 +126,30 @@ class Linearisation:
 
     def weigh(self, state: State) -> None:
         """Set what whitens residuals: the detector's covariance, and what is not known of the motion between knots."""
-        place = locate(self.problem.knot_s, self.times(state), self.problem.gap_s)
-        spread = self.problem.density * place.spread
-        J = self._jacobians(state)[2]
+        passage = self._pass(state)
+        spread = self.problem.density * passage.place.spread
+        J = self._by_point(state, passage.points)
         cov = self.observations.cov + spread[:, None, None] * J @ np.swapaxes(J, 1, 2)
         self.root = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), float)
 
+    def _by_point(self, state: State, points: Array) -> Array:
+        """(n, 2, 3) how what is expected changes with the marker's place in the world."""
+        J = np.zeros((len(points), 2, 3))
+        for c, given in enumerate(self.problem.lenses):
+            rows, T = np.flatnonzero(self.observations.camera == c), state.cameras[c]
+            local = (points[rows] - T[:3, 3]) @ T[:3, :3]
+            J[rows] = np.nan_to_num(state.lens(c, given).project_with_jacobian(local)[1] @ T[:3, :3].T)
+        return J
+
+    def select(self, rows: NDArray[np.bool_], broken: NDArray[np.bool_]) -> "Linearisation":
+        """The observations that a mask names, whitened as they are here, and intervals `broken` (L,)."""
+        kept = Linearisation(self.problem, self.observations.select(rows), broken)
+        kept.root = self.root[rows]
+        return kept
+
     def whitened(self, state: State) -> Array:
         """Residuals in units of their standard deviation (n, 2); 1e4 behind the camera."""
-        return np.nan_to_num(np.einsum("nij,nj->ni", self.root, self.residuals(state)), nan=1e4)
+        return np.nan_to_num((self.root @ self.residuals(state)[:, :, None])[:, :, 0], nan=1e4)
 
     def errors(self, state: State) -> "Errors":
         """Everything that is measured or known, against a state."""
@@ -155,11 +190,11 @@ class Linearisation:
             terms.append(((a, b), tuple(rows), np.array([1 - np.linalg.norm(gap) / distance]) / FIXED))
         return terms
 
-    def _jacobians(self, state: State) -> tuple[Array, Array, Array]:
+    def _jacobians(self, state: State, passage: "_Passage") -> tuple[Array, Array, Array]:
         """Residuals (n, 2), and the derivatives of what is expected by the camera's parameters (n, 2, d) and by the
         marker's place in the world (n, 2, 3)."""
         seen, free = self.observations, list(self.problem.free)
-        _, _, points, velocity = self._place(state)
+        points, velocity = passage.points, passage.velocity(self.problem.knot_s)
         since = seen.t_s - self.problem.middle_s
         error, J_point = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 3))
         J_camera = np.zeros((len(seen), 2, PER_CAMERA))
@@ -171,23 +206,29 @@ class Linearisation:
             error[rows] = np.nan_to_num(seen.uv[rows] - uv)
             J_point[rows] = J @ T[:3, :3].T
             J_camera[rows, :, :6], J_camera[rows, :, 8:] = J_pose, J_lens
-            J_camera[rows, :, 6] = np.einsum("nij,nj->ni", J_point[rows], velocity[rows])
-            J_camera[rows, :, 7] = J_camera[rows, :, 6] * since[rows, None]
+        J_camera[:, :, 6] = (J_point @ velocity[:, :, None])[:, :, 0]
+        J_camera[:, :, 7] = J_camera[:, :, 6] * since[:, None]
         return error, J_camera[:, :, free], J_point
 
-    def relinearise(self, state: State, weight: Array, link_weight: Array) -> None:
-        """Make the system around `state`, observations weighted by `weight` (n,), smoothness by `link_weight`."""
-        link, h, _, _ = self._place(state)
-        error, J_camera, J_point = self._jacobians(state)
+    def relinearise(
+        self, state: State, weight: Array | None = None, link_weight: Array | None = None
+    ) -> None:
+        """Make the system around `state`, observations weighted by `weight` (n,), smoothness by `link_weight` (L,); 1
+        each unless given."""
+        weight = np.ones(len(self.observations)) if weight is None else weight
+        link_weight = np.ones(len(self.smooth)) if link_weight is None else link_weight
+        passage = self._pass(state)
+        error, J_camera, J_point = self._jacobians(state, passage)
         root = np.sqrt(weight)[:, None, None] * self.root
         weights = self.problem.wand.weights[self.observations.label]
-        J_knots = np.einsum("nrx,nh,nb->nrhbx", root @ J_point, h, weights).reshape(len(h), 2, -1)
-        error = np.einsum("nij,nj->ni", root, error)[:, :, None]
-        rows = np.concatenate([J_knots, root @ J_camera, error], axis=2)
-        view = link * len(self.problem.lenses) + self.observations.camera
-        self.views, first = np.unique(np.sort(view), return_index=True)
-        self.ends = 2 * np.append(first, len(view))
-        self.rows = rows[np.argsort(view, kind="stable")].reshape(-1, rows.shape[2])
+        by_basis = (passage.h[:, :, None] * weights[:, None]).reshape(len(error), 1, -1, 1)
+        J_knots = (by_basis * (root @ J_point)[:, :, None]).reshape(len(error), 2, -1)
+        rows = np.concatenate([J_knots, root @ J_camera, root @ error[:, :, None]], axis=2)
+        view = passage.place.link * len(self.problem.lenses) + self.observations.camera
+        order = np.argsort(view, kind="stable")
+        first = np.flatnonzero(np.diff(view[order], prepend=-1))
+        self.views, self.ends = view[order][first], 2 * np.append(first, len(view))
+        self.rows = rows[order].reshape(-1, rows.shape[2])
         self._hold_motion(state, link_weight)
         self.rig = self._rig_terms(state)
 

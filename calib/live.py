@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from calib.coverage import Coverage
 from calib.errors import CalibrationError
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig
+from calib.rig import Rig
 from camera_node.messages import Detections, Keys, MessageError, decode, encode
 
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
@@ -131,7 +131,7 @@ def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:
         lambda status: listening.set() if status.matching else listening.clear()
     )
     taken = publisher.matching_status or listening.wait(DELIVERY_S)
-    publisher.put(encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+    publisher.put(encode(RigMessage.of(rig)))
     listener.undeclare()
     publisher.undeclare()
     return taken

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What calibration says over Zenoh, in the encoding of `camera_node.messages`; the key is `Keys.rig`."""
 
-import msgspec
+import time
 
-from camera_node.messages import VERSION
+import msgspec
+import yaml
+
+from calib.rig import Rig, dump_rig
+from camera_node.messages import VERSION, MessageError
 
 
 class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -12,3 +16,19 @@ class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
     version: int = VERSION
     t_ns: int
     yaml: str
+
+    @classmethod
+    def of(cls, rig: Rig) -> "RigMessage":
+        """A rig that is in force from now on."""
+        return cls(t_ns=time.time_ns(), yaml=dump_rig(rig))
+
+    def rig(self) -> Rig:
+        """The rig that it tells of.
+
+        Raises:
+            MessageError: the text is no rig.yaml; in one line.
+        """
+        try:
+            return msgspec.yaml.decode(self.yaml, type=Rig)
+        except (msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+            raise MessageError(f"no rig.yaml: {' '.join(str(error).split())[:200]}") from None

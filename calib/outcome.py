@@ -3,6 +3,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.lengths import measure_lengths
+from calib.lens_change import find_changes
 from calib.lens_prior import written
 from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations
 from calib.report import CameraReport, Outlier, WandReport
@@ -47,6 +49,24 @@ class Calibration:
     time_sigma_ms: Array
     drift_ppm: Array
     drift_sigma_ppm: Array
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the `calibration` map of `rig.yaml`: the report, clocks where the data want any, and what the wave
+        changed of the lenses."""
+        columns = {
+            "time_offset_ms": (self.time_offset_ms, self.time_sigma_ms),
+            "drift_ppm": (self.drift_ppm, self.drift_sigma_ppm),
+        }
+        clocks = {what: self._by_camera(*column) for what, column in columns.items() if (column[1] > 0).any()}
+        changes = find_changes(self.names, self.adjusted)
+        lenses = {name: change.as_dict() for name, change in changes.items()}
+        return {**self.report.as_dict(), **clocks, "adjusted_lenses": lenses}
+
+    def _by_camera(self, values: Array, sigmas: Array) -> dict[str, dict[str, float]]:
+        return {
+            name: {"value": round(float(value), 4), "sigma": round(float(sigma), 4)}
+            for name, value, sigma in zip(self.names, values, sigmas, strict=True)
+        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,7 +95,8 @@ class Pairs:
         seen, rows = self.seen, self.rows[a]
         near = self._near(rows, b)
         shift_s = find_shift(self.tracks[b], seen.label[near], seen.t_s[near], seen.xy[near], self.gap_s)
-        together, apart = self._motion(a, b, near, 0.0), self._motion(a, b, near, shift_s)
+        together = self._motion(a, b, near, 0.0)
+        apart = self._motion(a, b, near, shift_s) if shift_s else together
         if shift_s and not _tells(together, apart, len(np.unique(seen.t_s[near]))):
             shift_s, apart = 0.0, together
         if apart is None:

@@ -86,9 +86,9 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     problem = replace(problem.freeing(POSE, OFFSET), sought=(this,))
     state = find_robustly(problem, observations, state)
     observations = with_disc_centres(wave, problem, state, observations)
-    first = widen(adjust(problem.freeing(POSE, OFFSET, LENS), observations, state), observations)
+    first = widen(adjust(problem.freeing(POSE, OFFSET, LENS), observations, state))
     check_lenses(recording.names, first)
-    adjusted = widen(adjust(settle(first.problem, first), observations, first.state), observations)
+    adjusted = widen(adjust(settle(first.problem, first), observations, first.state))
     check_agreement(recording.names, adjusted, observations)
     return _conclude(rig, name, this, adjusted, observations)
 

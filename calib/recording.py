@@ -79,6 +79,11 @@ def iterate(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[st
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
 
+def wave_beside(rig: Path) -> Path:
+    """Where the wave is kept by which a rig was made."""
+    return rig.with_name(f"{rig.stem}.wave.mcap")
+
+
 def save_wave(path: Path, arena: str, messages: Iterable[Detections]) -> Path | None:
     """Write a wave's detections as `fusion record` would, as if each had arrived at once; never a part of them.
 

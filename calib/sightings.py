@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,16 @@ from camera_node.messages import Detections
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+HEADER = ("camera", "t_ns")
+# Of a message: what its columns hold, and how many of them a roundel has (`Detections`).
+COLUMNS = {
+    "uv": ("<f8", 2),
+    "cov": ("<f4", 3),
+    "axes_px": ("<f4", 2),
+    "angle_rad": ("<f4", 1),
+    "id": ("<i4", 1),
+}
 
 
 class Ellipses(Protocol):
@@ -95,33 +106,33 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
-    origin_ns = min(message.t_ns for message in messages)
-    camera = np.array([index[message.camera] for message in messages], np.intp)
-    t_s = np.array([message.t_ns - origin_ns for message in messages]) * 1e-9
-    frame = np.repeat(np.arange(len(messages)), [len(message) for message in messages])
-    uv = _column(messages, "uv", "<f8", 2)
+    camera_of, t_ns, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
+    origin_ns = min(t_ns)
+    camera = np.array([index[name] for name in camera_of], np.intp)
+    t_s = (np.array(t_ns) - origin_ns) * 1e-9
+    tables = [_table(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
+    uv, cov, axes_px, angle_rad, number = tables
+    frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])
     xy = np.full(uv.shape, np.nan)
     for k, lens in enumerate(lenses):
         mine = camera[frame] == k
         xy[mine] = lens.normalise(uv[mine])
-    cov = _column(messages, "cov", "<f4", 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     every = Sightings(
         camera[frame],
         frame,
         t_s[frame],
-        _column(messages, "id", "<i4", 1)[:, 0].astype(np.intp),
+        number[:, 0].astype(np.intp),
         uv,
-        cov,
-        _column(messages, "axes_px", "<f4", 2),
-        _column(messages, "angle_rad", "<f4", 1)[:, 0],
+        cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
+        axes_px,
+        angle_rad[:, 0],
         xy,
     )
     return Frames(camera, t_s, origin_ns), every.select(np.flatnonzero(np.isfinite(xy).all(axis=1)))
 
 
-def _column(messages: Sequence[Detections], name: str, dtype: str, width: int) -> Array:
-    data = b"".join(getattr(message, name) for message in messages)
-    return np.frombuffer(data, dtype).reshape(-1, width).astype(float)
+def _table(data: Sequence[bytes], dtype: str, width: int) -> Array:
+    return np.frombuffer(b"".join(data), dtype).reshape(-1, width).astype(float)
 
 
 def ranges(lenses: Sequence[Lens], seen: Ellipses, diameter_m: float) -> Array:

@@ -61,7 +61,7 @@ def solve(
     centred = with_disc_centres(wave, problem, state, observations)
     few = adjust(problem, centred, state)
     check_lenses(wave.names, few)
-    judged = widen(few, centred)
+    judged = widen(few)
     free = [LENS, *(part for part in clocks if _tells(judged, part))]
     offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
     drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
@@ -79,7 +79,7 @@ def solve(
     if metric:
         check_sizes(wave.wand, adjusted, observations)
         check_spacing(wave.wand, adjusted, observations)
-    return Solution(widen(adjusted, observations), observations)
+    return Solution(widen(adjusted), observations)
 
 
 def _around(

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from calib.blame import lens_to_blame, pose_px
 from calib.camera import Camera, transform
 from calib.coverage import Coverage, cell_centres, enumerate_words
+from calib.outcome import Calibration
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.report import CameraReport
 from calib.triangulation import Joint
-from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.pose import invert
 
@@ -212,18 +212,18 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
     """
     wave = waved_points(result)
     rows = {row.name: row for row in result.report.cameras}
+    noise, joint = result.adjusted.by_noise(), result.adjusted.joint_covariance()
     cameras = [
-        _assess_camera(
-            result, k, rows[name], wave, {n: result.rig.cameras[n] for n in result.names if n != name}
-        )
-        for k, name in enumerate(result.names)
+        _assess_camera(result, k, rows[name], wave, noise, joint) for k, name in enumerate(result.names)
     ]
     length, extent = result.report.length_mean_mm, np.linalg.norm(np.ptp(wand.points, axis=0))
     expected = None
     if result.report.metric:
         low, high = np.quantile(wave[:, :2], [0.02, 0.98], axis=0)
         placed = [result.rig.cameras[name] for name in result.names]
-        expected = map_precision(placed, low, high, height_m, sigma_px, joint_of(result))
+        size = joint.shape[0] * joint.shape[1]
+        doubt = Joint(result.adjusted.problem.free, joint.reshape(size, size))
+        expected = map_precision(placed, low, high, height_m, sigma_px, doubt)
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     return Trust(cameras, unplaced, off, expected)
@@ -236,26 +236,25 @@ def waved_points(result: Calibration) -> Array:
 
 
 def _assess_camera(
-    result: Calibration, k: int, row: CameraReport, wave: Array, others: dict[str, Camera]
+    result: Calibration, k: int, row: CameraReport, wave: Array, noise: Array, joint: Array
 ) -> CameraTrust:
+    """Camera k, by covariances (C, d, C, d) of all cameras: by the wave's noise alone, and by all that is unknown."""
     camera = result.rig.cameras[row.name]
     seen = result.observations
     uv = seen.uv[(seen.camera == k) & result.adjusted.used]
     coverage = Coverage.of(uv, camera.width, camera.height, CELLS)
     distances = np.linalg.norm(wave - camera.matrix()[:3, 3], axis=1)
-    useful = shared_cells(camera, list(others.values()), np.quantile(distances, DEPTHS))
-    distance, adjusted = float(np.median(distances)), result.adjusted
-    noise_px, known_px = (
-        pose_px(result, k, uv, distance, covariance)
-        for covariance in (adjusted.by_noise(), adjusted.joint_covariance())
-    )
+    others = [result.rig.cameras[name] for name in result.names if name != row.name]
+    useful = shared_cells(camera, others, np.quantile(distances, DEPTHS))
+    distance = float(np.median(distances))
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": known_px,
+        "pose_px": pose_px(result, k, uv, distance, joint),
         "unused": 1 - coverage.share(useful),
     }
-    lens = lens_to_blame(result, k, uv, distance)
+    lens = lens_to_blame(result, k, uv, distance, joint)
+    noise_px = pose_px(result, k, uv, distance, noise)
     return CameraTrust(row.name, coverage, useful, figures, lens, noise_px)
 
 
@@ -268,10 +267,3 @@ def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> NDAr
         for other in others:
             shared |= other.sees(other.project_world(points))
     return shared.reshape(CELLS)
-
-
-def joint_of(result: Calibration) -> Joint:
-    """The covariance of everything that the adjustment sought of the cameras: poses, clocks, lenses."""
-    covariance = result.adjusted.joint_covariance()
-    size = covariance.shape[0] * covariance.shape[1]
-    return Joint(result.adjusted.problem.free, covariance.reshape(size, size))

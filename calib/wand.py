@@ -24,8 +24,6 @@ from camera_node.body import Body
 from camera_node.lens import Lens
 from camera_node.messages import Detections
 
-__all__ = ["Calibration", "calibrate", "check_recording"]
-
 Array = NDArray[np.float64]
 
 

@@ -24,9 +24,12 @@ from calib.errors import CalibrationError
 from calib.live import Heard, listen
 from calib.rig import Rig
 from calib.scale import Distance
+from calib.trust import assess
+from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 
+MOST_S = 180.0  # that a wave may last when it ends by itself
 TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions
 TRIAL_FRAMES = 150  # of each camera: a solution of a second or less
 BLOCK_S = 0.5  # frames that are taken or left together, so that the motion between them is known
@@ -226,9 +229,6 @@ def try_part(
     rig: Rig, wand: Body, distance: Distance | None, part: Sequence[Detections], share: float
 ) -> Trial:
     """Solve a part, `share` of all frames, and say what all of them would give."""
-    from calib.trust import assess
-    from calib.wand import calibrate
-
     try:
         result = calibrate(rig, wand, part, distance)
     except CalibrationError as error:

@@ -12,8 +12,10 @@ from typing import Annotated, Literal
 import tyro
 
 from camera_node.config import is_name
-from camera_node.errors import ConfigError, run
-from camera_node.source import Replay, SourceSettings, open_source
+from camera_node.errors import ConfigError, check_command, run
+from camera_node.frame import SourceSettings
+from camera_node.replay import Replay
+from camera_node.source import open_source
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ def main() -> None:
 
 def _program() -> int | None:
     arguments = sys.argv[1:]
+    check_command(arguments, ("detect", "print"))
     name = arguments[0] if arguments else ""
     if name == "detect":
         from camera_node.detect import Detect

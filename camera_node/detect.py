@@ -18,8 +18,8 @@ from camera_node.draw import draw_roundels
 from camera_node.errors import ConfigError
 from camera_node.lens import Lens, load_lens
 from camera_node.pixels import Grey
+from camera_node.replay import read_grey
 from camera_node.roundels import Roundel, Roundels
-from camera_node.source import read_grey
 
 
 @dataclass(frozen=True, kw_only=True)

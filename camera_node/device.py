@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import cv2
 
 from camera_node.errors import CameraError
+from camera_node.frame import Frame, SourceSettings
 from camera_node.pixels import RAW, grey
-from camera_node.source import Frame, SourceSettings
 
 log = logging.getLogger("camera_node.device")
 

@@ -12,9 +12,10 @@
 Every message says what is wrong, where, and what to do. Faults in live data are never raised: they are counted.
 """
 
+import difflib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 
 class RoundelError(Exception):
@@ -46,3 +47,12 @@ def run(program: Callable[[], int | None]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code or 0)
+
+
+def check_command(arguments: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ConfigError where the first argument is meant as a command, and is none of those known."""
+    if not arguments or arguments[0].startswith("-") or arguments[0] in known:
+        return
+    meant = difflib.get_close_matches(arguments[0], known, 1)
+    hint = f"did you mean {meant[0]}?" if meant else f"there are {', '.join(known)}"
+    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} (--help tells the options)")

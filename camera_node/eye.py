@@ -8,10 +8,10 @@ import msgspec
 
 from camera_node.detector import Detector
 from camera_node.errors import ConfigError
+from camera_node.frame import Source
 from camera_node.messages import Settings
 from camera_node.pixels import Grey
 from camera_node.roundels import Roundels
-from camera_node.source import Source
 
 OF_THE_SOURCE = ("exposure_us", "gain")
 OF_THE_DETECTOR = tuple(set(Settings.__struct_fields__) - {"version", *OF_THE_SOURCE})

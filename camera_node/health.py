@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.frame import Frame
 from camera_node.messages import CameraStatus
 from camera_node.pixels import Grey
 from camera_node.roundels import Roundels
-from camera_node.source import Frame
 
 THERMAL = Path("/sys/class/thermal")
 FULL = 250  # grey levels from which a pixel counts as saturated

@@ -14,9 +14,11 @@ import zenoh
 from camera_node.clock import Clock
 from camera_node.draw import draw_roundels
 from camera_node.eye import Eye
+from camera_node.frame import Frame, Source
 from camera_node.health import Health
 from camera_node.messages import CameraStatus, Detections, Keys, Settings, encode
 from camera_node.network import ServerWatch
+from camera_node.replay import Replay
 from camera_node.requests import (
     RequestError,
     encode_jpeg,
@@ -28,7 +30,6 @@ from camera_node.requests import (
     respond,
 )
 from camera_node.roundels import Roundels
-from camera_node.source import Frame, Replay, Source
 
 log = logging.getLogger("camera_node")
 

@@ -11,8 +11,8 @@ from rich.progress import track
 from camera_node.detector import Detector
 from camera_node.errors import CameraError, ConfigError
 from camera_node.messages import Detections
+from camera_node.replay import FolderSource
 from camera_node.roundels import Roundels
-from camera_node.source import FolderSource
 
 SIGMA_PX = 0.3  # of a centre whose file does not say better
 Rows = dict[tuple[int, str], list[tuple[float, float, int]]]

@@ -16,10 +16,10 @@ from rich.progress import track
 
 from camera_node.config import write_atomically
 from camera_node.errors import CameraError, ConfigError, run
+from camera_node.frame import Frame
 from camera_node.pose import invert
 from camera_node.rendering import Renderer
 from camera_node.scene import WAND, Scene, SceneCamera
-from camera_node.source import Frame
 
 
 class SimulatedCamera:

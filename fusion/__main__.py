@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m fusion` is the live server; `run`, `record` and `replay` are about recordings."""
+"""The command line: `python -m fusion` is the live server; `run`, `record` and `replay` are about recordings;
+`define` and `undo` ask something of a server that runs."""
 
 import logging
 import signal
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import tyro
 
-from camera_node.errors import run
+from camera_node.errors import check_command, run
+
+# imported when asked for: what runs on a robot's computer has neither GTSAM nor SciPy
+COMMANDS = {
+    "run": "fusion.offline",
+    "replay": "fusion.offline",
+    "record": "fusion.recording",
+    "define": "fusion.defining",
+    "undo": "fusion.undoing",
+}
 
 
 @dataclass(frozen=True)
@@ -18,6 +29,7 @@ class Serve:
 
     For recordings: python -m fusion run | record | replay --help
     For a new robot, measured where it stands: python -m fusion define --help
+    For a camera that was placed anew wrongly: python -m fusion undo --help
     """
 
     config: Path | None = None
@@ -63,18 +75,12 @@ def main() -> None:
 
 
 def _program() -> int:
-    arguments = sys.argv[1:]
-    if arguments[:1] == ["run"]:
-        from fusion.offline import run as command
-    elif arguments[:1] == ["record"]:
-        from fusion.recording import record as command
-    elif arguments[:1] == ["define"]:
-        from fusion.defining import define as command
-    elif arguments[:1] == ["replay"]:
-        from fusion.offline import replay as command
-    else:
-        return tyro.cli(Serve, prog="fusion", args=arguments).run()
-    return tyro.cli(command, prog=f"fusion {arguments[0]}", args=arguments[1:])
+    check_command(sys.argv[1:], tuple(COMMANDS))
+    name, *arguments = sys.argv[1:] or [""]
+    if name not in COMMANDS:
+        return tyro.cli(Serve, prog="fusion").run()
+    command = getattr(import_module(COMMANDS[name]), name)
+    return tyro.cli(command, prog=f"fusion {name}", args=arguments)
 
 
 if __name__ == "__main__":

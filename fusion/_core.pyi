@@ -73,6 +73,9 @@ class ExpectedMarkers:
         N detections in order of their frames: xy (2, N), scale and cov (2, 2, N), major (N,); focal (F,) by frame.
         """
 
+def assign(pairs: Index, costs: Array, frame: Index, /) -> Index:
+    """Rows of pairs (2, K) with costs (K,), each less than 1e4, that go together best; `frame` (N,) of detections."""
+
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
     """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) the derivatives of pixels by these.
 
@@ -81,6 +84,22 @@ def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) of measured ellipses, as discs should look with centre and normal (3, N)."""
+
+def predict(
+    R: Array,
+    p: Array,
+    omega: Array,
+    v: Array,
+    P: Array,
+    dt: Array,
+    densities: Array,
+    single: NDArray[np.bool_],
+    /,
+) -> tuple[Array, Array, Array, Array]:
+    """R (N, 3, 3), p (N, 3) and P (N, 12, 12) after dt (N,) seconds, and T (N, 3, 3): turns' errors by rates'.
+
+    densities (N, 2) and single (N,) as `fusion.state.predict` has them.
+    """
 
 def reweigh(
     rows: Array, body: Index, information: Array, right: Array, weights: Array, /

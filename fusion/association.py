@@ -4,15 +4,13 @@
 Each marker is predicted into each frame at the frame's own time; within a gate of its covariance and apparent size,
 detections are assigned globally, frame by frame: no detection is of two markers. The cost of a pair is its negative
 log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits:
-`native/candidates.cpp` finds the pairs and their costs.
+`native/candidates.cpp` finds the pairs and their costs, `native/assignment.cpp` chooses among them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from fusion import _core
 from fusion.instants import Frame, Instant
@@ -22,18 +20,6 @@ from fusion.state import States
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
-TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pairs:
-    """Candidates: row of the catalogue, row of the sighting, its frame, and what the pair costs."""
-
-    marker: Index
-    sighting: Index
-    frame: Index
-    cost: Array
 
 
 class Association:
@@ -85,7 +71,7 @@ class Association:
 
     def _match(self, sightings: Sightings) -> Matches:
         exposures = sightings.exposures
-        (marker, sighting), cost = self._expected.candidates(
+        pairs, cost = self._expected.candidates(
             self._optics.pose(self._states, exposures),
             sightings.frame,
             sightings.xy,
@@ -94,31 +80,6 @@ class Association:
             sightings.axes_px[0],
             self._optics.focal[exposures.camera],
         )
-        pairs = _Pairs(self._markers[marker], sighting, sightings.frame[sighting], cost)
-        chosen = _assign(pairs)
-        return Matches.of(sighting[chosen], pairs.marker[chosen])
-
-
-def _assign(pairs: _Pairs) -> Index:
-    """The rows of the cheapest pairs, as many as there can be; what has no rival needs no search."""
-    place = pairs.frame * (np.max(pairs.marker, initial=0) + 1) + pairs.marker  # of a marker in a frame
-    rivals = np.maximum(np.bincount(place)[place], np.bincount(pairs.sighting)[pairs.sighting])
-    alone, contested = np.flatnonzero(rivals == 1), np.flatnonzero(rivals > 1)
-    at = pairs.frame[contested]
-    parts = [contested] if len(contested) < TOGETHER else [contested[at == k] for k in set(at.tolist())]
-    return np.concatenate([alone, *(_assign_rivals(pairs, place, part) for part in parts)])
-
-
-def _assign_rivals(pairs: _Pairs, place: Index, rows: Index) -> Index:
-    i, n = _renumber(place[rows])
-    j, m = _renumber(pairs.sighting[rows])
-    costs, number = np.full((n, m), UNMATCHED), np.full((n, m), -1)
-    costs[i, j], number[i, j] = pairs.cost[rows], rows
-    chosen = number[linear_sum_assignment(costs)]
-    return chosen[chosen >= 0]
-
-
-def _renumber(rows: Index) -> tuple[Index, int]:
-    """Rows counted from 0 without gaps, and how many there are."""
-    new = np.cumsum(np.bincount(rows) > 0)
-    return new[rows] - 1, int(new[-1]) if len(new) else 0
+        chosen = _core.assign(pairs, cost, sightings.frame)
+        marker, sighting = pairs[:, chosen]
+        return Matches.of(sighting, self._markers[marker])

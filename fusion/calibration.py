@@ -1,30 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The rig in force: where it comes from, what corrects it, and how that is taken back and kept."""
 
-import time
 from pathlib import Path
 
 import msgspec
-import yaml
 
 from calib.camera import Camera
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, load_rig
-from camera_node.messages import MessageError, decode
+from calib.rig import Rig, load_rig
 from fusion.errors import FusionError
 from fusion.kept import Kept
-
-
-def parse_rig(data: bytes) -> Rig:
-    """The rig of a `RigMessage`'s bytes.
-
-    Raises:
-        MessageError: they are none; in one line.
-    """
-    try:
-        return msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
-    except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise MessageError(" ".join(str(error).split())[:200]) from None
 
 
 class Calibration:
@@ -55,7 +40,7 @@ class Calibration:
     def message(self) -> RigMessage:
         """The rig in force, of which there is one, as a message."""
         assert self.rig is not None
-        return RigMessage(t_ns=time.time_ns(), yaml=dump_rig(self.rig))
+        return RigMessage.of(self.rig)
 
     def correct(self, name: str, camera: Camera) -> None:
         """A camera stands elsewhere."""

@@ -17,8 +17,6 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import msgspec
-import yaml
 import zenoh
 
 from calib.messages import RigMessage
@@ -27,7 +25,7 @@ from camera_node.errors import NetworkError
 from camera_node.messages import Keys, MessageError, decode
 from camera_node.network import open_client
 from fusion.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.requests import change_robots
+from fusion.requests import change_robots, undo_correction
 from fusion.robots import Robot as RobotBody
 
 T = TypeVar("T")
@@ -199,6 +197,15 @@ class Arena:
         request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
         return change_robots(self._session, self.keys.arena, request)
 
+    def undo_correction(self) -> Rig:
+        """Put the camera that the server placed anew last back where it stood; the rig in force then.
+
+        Raises:
+            FusionError: there is nothing to undo; the server's own words.
+            NetworkError: no server answers in time.
+        """
+        return undo_correction(self._session, self.keys.arena)
+
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every instant."""
         return self._stream(self.keys.markers, Markers, "markers", timeout_s)
@@ -224,8 +231,8 @@ class Arena:
 
     def _read_rig(self, data: bytes) -> Rig | None:
         try:
-            return msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
-        except (MessageError, msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError):
+            return decode(data, RigMessage).rig()
+        except MessageError:
             self.faults["RigMessage"] += 1
             return None
 

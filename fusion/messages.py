@@ -65,6 +65,38 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
         return np.frombuffer(self.covariance, "<f4").reshape(12, 12).astype(float)
 
 
+class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
+    """Where all robots of one shard were at `t_ns`, for the other shards: their detections are claimed by it.
+
+    Columns, one row a robot: `motion` (R, 13) <f8 position, quaternion wxyz, velocity and angular velocity,
+    `covariance` (R, 144) <f4; all as in `RobotPose`.
+    """
+
+    version: int = VERSION
+    t_ns: int
+    robots: tuple[str, ...]
+    states: tuple[State, ...]
+    motion: bytes
+    covariance: bytes
+
+    def check(self) -> None:
+        """Raise MessageError unless the columns' sizes agree, the numbers are finite and the quaternions are such."""
+        n = len(self.robots)
+        if (len(self.states), len(self.motion), len(self.covariance)) != (n, 104 * n, 576 * n):
+            raise MessageError(f"columns of other sizes than {n} robots have")
+        motion, covariance = self.motions(), np.frombuffer(self.covariance, "<f4")
+        if not (np.isfinite(motion).all() and np.isfinite(covariance).all() and motion[:, 3:7].any(1).all()):
+            raise MessageError("poses that are not finite, or a quaternion that is zero")
+
+    def motions(self) -> Array:
+        """(R, 13) positions, quaternions, velocities and angular velocities."""
+        return np.frombuffer(self.motion, "<f8").reshape(-1, 13)
+
+    def covariances(self) -> Array:
+        """(R, 12, 12)."""
+        return np.frombuffer(self.covariance, "<f4").reshape(-1, 12, 12).astype(float)
+
+
 class Markers(msgspec.Struct, frozen=True, kw_only=True):
     """Every marker of a fused instant, labelled or not.
 
@@ -145,6 +177,11 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
 def robots_key(arena: str) -> str:
     """The queryable that takes a `RobotsRequest` and answers with `Robots`."""
     return f"{arena}/robots"
+
+
+def shard_key(arena: str, index: int | str) -> str:
+    """Where shard `index`, of several, tells the others of its robots: `ShardPoses` in every instant."""
+    return f"{arena}/fusion/shard/{index}"
 
 
 def undo_key(arena: str) -> str:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import tyro
 import zenoh
 
@@ -50,10 +49,10 @@ class Recording:
             elif key.endswith("/pose"):
                 self.poses.append(decode(data, RobotPose))
             elif key.endswith("/rig") and self.rig is None:
-                self.rig = msgspec.yaml.decode(decode(data, RigMessage).yaml, type=Rig)
+                self.rig = decode(data, RigMessage).rig()
             elif key.endswith("/robots"):
                 self.robots = decode(data, Robots).robots
-        except (MessageError, msgspec.MsgspecError, ValueError):
+        except MessageError:
             self.faults[f"messages on {key} that are none"] += 1
 
 

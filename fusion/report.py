@@ -14,6 +14,7 @@ from fusion.grouping import Marker
 from fusion.instants import Instant
 from fusion.messages import Latency, Markers, RobotPose, State
 from fusion.optics import Optics
+from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Sightings
 from fusion.state import States, wxyz_of
 
@@ -30,6 +31,7 @@ class Told(Protocol):
     states: States
     status: list[State | None]
     owned: NDArray[np.bool_]  # robots whose poses are told
+    shard: Shard
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,12 +76,15 @@ def report(
     instant: Instant,
     sightings: Sightings,
     matches: Matches,
+    seen: Seen,
     free: list[Marker],
     told: dict[int, RobotPose],
 ) -> Fused:
-    """What to tell of an instant after its observations; the poses in `told`, by robot, stay as they were told."""
-    seen = look(tracker, sightings, matches)
-    rest = [k for k, status in enumerate(tracker.status) if status is not None and k not in told]
+    """What to tell of an instant after its observations; the poses in `told`, by robot, stay as they were told.
+
+    Markers are told by the leading shard alone.
+    """
+    rest = [k for k in np.flatnonzero(tracker.owned).tolist() if k not in told]
     poses = told | tell_poses(tracker, instant.t_ns, seen, rest)
     markers = _markers(tracker, instant.t_ns, seen, free)
     usage = _usage(tracker, sightings, matches, free)
@@ -117,7 +122,9 @@ def look(tracker: Told, sightings: Sightings, matches: Matches) -> Seen:
 
 
 def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[int, RobotPose]:
-    """The poses of robots `rows` that are this shard's, by robot; each has a status."""
+    """The poses of those of the robots `rows` that are this shard's and have a status, by robot."""
+    if not rows:
+        return {}
     states, names, status = tracker.states, tracker.optics.names, tracker.status
     p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
     wxyz, residual = wxyz_of(states.R).tolist(), seen.residual_px.tolist()
@@ -144,7 +151,7 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
 
 def _markers(tracker: Told, t_ns: int, seen: Seen, free: list[Marker]) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
-    discs = np.flatnonzero(seen.by_marker.any(1))
+    discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
     owner = tracker.catalogue.robot[discs]
     R, marker = tracker.states.R[owner], tracker.catalogue.marker[:, discs].T
     J = np.concatenate([-R @ skew(marker), np.tile(np.eye(3), (len(discs), 1, 1))], 2)

@@ -17,6 +17,7 @@ from fusion.messages import State
 from fusion.normals import find_normal, rotation_to
 from fusion.optics import Optics
 from fusion.robots import Robot
+from fusion.shards import Shard
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
 from fusion.signature import Fit, fits_size, identify
 from fusion.state import POSITION, States
@@ -46,6 +47,7 @@ class Followed(Protocol):
     states: States
     status: list[State | None]
     owned: NDArray[np.bool_]
+    shard: Shard
 
     def adopt(self, rows: Index, states: States) -> None: ...
 
@@ -78,7 +80,9 @@ class Search:
         self._turn = 0
 
     def find(self, missing: Index, sightings: Sightings, matches: Matches) -> tuple[Matches, list[Marker]]:
-        """The matches with those of the robots found, and the markers that stay nobody's."""
+        """The matches with those of the robots found, and the markers that stay nobody's: these tells the leader."""
+        if not len(missing) and not self.tracker.shard.leads:
+            return matches, []
         single = self.tracker.estimator.single
         bodies, singles = missing[~single[missing]], missing[single[missing]]
         if len(bodies):

@@ -17,17 +17,28 @@ import numpy as np
 import zenoh
 
 from calib.camera import Camera
+from calib.messages import RigMessage
 from calib.rig import load_rig, save_rig
 from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.requests import encode_reply, parse_request, payload_of
-from fusion.calibration import Calibration, parse_rig
+from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health
 from fusion.instants import Instant, Instants
 from fusion.intake import FAR_NS, Intake
 from fusion.kept import Kept
 from fusion.link import Link, open_session
-from fusion.messages import Latency, RobotPose, Robots, RobotsRequest, State, robots_key, undo_key
+from fusion.messages import (
+    Latency,
+    RobotPose,
+    Robots,
+    RobotsRequest,
+    ShardPoses,
+    State,
+    robots_key,
+    shard_key,
+    undo_key,
+)
 from fusion.report import Move, latency_of
 from fusion.robots import changed, load_kept_robots, load_robots, save_robots
 from fusion.shards import Shard
@@ -50,6 +61,7 @@ class Server:
         self.config = config
         self.keys = Keys(config.arena)
         self.shard = Shard.parse(config.shard)
+        self._own_key = shard_key(config.arena, self.shard.index)
         given = Path(config.robots)
         self._kept_robots = Kept("robots", config.kept_robots, load_kept_robots, save_robots)
         kept = self._kept_robots.newer_than(given)
@@ -73,7 +85,7 @@ class Server:
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
         log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
         if self._tracker is None:
-            log.warning("cameras are not calibrated; waiting for a rig on %s", self.keys.rig)
+            log.warning("no camera has a place yet: wave the wand, python -m calib wand --live --help")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -114,7 +126,7 @@ class Server:
         link.subscribe(keys.rig, self._take_rig)
         link.answer_later(robots_key(keys.arena), self._change_robots)
         if self.shard.count > 1:
-            link.subscribe(keys.robot_pose(), self._take_pose)
+            link.subscribe(shard_key(keys.arena, "*"), self._take_shard)
         if self.shard.leads:
             link.answer(keys.clock, self._answer_clock)
             link.answer(keys.rig, self._answer_rig)
@@ -130,7 +142,7 @@ class Server:
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
-            rig = parse_rig(data)
+            rig = decode(data, RigMessage).rig()
         except MessageError as error:
             self.health.count("rig that is no rig")
             log.warning("a published rig is refused, the old one stays: %s", error)
@@ -144,17 +156,19 @@ class Server:
         else:
             self._start()
 
-    def _take_pose(self, data: bytes, key: str, received_ns: int) -> None:
-        """Another shard's robot."""
+    def _take_shard(self, data: bytes, key: str, received_ns: int) -> None:
+        """Another shard's robots."""
+        if key == self._own_key:
+            return
         try:
-            pose = decode(data, RobotPose)
+            told = decode(data, ShardPoses)
         except MessageError:
             self.health.count("poses that are no message")
             return
-        if abs(pose.t_ns - received_ns) > FAR_NS:
+        if abs(told.t_ns - received_ns) > FAR_NS:
             self.health.count("implausible time")
-        elif self._tracker is not None and not self.shard.owns(pose.robot):
-            self._tracker.follow(pose)
+        elif self._tracker is not None:
+            self._tracker.follow(told)
 
     def _start(self) -> None:
         """Begin with the rig in force; robots are found anew."""
@@ -235,6 +249,8 @@ class Server:
         first = tracker.advance(instant)
         latency = latency_of(instant, begun_ns, time.time_ns())
         self._tell_poses(first, latency)
+        if self.shard.count > 1:
+            self.link.publish(self._own_key, tracker.tell())
         fused = tracker.complete()
         told = {pose.robot for pose in first}
         self._tell_poses([pose for pose in fused.poses if pose.robot not in told], latency)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion import _core
+
 Array = NDArray[np.float64]
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UNKNOWN_TURN = np.pi**2  # variance of a turn about the normal that nothing tells, rad^2
@@ -89,13 +91,9 @@ def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool
     Returns:
         the predicted states, P = F P F^T + Q; how an error moves.
     """
-    half = exp_so3(states.omega * dt[:, None] / 2)
-    R_half = half @ states.R
-    turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
-    motion = Motion(turn, dt)
-    P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + _noise(dt, densities, R_half)
-    moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
-    return moved, motion
+    of_each = states.R, states.p, states.omega, states.v, states.P
+    R, p, P, turn = _core.predict(*of_each, dt, densities, single)
+    return States(R, p, states.omega, states.v, P), Motion(turn, dt)
 
 
 def forget_turn(P: Array) -> Array:
@@ -139,20 +137,6 @@ def turns(w: Array) -> Array:
     R[1, 2] -= s[0]
     R[2, 1] += s[0]
     return R
-
-
-def _noise(dt: Array, densities: Array, R_half: Array) -> Array:
-    """(N, 12, 12) of white noise on acceleration: q [dt^3/3, dt^2/2; dt^2/2, dt]."""
-    Q = np.zeros((len(dt), 12, 12))
-    i = np.arange(3)
-    for k, (place, rate) in enumerate(((THETA, OMEGA), (POSITION, VELOCITY))):
-        q = densities[:, k]
-        Q[:, place.start + i, place.start + i] = (q * dt**3 / 3)[:, None]
-        Q[:, rate.start + i, rate.start + i] = (q * dt)[:, None]
-        turn = R_half.transpose(0, 2, 1) if place is THETA else np.eye(3)
-        Q[:, place, rate] = (q * dt**2 / 2)[:, None, None] * turn
-        Q[:, rate, place] = np.swapaxes(Q[:, place, rate], 1, 2)
-    return Q
 
 
 def wxyz_of(R: Array) -> Array:

@@ -8,20 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.pose import rotation_from_wxyz
 from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.inspection import Inspection
 from fusion.instants import Instant
-from fusion.messages import RobotPose, State
+from fusion.messages import RobotPose, ShardPoses, State
 from fusion.optics import Optics
-from fusion.report import Fused, Move, look, report, tell_poses
+from fusion.report import Fused, Move, Seen, look, report, tell_poses
 from fusion.robots import Robot
 from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
-from fusion.shards import Shard
+from fusion.shards import Shard, states_of, told_of
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
-from fusion.state import POSITION, THETA, States, exp_so3
+from fusion.state import POSITION, THETA, States
 from fusion.watch import Watch
 
 Array = NDArray[np.float64]
@@ -30,7 +29,7 @@ CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
 # Likewise of its turn: a constellation turned further looks as if its markers were swapped.
 FOLLOWED_RAD = 0.15
-TOLD = "position", "quaternion_wxyz", "velocity", "angular_velocity"  # of another shard's robot
+OTHERS = 1000  # messages of other shards that wait for an instant, at the most
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -87,13 +86,13 @@ class Tracker:
         self.watch = Watch()
         self.shapes = Shapes(self.names, single)
         self._inspection = Inspection(self)
-        self._last: tuple[Instant, Sightings, Matches] | None = None
+        self._last: tuple[Instant, Sightings, Matches, Seen] | None = None
         self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
         self._begun: _Begun | None = None  # the instant that comes next
         self._told: dict[int, RobotPose] = {}  # of the last instant, before it was complete
-        self._others: dict[int, RobotPose] = {}  # of other shards' robots, since the last instant was begun
+        self._others: list[ShardPoses] = []  # of other shards, since the last instant was begun
 
     def fuse(self, instant: Instant) -> Fused:
         """Follow the robots into this instant, and look for those that are not tracked."""
@@ -122,20 +121,24 @@ class Tracker:
         seen = look(self, sightings, matches)
         self.shapes.note(seen.residual_px)
         self._told = tell_poses(self, instant.t_ns, seen, rows.tolist())
-        self._last = instant, sightings, matches
+        self._last = instant, sightings, matches, seen
         return tuple(self._told.values())
 
     def complete(self) -> Fused:
         """After `advance`: look for robots that are not tracked, and tell the whole instant."""
         assert self._last is not None
-        instant, sightings, matches = self._last
+        instant, sightings, matches, seen = self._last
         missing = np.flatnonzero(~self.predicted[1])
+        if not self.owned[missing].any():  # others' are for their own shards to look for
+            missing = missing[:0]
         n_known = len(matches)
         matches, free = self.search.find(missing, sightings, matches)
         if len(matches) != n_known:
             self._note(instant.t_ns, matches)
-        self._last = instant, sightings, matches
-        return report(self, self._trusted(instant), sightings, matches, free, self._told)
+        if len(missing):
+            seen = look(self, sightings, matches)
+        self._last = instant, sightings, matches, seen
+        return report(self, self._trusted(instant), sightings, matches, seen, free, self._told)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots before the same cameras; those it knows by name and markers stay as they are.
@@ -165,7 +168,7 @@ class Tracker:
 
     def inspect(self) -> tuple[Move, ...]:
         """After an instant was told: which cameras are found to be moved, and where they stand; see `Inspection`."""
-        return () if self._last is None else self._inspection.inspect(*self._last)
+        return () if self._last is None else self._inspection.inspect(*self._last[:3])
 
     def _begin(self, t_ns: int) -> "_Begun":
         """The instant at `t_ns`, begun now if it was not yet."""
@@ -246,8 +249,7 @@ class Tracker:
         seen[self.catalogue.robot[matches.disc]] = True
         self._seen, self._seen_ns[seen & self.owned] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self.limits.lost_after_s
-        worst = np.linalg.eigvalsh(self.states.P[:, POSITION, POSITION])[:, -1]
-        vague = worst > self.limits.tracked_sigma_m**2
+        vague = self._is_vague()
         for k, status in enumerate(self.status):
             if not self.owned[k]:
                 self.status[k] = "lost" if status is not None and silent[k] else status
@@ -258,32 +260,36 @@ class Tracker:
                 if silent[k]:
                     self.states.v[k] = self.states.omega[k] = 0
 
-    def follow(self, pose: RobotPose) -> None:
-        """Another shard's robot is there: its detections are its own, and not for ours."""
-        k = self._row.get(pose.robot)
-        if k is None or self.owned[k] or pose.t_ns <= self._seen_ns[k]:
-            return
-        if np.isfinite(np.frombuffer(pose.covariance, "<f4")).all():
-            self._others[k] = pose
-            self._seen_ns[k] = pose.t_ns
+    def _is_vague(self) -> NDArray[np.bool_]:
+        """(N,) robots whose place is known worse than `tracked_sigma_m` along some direction."""
+        place, most = self.states.P[:, POSITION, POSITION], self.limits.tracked_sigma_m**2
+        vague = np.einsum("nii->n", place) > most  # or else no eigenvalue is
+        vague[vague] = np.linalg.eigvalsh(place[vague])[:, -1] > most
+        return vague
+
+    def tell(self) -> ShardPoses:
+        """For the other shards, after `advance`: where this one's robots are."""
+        assert self._t_ns is not None
+        known = np.array([status is not None for status in self.status], bool)
+        return told_of(self.names, self._t_ns, self.states, self.status, np.flatnonzero(known & self.owned))
+
+    def follow(self, told: ShardPoses) -> None:
+        """Another shard's robots are there: their detections are its own, and not for ours."""
+        if len(self._others) < OTHERS:
+            self._others.append(told)
 
     def _take_others(self) -> None:
         """The robots of other shards as these told of them, at this tracker's last instant."""
-        if not self._others or self._t_ns is None:
-            return
-        rows, poses = np.array(list(self._others)), list(self._others.values())
-        self._others = {}
-        dt = (self._t_ns - np.array([pose.t_ns for pose in poses]))[:, None] * 1e-9
-        p, wxyz, v, omega = (np.array([getattr(pose, name) for pose in poses]) for name in TOLD)
-        P = (
-            np.frombuffer(b"".join(pose.covariance for pose in poses), "<f4")
-            .reshape(-1, 12, 12)
-            .astype(float)
-        )
-        there = States(exp_so3(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, P)
-        self.states = self.states.with_rows(rows, there)
-        for k, pose in zip(rows, poses, strict=True):
-            self.status[k] = pose.state
+        told, self._others = self._others, []
+        for one in told if self._t_ns is not None else ():
+            at = np.array([self._row.get(name, -1) for name in one.robots], np.intp)
+            new = np.flatnonzero((at >= 0) & ~self.owned[at] & (one.t_ns > self._seen_ns[at]))
+            if self._t_ns is not None and len(new):
+                rows = at[new]
+                self.states = self.states.with_rows(rows, states_of(one, self._t_ns).select(new))
+                self._seen_ns[rows] = one.t_ns
+                for k, row in zip(new.tolist(), rows.tolist(), strict=True):
+                    self.status[row] = one.states[k]
 
     def adopt(self, rows: NDArray[np.intp], states: States) -> None:
         """Robots that were found stand there from now on."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`python -m web`: watch an arena or its recording, in the browser or on one line a second; or start a demo."""
 
+import contextlib
 import signal
 import threading
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ class Options:
         headless: One line a second instead of a page.
         seconds: End after so long; of a demo, so long after calibration.
         demo: Start a simulated arena, calibrate it by a wand wave, track its robots, and watch it.
+        rig: The arena's rig.yaml (lenses at the least), for a button that places its cameras by a waved wand.
+        wand: The wand that is waved.
         replay: Show a recording (MCAP, by python -m fusion record) instead of a running arena.
         scene: The demo's scene; arena.yaml, robots.yaml and wand.yaml lie beside it. The checkout's own by default.
         listen: Zenoh endpoint of the demo's server, as tcp/127.0.0.1:7447; a free one by default.
@@ -42,6 +45,8 @@ class Options:
     headless: bool = False
     seconds: float | None = None
     demo: bool = False
+    rig: Path | None = None
+    wand: Path = Path("configs/wand.yaml")
     replay: Path | None = None
     scene: Path | None = None
     listen: str | None = None
@@ -77,22 +82,29 @@ def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: thr
             ended = stop.wait(1.0)
             print(describe(feed.latest()), flush=True)
         return
+    from web.calibrating import Calibrating, Files
     from web.controls import LiveControls
     from web.picking import Picking
     from web.playback import ReplayControls
     from web.view import View
 
-    view = View(feed, options.host, options.port)
-    if isinstance(source, Subscription):
-        view.add(LiveControls(view.server, source))
-        view.add(Picking(view.server, source))
-    else:
-        view.add(ReplayControls(view.server, source))
-    print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
-    try:
+    files = Files(options.rig, options.wand) if options.rig is not None else None
+    if files is not None:
+        files.check()
+    with contextlib.ExitStack() as stack:
+        view = View(feed, options.host, options.port)
+        stack.callback(view.close)
+        if isinstance(source, Replay):
+            view.add(ReplayControls(view.server, source))
+        else:
+            if files is not None:
+                calibrating = Calibrating(view.server, source, files)
+                stack.callback(calibrating.close)
+                view.add(calibrating)
+            view.add(LiveControls(view.server, source))
+            view.add(Picking(view.server, source))
+        print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
         view.run(stop)
-    finally:
-        view.close()
 
 
 def play(options: Options) -> int:

@@ -143,10 +143,7 @@ class Feed:
         self._latest.received[f"frames {camera}"] += 1
 
     def _take_rig(self, message: RigMessage, key: str) -> None:
-        try:
-            self._latest.rig = msgspec.yaml.decode(message.yaml, type=Rig)
-        except Exception as error:  # whatever YAML trips over: the bytes come from the network
-            raise MessageError(f"no rig.yaml: {error}") from None
+        self._latest.rig = message.rig()
 
     def _store(self, into: dict[str, Seen], name: str, message: msgspec.Struct, key: str) -> None:
         _check_name(into, name, key)

@@ -5,9 +5,10 @@ from typing import Any
 
 import zenoh
 
+from camera_node.errors import RoundelError
 from fusion.measuring import watch
-from fusion.messages import Markers, RobotsRequest, undo_key
-from fusion.requests import change_robots
+from fusion.messages import Markers, RobotsRequest
+from fusion.requests import change_robots, undo_correction
 from fusion.robots import Robot
 from web.feed import Feed
 
@@ -47,11 +48,11 @@ class Subscription:
 
     def undo(self, timeout_s: float = ASK_S) -> str:
         """Have the server take back the last pose that it found of a moved camera; what came of it, in words."""
-        for reply in self.session.get(undo_key(self.feed.keys.arena), timeout=timeout_s):
-            if reply.ok is None:
-                return reply.err.payload.to_string() if reply.err else "the server refused"
-            return "the camera is back where it stood"
-        return f"the server did not answer within {timeout_s:.0f} s"
+        try:
+            undo_correction(self.session, self.feed.keys.arena, timeout_s)
+        except RoundelError as error:
+            return str(error)
+        return "the camera is back where it stood"
 
     def _subscribe(self, key_expr: str) -> zenoh.Subscriber:
         def take(sample: zenoh.Sample) -> None:

@@ -12,27 +12,49 @@ from web.feed import Latest, Seen
 STALE_S = 2.0  # a robot or a camera that was silent for so long is away
 NONE = "–"
 HUE_OF = {"tracked": "ok", "coasting": "warn"}  # of a robot's state; else bad
+MARGIN_PX = 6
+CELL = "padding:3px 6px 3px 0"
 HUES = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b"}
 
 
 @dataclass(frozen=True)
+class Row:
+    """A table's cells; how what they tell of does, a hue of `HUES`; and what to know or do about it, if anything."""
+
+    cells: tuple[str, ...]
+    hue: str
+    note: str = ""
+
+    def html(self) -> str:
+        """The row, its note on a line of its own: a sentence has no width to share with figures."""
+        cell = f'<td style="{CELL};white-space:nowrap">'
+        texts = f"</td>{cell}".join(html.escape(text) for text in self.cells)
+        row = f'<tr style="border-top:1px solid #8883">{cell}{_dot(self.hue)}{texts}</td></tr>'
+        style = f"white-space:normal;line-height:1.3;padding:0 0 4px 14px;color:{HUES[self.hue]}"
+        note = f'<tr><td colspan="{len(self.cells)}" style="{style}">{html.escape(self.note)}</td></tr>'
+        return row + (note if self.note else "")
+
+
+@dataclass(frozen=True)
 class Table:
-    """Text in rows, and how each row does: a hue of `HUES`."""
+    """Rows under a header; `nothing` is told where there are none."""
 
     header: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-    hues: list[str]
+    rows: list[Row]
+    nothing: str = "none"
 
     def html(self) -> str:
         """The table for the panel; whatever the network said is escaped."""
-        head = "".join(f"<th>{html.escape(text)}</th>" for text in self.header)
-        body = "".join(
-            f'<tr style="border-top:1px solid #8883"><td>{_dot(hue)}'
-            f"{'</td><td>'.join(html.escape(text) for text in row)}</td></tr>"
-            for row, hue in zip(self.rows, self.hues, strict=True)
+        if not self.rows:
+            return f'<div style="margin:0 {MARGIN_PX}px;font-size:11px;opacity:.6">{html.escape(self.nothing)}</div>'
+        head = f'</th><th style="{CELL}">'.join(html.escape(text) for text in self.header)
+        body = "".join(row.html() for row in self.rows)
+        place = f"width:calc(100% - {2 * MARGIN_PX}px);margin:0 {MARGIN_PX}px"
+        style = f"{place};border-collapse:collapse;font-size:11px;text-align:left"
+        return (
+            f'<table style="{style}"><tr style="opacity:.6;vertical-align:bottom;line-height:1.2">'
+            f'<th style="{CELL}">{head}</th></tr>{body}</table>'
         )
-        style = "width:100%;border-collapse:collapse;font-size:11px;line-height:1.8;text-align:left;white-space:nowrap"
-        return f'<table style="{style}"><tr style="opacity:.6">{head}</tr>{body}</table>'
 
 
 def robot_state(latest: Latest, robot: str) -> str:
@@ -44,17 +66,22 @@ def robot_state(latest: Latest, robot: str) -> str:
 def tabulate_robots(latest: Latest) -> Table:
     """One row a robot: state, position (m), speed (m/s) and one standard deviation of the position (mm)."""
     misfits = latest.status.message.misfits if latest.status else {}
-    rows, hues = [], []
-    for name, seen in sorted(latest.poses.items()):
-        pose: RobotPose = seen.message
-        state = robot_state(latest, name)
-        place = " ".join(f"{x:+.2f}" for x in pose.position)
-        speed, sigma = float(np.linalg.norm(pose.velocity)), position_sigma_mm(pose)
-        misfit = misfits.get(name)
-        told = f"{state}, markers off by {misfit:.1f} px" if misfit is not None else state
-        rows.append((name, told, place, f"{speed:.2f}", describe_sigma(sigma), str(pose.n_markers)))
-        hues.append("warn" if misfit is not None and state == "tracked" else HUE_OF.get(state, "bad"))
-    return Table(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, hues)
+    rows = [_robot_row(latest, name, misfits.get(name)) for name in sorted(latest.poses)]
+    return Table(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, "no robot yet")
+
+
+def _robot_row(latest: Latest, name: str, misfit: float | None) -> Row:
+    pose: RobotPose = latest.poses[name].message
+    state = robot_state(latest, name)
+    place = " ".join(f"{x:+.2f}" for x in pose.position)
+    speed, sigma = float(np.linalg.norm(pose.velocity)), describe_sigma(position_sigma_mm(pose))
+    cells = (name, state, place, f"{speed:.2f}", sigma, str(pose.n_markers))
+    hue = HUE_OF.get(state, "bad")
+    if misfit is None:
+        return Row(cells, hue)
+    return Row(
+        cells, "warn" if hue == "ok" else hue, f"its markers are off by {misfit:.1f} px: measure them again"
+    )
 
 
 def describe_sigma(sigma_mm: float) -> str:
@@ -71,31 +98,29 @@ def tabulate_cameras(latest: Latest) -> Table:
     """One row a camera: what its node says of it, and what the server sees of it.
 
     The columns: frames a second, time to detect, roundels a frame, RMS of the reprojection, middle of the exposure
-    to arrival, clock offset, frames lost (dropped at the camera / too late for the server), advice.
+    to arrival, clock offset, frames lost (dropped at the camera / too late for the server).
     """
     server = latest.status.message.cameras if latest.status else {}
-    rows, hues = [], []
-    for name in sorted({*latest.cameras, *server}):
-        seen, health = latest.cameras.get(name), server.get(name)
-        own = seen.message if seen else None
-        lost = f"{own.dropped if own else 0} / {health.late if health else 0}"
-        advice = _advise(latest, seen, health)
-        rows.append(
-            (
-                name,
-                _number(own and own.fps, 1),
-                _number(own and own.detect_ms, 2),
-                _number(own and own.roundels, 1),
-                _number(health and health.residual_px, 2),
-                _number(health and health.lateness_ms, 1),
-                _number(own and own.clock_offset_ms, 2),
-                lost,
-                advice,
-            )
-        )
-        hues.append("bad" if advice == "away" else "warn" if advice else "ok")
-    header = ("camera", "fps", "detect ms", "seen", "px", "late ms", "clock ms", "lost", "")
-    return Table(header, rows, hues)
+    rows = [_camera_row(latest, name, server.get(name)) for name in sorted({*latest.cameras, *server})]
+    header = ("camera", "fps", "detect ms", "seen", "px", "late ms", "clock ms", "lost")
+    return Table(header, rows, "no camera yet")
+
+
+def _camera_row(latest: Latest, name: str, health: CameraHealth | None) -> Row:
+    seen = latest.cameras.get(name)
+    own = seen.message if seen else None
+    advice = _advise(latest, seen, health)
+    cells = (
+        name,
+        _number(own and own.fps, 1),
+        _number(own and own.detect_ms, 2),
+        _number(own and own.roundels, 1),
+        _number(health and health.residual_px, 2),
+        _number(health and health.lateness_ms, 1),
+        _number(own and own.clock_offset_ms, 2),
+        f"{own.dropped if own else 0} / {health.late if health else 0}",
+    )
+    return Row(cells, "bad" if advice == "away" else "warn" if advice else "ok", advice)
 
 
 def _advise(latest: Latest, seen: Seen | None, health: CameraHealth | None) -> str:
@@ -140,17 +165,17 @@ def list_faults(latest: Latest) -> Table:
     server = latest.status.message.faults if latest.status else {}
     counts = [(reason, count) for reason, count in server.items() if count]
     counts += [(f"viewer: {reason}", count) for reason, count in latest.faults.items()]
-    rows = [(reason, str(count)) for reason, count in counts]
-    return Table(("skipped", "times"), rows, ["warn"] * len(rows))
+    return Table(("skipped", "times"), [Row((reason, str(count)), "warn") for reason, count in counts])
 
 
 def describe(latest: Latest) -> str:
     """All of it in one line, for terminals and logs."""
-    cameras = [
-        f"{row[0]} {row[1]} fps{f' ({row[-1]})' if row[-1] else ''}" for row in tabulate_cameras(latest).rows
+    cameras = [f"{row.cells[0]} {row.cells[1]} fps{_noted(row)}" for row in tabulate_cameras(latest).rows]
+    robots = [
+        f"{row.cells[0]} {row.cells[1]} at {row.cells[2]} ±{row.cells[4]} mm{_noted(row)}"
+        for row in tabulate_robots(latest).rows
     ]
-    robots = [f"{row[0]} {row[1]} at {row[2]} ±{row[4]} mm" for row in tabulate_robots(latest).rows]
-    faults = sum(int(row[1]) for row in list_faults(latest).rows)
+    faults = sum(int(row.cells[1]) for row in list_faults(latest).rows)
     placed = len(latest.rig.placed()) if latest.rig else 0
     parts = [
         describe_server(latest),
@@ -164,6 +189,10 @@ def describe(latest: Latest) -> str:
 
 def _number(value: float | None, digits: int) -> str:
     return NONE if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _noted(row: Row) -> str:
+    return f" ({row.note})" if row.note else ""
 
 
 def _dot(hue: str) -> str:

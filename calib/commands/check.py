@@ -4,7 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from rich.console import Console
@@ -13,17 +13,17 @@ from calib.agreement import Agreement, Placed, compare
 from calib.commands.choice import require_one
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
+from calib.commands.report import print_report
 from calib.errors import CalibrationError
+from calib.outcome import Calibration
 from calib.problem import LENS, POSE
-from calib.report import print_report
 from calib.rig import Rig, load_rig
 from calib.scale import SIGMA_M, Distance
+from calib.trust import assess
+from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.messages import Detections
-
-if TYPE_CHECKING:
-    from calib.wand import Calibration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,9 +76,6 @@ class Check:
         distance: Distance | None,
         console: Console,
     ) -> dict[str, Any]:
-        from calib.trust import assess
-        from calib.wand import calibrate
-
         with console.status("placing cameras"):
             result = calibrate(rig, wand, messages, distance)
         trust = assess(result, wand, self.height)
@@ -95,8 +92,6 @@ def _compare_halves(
 ) -> Agreement | None:
     """Both halves start from the lenses that the whole recording gave: where these were refined, a half that refines
     them less would turn its cameras instead. What is not known of a measured distance is the same in both."""
-    from calib.wand import calibrate
-
     same = distance and replace(distance, sigma_m=0.0)
     try:
         with console.status("placing cameras by each half"):
@@ -109,7 +104,7 @@ def _compare_halves(
     return agreement
 
 
-def _compare_with_rig(rig: Rig, result: "Calibration", console: Console) -> Agreement | None:
+def _compare_with_rig(rig: Rig, result: Calibration, console: Console) -> Agreement | None:
     known = Placed.of_rig(rig)
     if len([name for name in known.names if name in result.names]) < 2:
         say(console, "the rig has no places with covariances to compare; the recording alone was judged")
@@ -130,7 +125,7 @@ def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detect
     return [m for m in messages if m.t_ns <= middle], [m for m in messages if m.t_ns > middle]
 
 
-def placed(result: "Calibration") -> Placed:
+def placed(result: Calibration) -> Placed:
     """The cameras of a calibration, for comparing."""
     adjusted = result.adjusted
     free, count = list(adjusted.problem.free), len(result.names)
@@ -142,7 +137,9 @@ def placed(result: "Calibration") -> Placed:
         name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
         for k, name in enumerate(result.names)
     }
-    return Placed(result.names, adjusted.state.cameras, noise, lenses)
+    scaled_by = result.report.scaled_by
+    metric = adjusted.problem.fixed_distance is None or (scaled_by is not None and scaled_by.sigma_m > 0)
+    return Placed(result.names, adjusted.state.cameras, noise, lenses, metric)
 
 
 def _figures(agreement: Agreement | None) -> dict[str, Any] | None:

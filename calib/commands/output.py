@@ -6,17 +6,15 @@ import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
+from calib.outcome import Calibration
 from calib.residual_map import draw_residuals, save_map
 from calib.rig import Rig, save_rig
+from calib.trust import Trust
 from camera_node.errors import ConfigError
-
-if TYPE_CHECKING:
-    from calib.outcome import Calibration
-    from calib.trust import Trust
 
 
 def check_folder(out: Path) -> None:
@@ -35,7 +33,7 @@ def write_rig(rig: Rig, out: Path, console: Console) -> None:
     say(console, f"wrote {out}" + (f"; the one before is kept as {kept.name}" if kept else ""))
 
 
-def save_maps(folder: Path, result: "Calibration", trust: "Trust", console: Console) -> None:
+def save_maps(folder: Path, result: Calibration, trust: Trust, console: Console) -> None:
     """A picture of each camera's residuals, with where to wave next, and one of the expected errors."""
     seen, adjusted = result.observations, result.adjusted
     for k, camera in enumerate(trust.cameras):

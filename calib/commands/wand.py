@@ -15,18 +15,19 @@ from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
+from calib.commands.report import print_report, show_progress
 from calib.live import Heard
-from calib.recording import save_wave
-from calib.report import clocks_as_dict, lenses_as_dict, print_report, show_progress
+from calib.recalibration import place_one
+from calib.recording import save_wave, wave_beside
 from calib.rig import Rig, load_rig
 from calib.scale import SIGMA_M, Distance
-from calib.waving import wave
+from calib.trust import assess
+from calib.wand import calibrate
+from calib.waving import MOST_S, wave
 from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.messages import Detections
-
-MOST_S = 180.0  # that a wave may last when it ends by itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,9 +92,6 @@ class Wand:
         distance: Distance | None,
         console: Console,
     ) -> Rig:
-        from calib.trust import assess
-        from calib.wand import calibrate
-
         if self.only is not None:
             return self._place_one(rig, wand, messages, self.only, console)
         with console.status("placing cameras"):
@@ -102,8 +100,7 @@ class Wand:
         print_report(result, trust, console)
         if self.maps is not None:
             save_maps(self.maps, result, trust, console)
-        told = {**provenance(), **trust.as_dict(), **result.report.as_dict(), **clocks_as_dict(result)}
-        told |= {**lenses_as_dict(result), **_of_lenses(rig)}
+        told = {**provenance(), **trust.as_dict(), **result.as_dict(), **_of_lenses(rig)}
         placed = msgspec.structs.replace(result.rig, calibration=told)
         write_rig(placed, self.out, console)
         return placed
@@ -111,8 +108,6 @@ class Wand:
     def _place_one(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str, console: Console
     ) -> Rig:
-        from calib.recalibration import place_one
-
         with console.status(f"placing {name}"):
             result = place_one(rig, wand, messages, name)
         moved = (
@@ -144,7 +139,7 @@ class Wand:
 
     def _keep(self, messages: Sequence[Detections], console: Console) -> Path | None:
         """Write the wave before it is solved, so that nothing that goes wrong there can lose it."""
-        path = self.out.with_name(f"{self.out.stem}.wave.mcap")
+        path = wave_beside(self.out)
         try:
             before = save_wave(path, self.server.arena, messages)
         except ConfigError as error:

@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 
+#include "lanes.hpp"
 #include "simd.hpp"
 
 namespace roundel {
@@ -23,48 +24,86 @@ constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows
 constexpr int kTurns = 4;            // pictures in which both diagonals have their turn
 constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
-/// The places of the bits of a word. Eight are written without asking how many there are.
-inline int* append_bits(uint64_t bits, int base, int* to) {
+constexpr int kBatch = 16;  // lines that are scanned at once
+constexpr int kGroup = 8;   // numbers that are written without asking how many there are
+
+/// The places of the bits of a word. Volatile, or they would be gathered in vectors first, which takes
+/// longer.
+ROUNDEL_INLINE int* append_bits(uint64_t bits, int base, int* to) {
     const int count = std::popcount(bits);
-    for (int k = 0; k < count; k += 8)
-        for (int j = k; j < k + 8; ++j, bits &= bits - 1) to[j] = base + std::countr_zero(bits);
+    for (int k = 0; k < count; k += kGroup)
+        for (int j = k; j < k + kGroup; ++j, bits &= bits - 1)
+            *static_cast<volatile int*>(to + j) = base + std::countr_zero(bits);
     return to + count;
 }
 
-/// Where a line turns dark and bright again, in turns; returns how many dark runs. Beyond it all is bright.
-ROUNDEL_CLONES int find_runs(const uint64_t* line, int words, int length, int* edges) {
+/// Where some lines turn dark and bright again, in turns; returns how many dark runs there are. A place is
+/// the line's number times 2^shift and the pixel's; beyond a line all is bright.
+ROUNDEL_INLINE int find_runs(const BitImage& picture, int first, int last, int shift, int* edges) {
+    const int words = picture.words;
     int* to = edges;
-    uint64_t carry = 0;
-    for (int n = 0; n < words; ++n) {
-        to = append_bits(line[n] ^ (line[n] << 1 | carry), n * 64, to);
-        carry = line[n] >> 63;
+    for (int line = first; line < last; ++line) {
+        const uint64_t* word = picture.line(line);
+        uint64_t carry = 0;
+        for (int n = 0; n < words; ++n) {
+            const uint64_t turns = word[n] ^ (word[n] << 1 | carry);
+            carry = word[n] >> (kWord - 1);
+            if (turns) to = append_bits(turns, (line << shift) + n * kWord, to);
+        }
+        if (carry) *to++ = (line << shift) + picture.length;
     }
-    if (carry && (length & 63) == 0) *to++ = length;
     return int(to - edges) / 2;
 }
 
-/// Which bright runs lie in the middle of a roundel, by their lengths and those of the dark runs beside them.
-/// All in sixteenths of a pixel, so that whole numbers do.
-ROUNDEL_CLONES void test_chords(const int* edges, int count, const Proportions& limits, int* passes) {
-    const Proportions p = limits;  // a copy that `passes` can't overlap
-    for (int k = 0; k + 1 < count; ++k) {
-        const int left = edges[2 * k + 1] - edges[2 * k], right = edges[2 * k + 3] - edges[2 * k + 2];
-        const int inner = edges[2 * k + 2] - edges[2 * k + 1];
-        const int dark = left < right ? left : right, uneven = left < right ? right : left;
-        const int total = inner + 2 * dark;
-        passes[k] = (total >= p.least) & (total <= p.most) & (16 * dark <= p.thick * inner + p.slack) &
-                    (16 * dark + p.slack >= p.thin * inner) & (16 * uneven <= kUneven * dark + p.slack);
+/// Begins and ends of eight dark runs that lie one after another.
+struct DarkRuns {
+    Bits begin, end;
+    ROUNDEL_INLINE explicit DarkRuns(const int* edges) {
+        Bits a, b;
+        __builtin_memcpy(&a, edges, sizeof a), __builtin_memcpy(&b, edges + kLanes, sizeof b);
+        begin = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14);
+        end = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
     }
+};
+
+/// Bit k tells whether lane k is set.
+ROUNDEL_INLINE uint32_t lanes_set(const Bits& lanes) {
+    typedef int32_t Half __attribute__((vector_size(2 * kLanes)));
+    const Bits v = lanes & Bits{1, 2, 4, 8, 16, 32, 64, 128};
+    const Half h = __builtin_shufflevector(v, v, 0, 1, 2, 3) | __builtin_shufflevector(v, v, 4, 5, 6, 7);
+    const Half q = h | __builtin_shufflevector(h, h, 2, 3, 0, 1);
+    return uint32_t(q[0] | q[1]);
 }
 
-/// The numbers of the `count` flags that are set.
-ROUNDEL_CLONES int collect(const int* flags, int count, int* numbers) {
-    int n = 0;
-    for (int k = 0; k < count; ++k) {
-        numbers[n] = k;
-        n += flags[k];
+/// Which of the eight bright runs behind some dark ones lie in the middle of a roundel, by their lengths and
+/// those of the dark runs on either side: bit k tells of the k-th. All in sixteenths of a pixel, so that
+/// whole numbers do.
+ROUNDEL_INLINE uint32_t test_chords(const int* edges, const Proportions& p) {
+    const DarkRuns before(edges), behind(edges + 2);
+    const Bits left = before.end - before.begin, right = behind.end - behind.begin;
+    const Bits inner = behind.begin - before.end;
+    const Bits dark = left < right ? left : right, uneven = left < right ? right : left;
+    const Bits total = inner + 2 * dark;
+    const Bits pass = (total >= p.least) & (total <= p.most) & (16 * dark <= p.thick * inner + p.slack) &
+                      (16 * dark + p.slack >= p.thin * inner) & (16 * uneven <= kUneven * dark + p.slack);
+    return lanes_set(pass);
+}
+
+/// Finds the bright runs of some lines that may lie in the middle of a roundel: `numbers` counts the dark
+/// runs before each. Returns how many. What lies between two lines is too long.
+ROUNDEL_CLONES int find_chords(const BitImage& picture, int first, int last, int shift,
+                               const Proportions& limits, int* edges, int* numbers) {
+    const Proportions p = limits;  // a copy that nothing overlaps
+    const int count = find_runs(picture, first, last, shift, edges) - 1;
+    int* number = numbers;
+    for (int begin = 0; begin < count; begin += kWord) {
+        uint64_t passes = 0;
+        for (int k = 0; k < kWord; k += kLanes)
+            passes |= uint64_t(test_chords(edges + 2 * (begin + k), p)) << k;
+        if (count - begin < kWord) passes &= (uint64_t(1) << (count - begin)) - 1;
+        number = append_bits(passes, begin, number);
     }
-    return n;
+    return int(number - numbers);
 }
 
 /// The darkest of three pixels in the middle of a run: a thin ring is that dark on one of them only.
@@ -98,45 +137,34 @@ bool ChordSearch::is_diametral(int dark, int inner) const {
            16 * dark + limits_.slack >= limits_.thin * inner;
 }
 
-void ChordSearch::find_chords(const BitImage& along, int line) {
-    chords_.clear();
-    const int count = find_runs(along.line(line), along.words, along.length, edges_.data());
-    if (count < 2) return;
-    test_chords(edges_.data(), count, limits_, passes_.data());
-    const int found = collect(passes_.data(), count - 1, numbers_.data());
-    for (int k = 0; k < found; ++k) {
-        const int* edge = &edges_[2 * size_t(numbers_[size_t(k)])];
-        const int b = edge[1], c = edge[2];
-        chords_.push_back({(b + c - 1) / 2, c - b, line, line, (b + c - 1) / 2, edge[3] - edge[0]});
+void ChordSearch::scan_lines(const BitImage& along, int first, int last) {
+    const int shift = std::bit_width(unsigned(along.length + limits_.most));
+    const int found = find_chords(along, first, last, shift, limits_, edges_.get(), numbers_.get());
+    for (int n = 0; n < found; ++n) {
+        const int* edge = &edges_[2 * size_t(numbers_[size_t(n)])];
+        const int line = edge[1] >> shift, b = edge[1] - (line << shift), inner = edge[2] - edge[1];
+        add_chord(b + (inner - 1) / 2, inner, edge[3] - edge[0], line);
     }
 }
 
-/// Puts the chords of a line on the stacks that they continue. Both are in the order of their middles.
-void ChordSearch::link(int line) {
-    next_.clear();
-    auto chord = chords_.begin();
-    for (const Stack& stack : open_) {
-        while (chord != chords_.end() && chord->middle < stack.middle - kDrift) next_.push_back(*chord++);
-        const bool same = chord != chords_.end() && chord->middle <= stack.middle + kDrift &&
-                          std::abs(chord->inner - stack.inner) <= 2 + stack.inner / 4;
-        if (same)
-            next_.push_back({chord->middle, chord->inner, stack.first, line, stack.begin,
-                             std::max(stack.outer, chord->outer)}),
-                ++chord;
-        else if (stack.last + 2 > line)
-            next_.push_back(stack);
-        else
-            close(stack);
-    }
-    next_.insert(next_.end(), chord, chords_.end());
-    open_.swap(next_);
+/// On the stack that it continues, one line may be between them; or on none. Without a branch, since nobody
+/// can tell.
+void ChordSearch::add_chord(int middle, int inner, int outer, int line) {
+    int* near = &nearest_[size_t(middle)];  // from `kDrift` pixels before it on
+    Stack& before = stacks_[size_t(near[kDrift])];
+    const bool same = (before.last + 2 >= line) & (before.last < line) &
+                      (std::abs(inner - before.inner) <= 2 + before.inner / 4);
+    const int mask = -int(same);
+    before.goes_on |= same;
+    const int first = (before.first & mask) | (line & ~mask),
+              begin = (before.begin & mask) | (middle & ~mask);
+    const int longest = std::max(outer, before.outer & mask);
+    std::fill_n(near, 2 * kDrift + 1, int(stacks_.size()));
+    stacks_.push_back({middle, inner, first, line, begin, longest, false});
 }
 
 /// A stack of two chords or more is tried across its middle.
-void ChordSearch::close(const Stack& stack) {
-    if (stack.first == stack.last) return;
-    add_streak(stack);
-    if (!across_) return;
+void ChordSearch::try_across(const Stack& stack) {
     const BitImage& across = *across_;
     const int at = stack.middle, line = at / 2, middle = stack.first + stack.last;  // two pixels a line
     if (across.is_dark(line, middle)) return;
@@ -158,11 +186,12 @@ void ChordSearch::close(const Stack& stack) {
 /// A stack as long as the bars of a roundel that is smeared along it.
 void ChordSearch::add_streak(const Stack& stack) {
     const int lines = stack.last - stack.first + 1;
-    if (lines < kStreakLines) return;
     const Raster& r = raster_;
+    const float step = r.step_length();
+    if (lines < kStreakLines || float(stack.outer) * step < kStreakWidth) return;
     const float drift = float(stack.middle - stack.begin) / float(lines - 1);
     const float x = r.line_x + drift * r.step_x, y = r.line_y + drift * r.step_y;  // along the bars
-    const float per_line = 1 / std::hypot(x, y), step = std::hypot(r.step_x, r.step_y);
+    const float per_line = 1 / std::sqrt(x * x + y * y);
     const float sine = std::abs(r.step_x * x + r.step_y * y) * per_line / step;  // of the slant
     const float cosine = std::abs(r.step_x * y - r.step_y * x) * per_line / step;
     const float width = float(stack.outer) * step * cosine, length = float(lines) * cosine / per_line;
@@ -176,23 +205,31 @@ void ChordSearch::add_streak(const Stack& stack) {
 void ChordSearch::scan(const BitImage& along, const BitImage* across, const Raster& raster,
                        const Proportions& limits) {
     across_ = across, along_rows_ = raster.step_y == 0, raster_ = raster, limits_ = limits;
-    edges_.resize(size_t(along.length) + 80);  // append_bits writes up to 8 more than there are
-    passes_.resize(edges_.size() / 2), numbers_.resize(edges_.size() / 2);
-    open_.clear();
-    for (int line = 0; line < along.lines; ++line) {
-        find_chords(along, line);
-        link(line);
+    const size_t most =
+        size_t(kBatch) * size_t(along.length + 1) + 4 * kWord;  // more are read than there are
+    if (most > room_) {
+        edges_ = std::make_unique_for_overwrite<int[]>(most);
+        numbers_ = std::make_unique_for_overwrite<int[]>(room_ = most);
     }
-    for (const Stack& stack : open_) close(stack);
+    nearest_.assign(size_t(along.length + 2 * kDrift), 0);
+    stacks_.assign(1, {0, 0, 0, -kGroup, 0, 0, true});
+    for (int line = 0; line < along.lines; line += kBatch)
+        scan_lines(along, line, std::min(line + kBatch, along.lines));
+    for (const Stack& stack : stacks_) {
+        if (stack.goes_on || stack.first == stack.last) continue;
+        add_streak(stack);
+        if (across_) try_across(stack);
+    }
 }
 
 /// For smeared ones alone.
 void ChordSearch::scan_diagonals() {
+    if (both_ || turn_ % (kTurns / 2) == 0) thin_out(rows_, thin_);
     for (const bool growing : {true, false}) {
         if (!both_ && turn_ != (growing ? 0 : kTurns / 2)) continue;
-        shear(rows_, growing, diagonals_);
+        shear(thin_, growing, diagonals_);
         const Raster raster =
-            growing ? Raster{float(-2 * (rows_.lines - 1)), 0.5f, 2, 2, 4, 0} : Raster{0, 0.5f, -2, 2, 4, 0};
+            growing ? Raster{float(-4 * (rows_.lines / 2)), 0.5f, 2, 2, 4, 0} : Raster{0, 0.5f, -2, 2, 4, 0};
         scan(diagonals_, nullptr, raster, coarse_);
     }
     both_ = partial_, turn_ = (turn_ + 1) % kTurns;

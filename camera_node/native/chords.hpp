@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <cmath>
+#include <memory>
 #include <vector>
 
-#include "bits.hpp"
+#include "binary.hpp"
 #include "settings.hpp"
 #include "streaks.hpp"
 
@@ -41,32 +43,36 @@ class ChordSearch {
     const std::vector<Streak>& streaks() const { return streaks_; }
 
   private:
-    /// A bright run between two dark ones, on one or more neighbouring lines.
+    /// A bright run between two dark ones, and those on neighbouring lines before it that it continues.
     struct Stack {
         int middle, inner;  // of the last line: middle of the bright run, and its length, pixels
         int first, last;    // lines, of two pixels each
         int begin;          // middle on the first line
         int outer;          // longest chord, with its dark runs
+        bool goes_on;       // in another one
     };
     /// Where pixel k of line d is in the image: at origin + k step + d line, as x and y.
     struct Raster {
         float x, y, step_x, step_y, line_x, line_y;
+        float step_length() const { return std::sqrt(step_x * step_x + step_y * step_y); }
     };
     void scan(const BitImage& along, const BitImage* across, const Raster& raster, const Proportions& limits);
     void scan_diagonals();
-    void find_chords(const BitImage& along, int line);
-    void link(int line);
-    void close(const Stack& stack);
+    void scan_lines(const BitImage& along, int first, int last);
+    void add_chord(int middle, int inner, int outer, int line);
+    void try_across(const Stack& stack);
     void add_streak(const Stack& stack);
     bool is_diametral(int dark, int inner) const;
 
     Proportions fine_{}, coarse_{}, limits_{};  // of rows and columns; of diagonals; of what is scanned
     Raster raster_{};
     int min_contrast_;  // grey levels
-    BitImage rows_, columns_, diagonals_;
-    std::vector<int> edges_;             // begin, end, begin, end, ... of the dark runs of a line
-    std::vector<int> passes_, numbers_;  // which bright runs between two dark ones are diametral
-    std::vector<Stack> chords_, open_, next_;
+    BitImage rows_, columns_, thin_, diagonals_;
+    std::unique_ptr<int[]> edges_;    // begin, end, begin, end, ... of the dark runs of some lines
+    std::unique_ptr<int[]> numbers_;  // of the bright runs between two dark ones that are diametral
+    size_t room_ = 0;                 // for either
+    std::vector<Stack> stacks_;       // the first of them is none
+    std::vector<int> nearest_;        // the last stack whose middle may drift to a place
     std::vector<Seed> seeds_;
     std::vector<Streak> streaks_;
     const ImageView* image_ = nullptr;

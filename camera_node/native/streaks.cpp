@@ -61,8 +61,8 @@ StreakMatcher::Appearance StreakMatcher::make_appearance(double ratio, double le
         const double n = spread(int(k) / kAlong, kAcross, kReachAcross);
         Vector<3> share{};  // of paper, ink and ground
         for (int j = 0; j < kInstants; ++j) {
-            const double r = std::hypot(s - 2 * length * ((j + 0.5) / kInstants - 0.5), n);
-            share[r > kCardRatio ? 2 : r < 1 && r > ratio] += 1.0 / kInstants;
+            const double along = s - 2 * length * ((j + 0.5) / kInstants - 0.5), rr = along * along + n * n;
+            share[rr > kCardRatio * kCardRatio ? 2 : rr < 1 && rr > ratio * ratio] += 1.0 / kInstants;
         }
         const double weight = 1 / (1 + kSeeThrough * share[2] * share[2]);
         for (size_t i = 0; i < 3; ++i) {

@@ -2,24 +2,42 @@
 #include "threshold.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cstring>
 
 #include "simd.hpp"
 
 namespace roundel {
 
+namespace {
+
+inline uint8_t least(uint8_t a, uint8_t b) { return a < b ? a : b; }
+inline uint8_t greatest(uint8_t a, uint8_t b) { return a > b ? a : b; }
+
+/// The darkest and the brightest pixel of a patch, one from the other.
+template <int width, int height>
+int span_of(const ImageView& patch) {
+    uint8_t low[width], high[width];
+    std::copy_n(patch.data, width, low), std::copy_n(patch.data, width, high);
+    for (int y = 1; y < height; ++y)
+        for (int x = 0; x < width; ++x) {
+            low[x] = least(low[x], patch.row(y)[x]);
+            high[x] = greatest(high[x], patch.row(y)[x]);
+        }
+    return *std::max_element(high, high + width) - *std::min_element(low, low + width);
+}
+
+}  // namespace
+
 double noise_level(const ImageView& image) {
-    constexpr int kPatches = 16;                       // each way, of 8 x 4 pixels
-    constexpr double kFlat = 0.05, kDeviations = 2.9;  // the flattest twentieth of noise spans so many
-    std::vector<int> spans;
+    constexpr int kPatches = 16, kWidth = 8, kHeight = 4;  // so many each way
+    constexpr double kFlat = 0.05, kDeviations = 2.9;      // the flattest twentieth of noise spans so many
+    if (image.width < kWidth || image.height < kHeight) return 1;
+    std::array<int, kPatches * kPatches> spans;
     for (int k = 0; k < kPatches * kPatches; ++k) {
-        const int x = (image.width - 8) * (k % kPatches) / kPatches;
-        const int y = (image.height - 4) * (k / kPatches) / kPatches;
-        uint8_t low = 255, high = 0;
-        for (int v = std::max(y, 0); v < std::min(y + 4, image.height); ++v)
-            for (int u = std::max(x, 0); u < std::min(x + 8, image.width); ++u)
-                low = std::min(low, image.row(v)[u]), high = std::max(high, image.row(v)[u]);
-        spans.push_back(high - low);
+        const int x = (image.width - kWidth) * (k % kPatches) / kPatches;
+        const int y = (image.height - kHeight) * (k / kPatches) / kPatches;
+        spans[size_t(k)] = span_of<kWidth, kHeight>(image.window(x, y, kWidth, kHeight));
     }
     const auto flat = spans.begin() + ptrdiff_t(kFlat * double(spans.size()));
     std::nth_element(spans.begin(), flat, spans.end());
@@ -38,19 +56,28 @@ void Theta::step() {
     value_ = 256 * share;
 }
 
+namespace {
+
+constexpr int kShift = 3, kTile = 1 << kShift;
+
+/// Each of n values `kTile` times.
+ROUNDEL_CLONES void repeat(const uint8_t* from, int n, uint8_t* to) {
+    for (int x = 0; x < n; ++x)
+        for (int k = 0; k < kTile; ++k) to[kTile * x + k] = from[x];
+}
+
+}  // namespace
+
 void ThresholdMap::expand(int y, int width, uint8_t* out) const {
     const uint8_t* row = theta.data() + size_t(y >> shift) * size_t(columns);
-    for (int x = 0; x < width; x += 8) {
-        const uint64_t eight = row[x >> shift] * 0x0101010101010101u;
-        std::memcpy(out + x, &eight, sizeof eight);
-    }
+    if (shift == kShift) return repeat(row, (width + kTile - 1) / kTile, out);
+    for (int x = 0; x < width; x += kTile) std::memset(out + x, row[x >> shift], kTile);
 }
 
 ThresholdMap constant_threshold(uint8_t theta) { return {30, 1, {theta}}; }
 
 namespace {
 
-constexpr int kShift = 3, kTile = 1 << kShift;
 constexpr int kLevels = 5;
 
 /// The darkest and the brightest pixel of each tile, row by row.
@@ -60,9 +87,6 @@ struct Range {
     Range(int c, int r) : columns(c), rows(r), low(size_t(c) * size_t(r), 255), high(low.size(), 0) {}
     size_t at(int x, int y) const { return size_t(y) * size_t(columns) + size_t(x); }
 };
-
-inline uint8_t least(uint8_t a, uint8_t b) { return a < b ? a : b; }
-inline uint8_t greatest(uint8_t a, uint8_t b) { return a > b ? a : b; }
 
 /// Joins the ranges of n columns into others.
 inline void widen(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {

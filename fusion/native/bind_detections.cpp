@@ -1,14 +1,17 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
+
 #include "arrays.hpp"
-#include "candidates.hpp"
+#include "assignment.hpp"
 #include "inverse_lens.hpp"
 
 namespace roundel::fusion {
 namespace {
 
 using Markers = std::vector<ExpectedMarker>;
+constexpr size_t kMostMarkers = size_t(1) << 24;  // a number beyond is none of an arena's
 
 /// R and P are those of the bodies, `body` that of each marker.
 void make_expected(Markers* self, const In<double, -1, 3, 3>& R, const In<double, -1, 12, 12>& P,
@@ -28,8 +31,8 @@ void make_expected(Markers* self, const In<double, -1, 3, 3>& R, const In<double
 Out covariances(const Markers& markers, double tau) {
     auto [all, to] = make({markers.size(), 3, 3});
     for (const ExpectedMarker& marker : markers) {
-        const Matrix C = marker.covariance(tau);
-        for (const Vector& row : {C.r0, C.r1, C.r2}) *to++ = row.x, *to++ = row.y, *to++ = row.z;
+        write(marker.covariance(tau), to);
+        to += 9;
     }
     return all;
 }
@@ -54,6 +57,23 @@ auto candidates(const Markers& markers, const Poses& poses, const Index& frame, 
     return std::make_tuple(pairs, costs);
 }
 
+OutOf<int64_t> assign_pairs(const In<int64_t, 2, -1>& pairs, const Numbers& costs, const Index& frame) {
+    const size_t n = costs.size();
+    require_equal(n, {pairs.shape(1)});
+    std::vector<Candidate> candidates;
+    for (size_t k = 0; k < n; ++k) {
+        require_below(kMostMarkers, pairs(0, k));
+        require_below(frame.size(), pairs(1, k));
+        if (!(std::abs(costs(k)) < kUnmatched)) throw nb::value_error("a cost that is none");
+        candidates.push_back({pairs(0, k), pairs(1, k), costs(k)});
+    }
+    std::vector<int64_t> rows;
+    unlocked([&] { rows = assign(candidates, frame.data()); });
+    auto [chosen, to] = make<int64_t>({rows.size()});
+    std::copy(rows.begin(), rows.end(), to);
+    return chosen;
+}
+
 auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
@@ -71,6 +91,7 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
+    m.def("assign", &assign_pairs);
     m.def("look_up", &look_up_pixels);
 }
 

@@ -4,7 +4,7 @@
 #include <algorithm>
 
 #include "arrays.hpp"
-#include "normal_equations.hpp"
+#include "motion.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -48,11 +48,34 @@ Out inverses(const In<double, -1, 12, 12>& information) {
     return covariances;
 }
 
+auto predict_bodies(const In<double, -1, 3, 3>& R, const In<double, -1, 3>& p, const In<double, -1, 3>& omega,
+                    const In<double, -1, 3>& v, const In<double, -1, 12, 12>& P, const Numbers& dt,
+                    const In<double, -1, 2>& densities, const In<bool, -1>& single) {
+    const size_t n = R.shape(0);
+    require_equal(n, {p.shape(0), omega.shape(0), v.shape(0), P.shape(0), dt.size(), densities.shape(0),
+                      single.size()});
+    auto [R_then, to_R] = make({n, 3, 3});
+    auto [p_then, to_p] = make({n, 3});
+    auto [P_then, to_P] = make({n, kErrors, kErrors});
+    auto [turn, to_turn] = make({n, 3, 3});
+    std::copy_n(P.data(), P.size(), to_P);
+    for (size_t b = 0; b < n; ++b) {
+        Body body{matrix_at(R.data() + 9 * b), vector_at(p.data() + 3 * b), vector_at(omega.data() + 3 * b),
+                  vector_at(v.data() + 3 * b)};
+        const Drive drive{dt(b), densities(b, 0), densities(b, 1), single(b)};
+        write(predict(body, reinterpret_cast<Square*>(to_P)[b], drive), to_turn + 9 * b);
+        write(body.R, to_R + 9 * b);
+        write(body.p, to_p + 3 * b);
+    }
+    return std::make_tuple(R_then, p_then, P_then, turn);
+}
+
 }  // namespace
 
 void bind_equations(nb::module_& m) {
     m.attr("CAUCHY") = kCauchy;
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
+    m.def("predict", &predict_bodies);
     m.def("reweigh", &sum_up);
     m.def("remainder", &remainder_of);
     m.def("inverses", &inverses);

@@ -152,7 +152,7 @@ std::vector<Candidate> find_candidates(const Poses& poses, const std::vector<Exp
             field.visit_near(expected.at.x, expected.at.y, expected.spread, [&](const Placement& p) {
                 const int64_t k = p.detection;
                 const double costs = cost(expected, p, seen.major[k], Scale::of(seen.scale, k), focal[f]);
-                if (costs < kInfinity) found.push_back({int64_t(m), k, costs});
+                if (std::isfinite(costs)) found.push_back({int64_t(m), k, costs});
             });
         }
     }

@@ -18,8 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 from calib.camera import Camera
+from calib.outcome import Calibration
 from calib.rig import Rig, load_rig
-from calib.wand import Calibration, calibrate
+from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.observations import read_observations

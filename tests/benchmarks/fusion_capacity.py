@@ -15,11 +15,11 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from camera_node.messages import Detections, decode, encode
-from fusion.health import memory_mb
 from fusion.instants import Frame, Instants
-from fusion.messages import Latency, RobotPose
+from fusion.messages import Latency, RobotPose, ShardPoses
 from fusion.server import collecting_between_instants
 from fusion.shards import Shard
 from fusion.tracker import Tracker
@@ -45,18 +45,17 @@ class Capacity:
     p99_ms: float
     cpu: float
     tracked: float
-    grown_mb_min: float  # slope of the resident memory, a line through one sample a second
 
 
 def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
     """Of a load that runs for `seconds`; of several shards, each a core of its own, the worst of each figure."""
     with collecting_between_instants():
-        queues = [_Queue(load, Shard(k + 1, shards)) for k in range(shards)]
+        queues = [Queue(load, seconds, Shard(k + 1, shards)) for k in range(shards)]
         for message in load.messages(seconds):
             data, arrival_ns = encode(message), message.t_ns + DELAY_NS
             told = [queue.step(data, arrival_ns) for queue in queues]
             for k, queue in enumerate(queues):
-                queue.hear([pose for other in (*told[:k], *told[k + 1 :]) for pose in other])
+                queue.hear([message for other in (*told[:k], *told[k + 1 :]) for message in other])
     each = [queue.sum_up(seconds) for queue in queues]
     worst = {name: max(getattr(c, name) for c in each) for name in Capacity.__slots__}
     return Capacity(**worst | {"tracked": min(c.tracked for c in each)})
@@ -65,7 +64,7 @@ def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
 def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
     """Of several loads, which take turns: what else the machine does meets all of them alike."""
     with collecting_between_instants():
-        queues = [_Queue(load, Shard()) for load in loads]
+        queues = [Queue(load, seconds) for load in loads]
         streams = [load.messages(seconds) for load in loads]
         for _ in range(math.ceil(seconds / TURN_S)):
             for load, queue, stream in zip(loads, queues, streams, strict=True):
@@ -74,26 +73,47 @@ def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
     return [queue.sum_up(seconds) for queue in queues]
 
 
-class _Queue:
-    """A server's loop on the messages of a load: `free_ns` is when it is done with what came so far."""
+class Series:
+    """Numbers, in memory that is taken before the first: what a benchmark keeps must not grow while it runs."""
 
-    def __init__(self, load: Load, shard: Shard) -> None:
+    def __init__(self, room: int) -> None:
+        self._numbers, self._n = np.full(room, np.nan), 0  # written, so that the memory is really taken
+
+    def __len__(self) -> int:
+        return self._n
+
+    def append(self, number: float) -> None:
+        self._numbers[self._n] = number
+        self._n += 1
+
+    def clear(self) -> None:
+        self._n = 0
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        return self._numbers[: self._n]
+
+
+class Queue:
+    """A server's loop on `seconds` of a load's messages: `free_ns` is when it is done with what came so far."""
+
+    def __init__(self, load: Load, seconds: float, shard: Shard = Shard()) -> None:  # noqa: B008 frozen
         self.load = load
         self.tracker = Tracker(load.rig, load.bodies, shard=shard)
         self.instants = Instants(round(1e9 / load.hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
-        self.latencies: list[float] = []
-        self.tracked: list[float] = []
-        self._done_ns: list[int] = []  # of processor time, at each instant's end
-        self._memory: list[tuple[int, float]] = []
+        room = math.ceil((seconds + 1) * load.hz)
+        self.latencies_ms, self.tracked = Series(room), Series(room)
+        self._done_ns = Series(room)  # of processor time, at each instant's end
+        self._warm = False
 
     def step(self, data: bytes, arrival_ns: int) -> list[bytes]:
-        """A message comes; the poses that are told. What is done in the first `START_S` is not counted."""
+        """A message comes; what other shards are told. What is done in the first `START_S` is not counted."""
         self._first_ns = self._first_ns or arrival_ns
-        if not self._memory and arrival_ns - self._first_ns > START_S * 1e9:
-            self._memory.append((arrival_ns, memory_mb()))
-            self.busy_ns, self.free_ns = 0, arrival_ns
-            self.latencies, self.tracked, self._done_ns = [], [], []
+        if not self._warm and arrival_ns - self._first_ns > START_S * 1e9:
+            self._warm, self.busy_ns, self.free_ns = True, 0, arrival_ns
+            for series in (self.latencies_ms, self.tracked, self._done_ns):
+                series.clear()
         if self.free_ns < arrival_ns:
             self._spend(self._anticipate)
         self.free_ns = max(self.free_ns, arrival_ns)
@@ -101,34 +121,37 @@ class _Queue:
         if arrival_ns - self._collected_ns > 1e9:
             self._spend(gc.collect)
             self._collected_ns = arrival_ns
-            self._memory += [(arrival_ns, memory_mb())] if self._memory else []
         return told
 
-    def hear(self, poses: Sequence[bytes]) -> None:
-        """Other shards' poses come."""
-        self._spend(lambda: [self.tracker.follow(decode(pose, RobotPose)) for pose in poses])
+    def hear(self, messages: Sequence[bytes]) -> None:
+        """Other shards' robots come."""
+        self._spend(lambda: [self.tracker.follow(decode(message, ShardPoses)) for message in messages])
 
     def sum_up(self, seconds: float) -> Capacity:
         """What it took."""
-        p50, p99 = np.percentile(self.latencies, [50, 99])
+        p50, p99 = np.percentile(self.latencies_ms.numbers, [50, 99])
         cpu = self.busy_ns / ((seconds - START_S) * 1e9)
-        cost_ms, quiet_ms = 1e3 * cpu / self.load.hz, float(np.percentile(np.diff(self._done_ns), 5)) * 1e-6
-        return Capacity(
-            cost_ms, quiet_ms, p50, p99, cpu, float(np.mean(self.tracked)), _slope_mb_min(self._memory)
+        cost_ms, quiet_ms = (
+            1e3 * cpu / self.load.hz,
+            float(np.percentile(np.diff(self._done_ns.numbers), 5)) * 1e-6,
         )
+        return Capacity(cost_ms, quiet_ms, p50, p99, cpu, float(np.mean(self.tracked.numbers)))
 
     def _take(self, data: bytes, arrival_ns: int) -> list[bytes]:
         self._spend(lambda: self._add(data))
         out: list[bytes] = []
         for instant in self._spend(lambda: self.instants.take(arrival_ns)):
             first = self._spend(lambda instant=instant: self.tracker.advance(instant))
-            out += self._spend(lambda first=first: self._tell(first))
-            self.latencies.append((self.free_ns - arrival_ns) * 1e-6)
+            self._spend(lambda first=first: self._tell(first))
+            done_ns = self.free_ns
+            if self.tracker.shard.count > 1:
+                out.append(self._spend(lambda: encode(self.tracker.tell())))
             fused = self._spend(self.tracker.complete)
             told = {pose.robot for pose in first}
             if rest := [pose for pose in fused.poses if pose.robot not in told]:
-                out += self._spend(lambda rest=rest: self._tell(rest))
-                self.latencies[-1] = (self.free_ns - arrival_ns) * 1e-6
+                self._spend(lambda rest=rest: self._tell(rest))
+                done_ns = self.free_ns
+            self.latencies_ms.append((done_ns - arrival_ns) * 1e-6)
             self._spend(lambda fused=fused: encode(fused.markers))
             self._spend(self.tracker.inspect)
             self._done_ns.append(self.busy_ns)
@@ -156,9 +179,3 @@ class _Queue:
         self.free_ns += cost
         self.busy_ns += cost
         return done
-
-
-def _slope_mb_min(memory: list[tuple[int, float]]) -> float:
-    """Of times (ns) and sizes (MB)."""
-    t, size = np.array(memory, float).T
-    return float(np.polyfit((t - t[0]) / 60e9, size, 1)[0]) if len(memory) > 2 else 0.0

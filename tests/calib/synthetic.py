@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.agreement import Placed, compare
 from calib.camera import Camera, transform
+from calib.outcome import Calibration
 from calib.rig import Rig
-from calib.wand import Calibration
 from camera_node.body import Body
 from camera_node.messages import Detections
 from camera_node.pose import Pose, invert, look_at, rotation_from_vector
@@ -177,6 +178,13 @@ def errors(found: Rig, truth: Rig) -> tuple[float, float]:
     return float(shift.max()), float(turn.max())
 
 
+def assert_near(found: Rig, truth: Rig, metres: float, radians: float) -> None:
+    """Every camera is where it should be, and turned as it should be."""
+    shift, turn = errors(found, truth)
+    assert shift < metres
+    assert turn < radians
+
+
 def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
     """Errors of positions, m, and orientations, rad, by camera, after the best rigid motion of the world."""
     names = list(found.placed())
@@ -193,12 +201,12 @@ def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
 
 def joint_error(result: Calibration, truth: Rig) -> tuple[float, int]:
     """Squared Mahalanobis error of all poses together, and its degrees of freedom: the choice of the world, which no
-    covariance speaks of, is projected out."""
-    names = result.names
-    there = np.array([truth.cameras[n].matrix() for n in names])
-    here = np.array([result.rig.cameras[n].matrix() for n in names])
-    here = there[0] @ np.linalg.inv(here[0]) @ here
-    offsets = np.linalg.inv(here) @ there
-    error = np.array([[D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]] for D in offsets]).ravel()
-    information = np.linalg.pinv(result.covariance, rcond=1e-10, hermitian=True)
-    return float(error @ information @ error), 6 * len(names) - 6
+    covariance speaks of, is projected out, and its scale, where a distance that is exact carries it."""
+    there = np.array([truth.cameras[n].matrix() for n in result.names])
+    poses = np.array([result.rig.cameras[n].matrix() for n in result.names])
+    metric = result.adjusted.problem.fixed_distance is None
+    told = compare(
+        Placed(result.names, poses, result.covariance, metric=metric),
+        Placed(result.names, there, np.zeros_like(result.covariance)),
+    )
+    return told.chi2, told.degrees

@@ -18,7 +18,7 @@ from calib.camera import Camera
 from calib.rig import Rig, load_rig, save_rig
 from camera_node.observations import write_observations
 from camera_node.pose import Pose, invert
-from tests.calib.synthetic import Arena, errors, record, ring
+from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.test_world import L_FRAME, elsewhere, lie_still
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
@@ -48,7 +48,7 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
     assert done.returncode == 0, done.stderr
     assert "residual" in done.stdout
     rig = load_rig(tmp_path / "rig.yaml")
-    assert errors(rig, waved.truth) < (3e-3, 1.5e-3)  # as without the file: noise is 0.1 px
+    assert_near(rig, waved.truth, 3e-3, 1.5e-3)  # as without the file: noise is 0.1 px
     assert rig.calibration["cameras"]["cam0"]["observations"] > 50
     rows = [f"{n},{','.join(map(str, c.matrix()[:3, 3]))}" for n, c in waved.truth.cameras.items()]
     (tmp_path / "survey.csv").write_text("\n".join(["camera,x,y,z", *rows]))
@@ -208,7 +208,7 @@ def test_frames_of_a_foreign_arena(tmp_path: Path, shared_data: Callable[[str], 
     assert done.returncode == 0, done.stderr
     found = load_rig(tmp_path / "rig.yaml")
     assert set(found.placed()) == set(told)
-    assert errors(found, Rig(cameras=truth)) < (3e-3, np.radians(0.1))
+    assert_near(found, Rig(cameras=truth), 3e-3, np.radians(0.1))
 
 
 def _camera(entry: dict, placed: bool = False) -> Camera:

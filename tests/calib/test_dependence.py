@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calib.agreement import Agreement, compare
 from calib.commands.check import placed, split
-from calib.wand import Calibration, calibrate
+from calib.outcome import Calibration
+from calib.wand import calibrate
 from camera_node.messages import Detections
 from camera_node.roundels import Roundels
 from tests.calib.synthetic import Arena, record, ring

@@ -10,8 +10,9 @@ from scipy.stats import chi2
 
 from calib.ends import label_ends
 from calib.errors import CalibrationError
+from calib.outcome import Calibration
 from calib.sightings import gather
-from calib.wand import Calibration, calibrate
+from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
 from tests.calib.synthetic import CAREFUL, joint_error, roughly

@@ -9,10 +9,11 @@ import pytest
 from scipy.stats import chi2
 
 from calib.lens_prior import told_sigma
+from calib.outcome import Calibration
 from calib.recalibration import place_one
 from calib.rig import Rig
 from calib.trust import assess
-from calib.wand import Calibration, calibrate
+from calib.wand import calibrate
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 

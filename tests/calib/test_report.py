@@ -7,8 +7,8 @@ import msgspec
 import pytest
 from rich.console import Console
 
+from calib.commands.report import print_report
 from calib.lens_change import describe, find_changes
-from calib.report import lenses_as_dict, print_report
 from calib.trust import assess
 from calib.wand import calibrate
 from tests.calib.wave import Wave, record
@@ -38,7 +38,7 @@ def test_a_lens_that_was_off_is_told_with_its_correction():
         for line in lines
     )
     assert lines[-1] == "as they were, within 2 sigmas: the lenses of cam00, cam01, cam03, cam04"
-    assert lenses_as_dict(result)["adjusted_lenses"]["cam02"]["before"]["fx"] == change.before.fx
+    assert result.as_dict()["adjusted_lenses"]["cam02"]["before"]["fx"] == change.before.fx
     text = StringIO()
     print_report(result, assess(result, wave.wand), Console(width=80, file=text))
     told = text.getvalue()

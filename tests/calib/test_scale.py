@@ -6,8 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from calib.__main__ import execute
+from calib.agreement import Agreement
+from calib.agreement import compare as compare_rigs
+from calib.commands.check import placed, split
 from calib.errors import CalibrationError
 from calib.rig import load_rig, save_rig
 from calib.scale import Distance, compare
@@ -16,7 +20,9 @@ from calib.waving import try_part
 from camera_node.body import Body
 from camera_node.errors import ConfigError
 from camera_node.observations import write_observations
-from tests.calib.synthetic import Arena, errors, record, ring
+from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly
+from tests.calib.wave import Wave
+from tests.calib.wave import record as record_wave
 
 LIGHT = Body(diameter_m=0.1)
 
@@ -37,7 +43,7 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
         for sigma in (0.0, 0.02)
     )
     assert exact.report.metric
-    assert errors(exact.rig, arena.truth) < (2e-3, 1e-3)
+    assert_near(exact.rig, arena.truth, 2e-3, 1e-3)
     for a, b in combinations(exact.names, 2):
         wanted = Distance(a, b, apart(arena, a, b), 0.0)
         sure, loose = (compare(wanted, told.names, told.adjusted) for told in (exact, rough))
@@ -49,7 +55,37 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
     sized = record(arena, 12.0, sigma_px=0.1)  # a roundel's size, a tenth off, gives way
     wrong = Body(diameter_m=0.11)
     by_tape = calibrate(arena.intrinsics, wrong, sized, Distance("cam0", "cam2", true))
-    assert errors(by_tape.rig, arena.truth) < (5e-3, 2e-3)
+    assert_near(by_tape.rig, arena.truth, 5e-3, 2e-3)
+
+
+@pytest.mark.parametrize("off", [EXACT, OLD])
+def test_halves_of_a_light_are_compared_by_their_shape(off: tuple[float, float, float]):
+    """Each half sets its two farthest cameras 1 m apart, and these are not the same ones in both; and a distance that
+    is exact changes, by the square of a turn, by more than its own deviation: it told 10^4 times too large a
+    difference. Chi-square, summed over waves, lies below its 99.9 % quantile."""
+    found = [shape_apart(seed, off) for seed in (20, 21, 23)]
+    assert all(told.degrees == 6 * 4 - 7 for told in found)
+    assert sum(told.chi2 for told in found) < chi2.ppf(0.999, sum(told.degrees for told in found))
+
+
+def test_halves_of_a_light_that_differ_in_shape_are_told():
+    """A camera that was moved by 2 cm between the halves of its wave."""
+    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21)
+    recorded = record_wave(wave)
+    first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split(recorded.messages))
+    moved = placed(second)
+    moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # of 6 m, that are 1 here
+    told = compare_rigs(placed(first), moved)
+    assert not told.holds
+    assert told.guilty == "cam02"
+
+
+def shape_apart(seed: int, off: tuple[float, float, float]) -> Agreement:
+    """How the halves of 6 s differ."""
+    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed)
+    recorded = record_wave(wave)
+    rig = roughly(recorded.intrinsics, off, seed=seed)
+    return compare_rigs(*(placed(calibrate(rig, LIGHT, half)) for half in split(recorded.messages)))
 
 
 def test_a_wand_that_knows_metres_is_compared():
@@ -62,7 +98,7 @@ def test_a_wand_that_knows_metres_is_compared():
         told = result.report.compared
         assert told is not None
         assert told.sentence().startswith("warning: ") == warned
-        assert errors(result.rig, plain.rig) < (1e-12, 1e-7)  # what rounding leaves
+        assert_near(result.rig, plain.rig, 1e-12, 1e-7)  # what rounding leaves
         assert told.off_m / given == pytest.approx(true / given - 1, abs=1e-3)
 
 

@@ -9,11 +9,12 @@ from scipy.stats import chi2
 
 from calib.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.errors import CalibrationError
+from calib.outcome import Calibration
 from calib.precision import map_precision
 from calib.problem import PER_CAMERA, POSE, State
 from calib.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
 from calib.trust import GRADES, LIMITS, CameraTrust, Trust, assess, grade
-from calib.wand import Calibration, calibrate
+from calib.wand import calibrate
 from tests.calib.synthetic import record, ring
 from tests.calib.test_agreement import covariance, disturb
 

@@ -11,7 +11,7 @@ from calib.rig import Rig
 from calib.wand import calibrate
 from camera_node.body import Body
 from camera_node.messages import Detections
-from tests.calib.synthetic import CAREFUL, WAND, Arena, errors, joint_error, record, ring, roughly
+from tests.calib.synthetic import CAREFUL, WAND, Arena, assert_near, joint_error, record, ring, roughly
 
 
 def run(arena: Arena, messages: list[Detections]):
@@ -22,7 +22,7 @@ def test_exact_without_noise_when_cameras_fire_together():
     """What remains is the pixel's rounding and the hand's prior, far below a tenth of a millimetre."""
     arena = ring()
     result = run(arena, record(arena, free_running=False))
-    assert errors(result.rig, arena.truth) < (1e-4, 1e-4)
+    assert_near(result.rig, arena.truth, 1e-4, 1e-4)
     assert not result.report.unplaced
     assert result.report.length_std_mm == pytest.approx(0, abs=0.05)
 
@@ -32,7 +32,7 @@ def test_exact_without_noise_when_cameras_run_freely(seconds: float, period_ms: 
     """A quarter of a period apart at a metre a second, ignoring the times would cost centimetres."""
     arena = ring()
     result = run(arena, record(arena, seconds, period_ns=period_ms * 1_000_000))
-    assert errors(result.rig, arena.truth) < (2e-4, 2e-4)
+    assert_near(result.rig, arena.truth, 2e-4, 2e-4)
 
 
 def test_reported_covariance_is_honest():
@@ -53,10 +53,10 @@ def test_gross_outliers_and_clutter_are_left_out_and_counted():
     errors of up to 60 px do to plain least squares."""
     arena = ring()
     numbered = run(arena, record(arena, sigma_px=0.1, outliers=0.05, numbered=True, sized=False))
-    assert errors(numbered.rig, arena.truth) < (3e-3, 1.5e-3)
+    assert_near(numbered.rig, arena.truth, 3e-3, 1.5e-3)
     assert len(numbered.report.outliers) == sum(row.outliers for row in numbered.report.cameras) > 10
     cluttered = run(arena, record(arena, sigma_px=0.1, clutter=6, missing=0.05))
-    assert errors(cluttered.rig, arena.truth) < (3e-3, 1.5e-3)
+    assert_near(cluttered.rig, arena.truth, 3e-3, 1.5e-3)
 
 
 def test_no_camera_comes_first():
@@ -71,7 +71,7 @@ def test_no_camera_comes_first():
     there = run(renamed, [msgspec.structs.replace(m, camera=other[m.camera]) for m in messages]).rig
     here = run(arena, messages).rig
     back = Rig(cameras={other[n]: c for n, c in there.cameras.items()})
-    assert errors(back, here) < (3e-4, 3e-4)
+    assert_near(back, here, 3e-4, 3e-4)
 
 
 def test_a_camera_that_shares_too_little_is_named_with_the_reason():
@@ -92,7 +92,7 @@ def test_wands_of_other_numbers_of_markers(markers: int):
     result = run(arena, record(arena, 15.0, sigma_px=0.02))
     assert len(result.rig.placed()) == 4
     limit = 0.05 if markers == 1 else 1e-3
-    assert errors(result.rig, arena.truth) < (limit, limit)
+    assert_near(result.rig, arena.truth, limit, limit)
 
 
 def test_a_light_without_size_gives_a_rig_up_to_scale():

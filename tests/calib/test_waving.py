@@ -23,7 +23,7 @@ from calib.rig import load_rig, save_rig
 from calib.waving import IDLE_S, Progress, Rule, Trial, progress, thin, wave
 from camera_node.messages import Detections, Keys, encode
 from camera_node.network import open_client, open_router
-from tests.calib.synthetic import errors, record, ring
+from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 
 
@@ -150,7 +150,7 @@ def test_a_wave_whose_solution_fails_is_kept_and_the_command_told_tries_it_again
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.2, 0, 0], [0.5, 0, 0]]}")
     assert again[:3] == ["python", "-m", "calib"]
     execute(again[3:])
-    assert errors(load_rig(out), arena.truth) < (2e-4, 2e-4)  # no noise
+    assert_near(load_rig(out), arena.truth, 2e-4, 2e-4)  # no noise
 
 
 def test_a_part_holds_whole_runs_of_all_cameras():

@@ -13,7 +13,8 @@ import pytest
 
 from camera_node.device import DeviceSource, camera_names, capture_time, find_device, open_capture, properties
 from camera_node.errors import CameraError
-from camera_node.source import SourceSettings, open_source
+from camera_node.frame import SourceSettings
+from camera_node.source import open_source
 
 
 @pytest.fixture

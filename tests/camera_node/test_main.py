@@ -24,6 +24,8 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
         (["--source", "FRAMES", "--connect", "server"], "tcp/host:7447"),
         (["--source", "FRAMES", "--inner-ratios", "7"], "inner_ratios"),
         (["--source", "FRAMES", "--zenoh", "none.json5"], "none.json5 does not exist"),
+        (["detct", "FRAMES"], "did you mean detect?"),
+        (["show", "FRAMES"], "there are detect, print"),
         (["--source", "FRAMES", "--fourcc", "JPEG2000"], "four letters"),
     ],
 )

@@ -15,9 +15,10 @@ import pytest
 import zenoh
 
 from camera_node.detector import Detector
+from camera_node.frame import SourceSettings
 from camera_node.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
 from camera_node.node import Node
-from camera_node.source import SourceSettings, open_source
+from camera_node.source import open_source
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera_node.detector import Detector
 from camera_node.pixels import BAYER, grey, narrow
-from camera_node.source import FolderSource
+from camera_node.replay import FolderSource
 from tests.camera_node.rendering import Disc, outer_conic, render
 
 LEVELS = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10

@@ -16,9 +16,9 @@ import yaml
 
 from camera_node.pose import Pose
 from camera_node.rendering import Renderer
+from camera_node.replay import FolderSource, read_grey
 from camera_node.scene import Scene
 from camera_node.simulation import SimulatedCamera, list_exposures, render_recording
-from camera_node.source import FolderSource, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from camera_node.errors import CameraError, ConfigError
-from camera_node.source import FolderSource, Source, SourceSettings, VideoSource, open_source, read_grey
+from camera_node.frame import Source, SourceSettings
+from camera_node.replay import FolderSource, VideoSource, read_grey
+from camera_node.source import open_source
 
 MS = 1_000_000
 FAST = SourceSettings(pace="fast")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.optics import Discs, Exposures, Optics, Views
 from fusion.sightings import Observations, Sightings
-from fusion.state import OMEGA, POSITION, THETA, VELOCITY, States, turns
+from fusion.state import OMEGA, POSITION, THETA, VELOCITY, Motion, States, exp_so3, turns
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -211,3 +211,28 @@ def candidates(
                 cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * optics.focal[camera] ** 4 * depth)
                 found[int(i), int(j)] = cost
     return found
+
+
+def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Motion]:
+    """See `fusion.state.predict`."""
+    half = exp_so3(states.omega * dt[:, None] / 2)
+    R_half = half @ states.R
+    turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
+    motion = Motion(turn, dt)
+    P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
+    moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
+    return moved, motion
+
+
+def noise(dt: Array, densities: Array, R_half: Array) -> Array:
+    """(N, 12, 12) of white noise on acceleration: q [dt^3/3, dt^2/2; dt^2/2, dt]."""
+    Q = np.zeros((len(dt), 12, 12))
+    i = np.arange(3)
+    for k, (place, rate) in enumerate(((THETA, OMEGA), (POSITION, VELOCITY))):
+        q = densities[:, k]
+        Q[:, place.start + i, place.start + i] = (q * dt**3 / 3)[:, None]
+        Q[:, rate.start + i, rate.start + i] = (q * dt)[:, None]
+        turn = R_half.transpose(0, 2, 1) if place is THETA else np.eye(3)
+        Q[:, place, rate] = (q * dt**2 / 2)[:, None, None] * turn
+        Q[:, rate, place] = np.swapaxes(Q[:, place, rate], 1, 2)
+    return Q

@@ -9,13 +9,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from camera_node.roundels import Roundels
 from fusion import _core
 from fusion.instants import Frame, Instant
 from fusion.optics import Discs, Optics
 from fusion.sightings import Observations, Sightings
-from fusion.state import States, exp_so3
+from fusion.state import States, exp_so3, predict
 from tests.fusion import equations
 from tests.fusion.synthetic import ring
 
@@ -110,6 +111,42 @@ def test_sums_and_weights_are_those_of_reweighted_least_squares():
     steps = random.normal(size=(5, 12))
     rest = rows[:, :, 12] - np.einsum("nai,ni->na", rows[:, :, :12], steps[body])
     assert_near(_core.remainder(rows, body, steps), rest.T)
+
+
+def test_prediction_is_the_motion_models():
+    random = np.random.default_rng(6)
+    states, _ = scene()
+    root = random.normal(size=(BODIES, 12, 20))
+    states = replace(states, P=root @ root.transpose(0, 2, 1))
+    of_each = random.uniform(1e-3, 0.2, BODIES), random.uniform(0.1, 9, (BODIES, 2)), np.arange(BODIES) == 2
+    (found, motion), (expected, of_errors) = predict(states, *of_each), equations.predict(states, *of_each)
+    assert_near(motion.turn, of_errors.turn)
+    for name in States.__slots__:
+        assert_near(getattr(found, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_least_cost(seed: int):
+    """Against SciPy's assignment of whole frames, from a few pairs to every marker near every detection."""
+    random = np.random.default_rng(seed)
+    frame = np.repeat(np.arange(3), random.integers(1, 30, 3))
+    marker, detection = np.nonzero(random.random((25, len(frame))) < random.uniform(0.02, 1))
+    order = np.argsort(frame[detection], kind="stable")
+    pairs, costs = np.stack([marker, detection])[:, order], random.normal(size=len(order))
+    chosen = _core.assign(pairs, costs, frame)
+    expected = 0
+    for f in range(3):
+        dense = np.full((25, len(frame)), 1e4)
+        of_frame = frame[pairs[1]] == f
+        dense[pairs[0, of_frame], pairs[1, of_frame]] = costs[of_frame]
+        best = dense[linear_sum_assignment(dense)]
+        expected += best[best < 1e4].sum()
+        assert (frame[pairs[1, chosen]] == f).sum() == (best < 1e4).sum()
+    assert len(set(pairs[1, chosen].tolist())) == len(chosen)
+    assert len({(f, m) for f, m in zip(frame[pairs[1, chosen]], pairs[0, chosen], strict=True)}) == len(
+        chosen
+    )
+    assert costs[chosen].sum() == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_covariance_is_the_inverse_of_its_information():

@@ -155,6 +155,13 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
             client.change_robots(remove=["c"])
 
 
+def test_a_misspelt_command_is_answered_with_the_one_meant():
+    words = [sys.executable, "-m", "fusion", "defined", "b"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "did you mean define?" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

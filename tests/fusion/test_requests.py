@@ -3,16 +3,20 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import msgspec
+import pytest
 
 from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.messages import decode, encode
 from camera_node.pose import Pose
 from fusion.calibration import Calibration
+from fusion.errors import FusionError
 from fusion.kept import Kept
-from fusion.messages import Robots, RobotsRequest, robots_key, undo_key
+from fusion.messages import Robots, RobotsRequest, robots_key
 from tests.fusion.synthetic import WIDE
 from tests.fusion.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 
@@ -66,13 +70,15 @@ def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
 def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
     settings = config(tmp_path)
     with serving(settings) as (server, client):
-        assert "nothing to undo" in ask(client, undo_key("test"))[1]
+        with pytest.raises(FusionError, match="nothing to undo"):
+            client.undo_correction()
         moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
         server.link.put(lambda: server.calibration.correct("cam1", moved))
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
-        reply, _ = ask(client, undo_key("test"))
-        assert reply is not None
-        assert msgspec.yaml.decode(decode(reply, RigMessage).yaml, type=Rig).cameras == ARENA.cameras
+        words = [sys.executable, "-m", "fusion", "undo", "--connect", settings.listen[0], "--arena", "test"]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        assert done.stdout == "cam1 is back where it stood, and is not watched any more\n"
+        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)
         assert server._tracker is not None
         assert server._tracker.watch.held == {"cam1"}
 

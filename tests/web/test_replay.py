@@ -96,7 +96,7 @@ def test_any_moment_can_be_jumped_to(recording: Path, moment: float, placed: int
         assert latest.rig is not None
         assert len(latest.rig.placed()) == placed
         assert latest.now == feed.latest().now == min(moment, replay.duration_s)
-        assert tabulate_robots(latest).rows[0][1] == "tracked"
+        assert tabulate_robots(latest).rows[0].cells[1] == "tracked"
         assert latest.server_alive
         assert not latest.faults
 

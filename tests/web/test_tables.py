@@ -12,7 +12,15 @@ from fusion.messages import CameraHealth, FusionStatus
 from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen
-from web.tables import STALE_S, describe, describe_server, describe_sigma, tabulate_cameras, tabulate_robots
+from web.tables import (
+    STALE_S,
+    Row,
+    describe,
+    describe_server,
+    describe_sigma,
+    tabulate_cameras,
+    tabulate_robots,
+)
 from web.trails import LENGTH, Trails, fade
 
 
@@ -23,9 +31,10 @@ def test_the_tables_show_what_was_sent(played: Played, feed: Feed):
     played.status()
     wait_for(lambda: (x := feed.latest()).poses and x.cameras and x.status)
     latest = feed.latest()
-    assert tabulate_robots(latest).rows == [("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")]
-    cells = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1", "too dark")
-    assert tabulate_cameras(latest).rows == [cells]
+    robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")
+    assert tabulate_robots(latest).rows == [Row(robot, "ok")]
+    camera = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1")
+    assert tabulate_cameras(latest).rows == [Row(camera, "warn", "too dark")]
 
 
 def test_a_camera_that_does_not_count_is_told():
@@ -60,7 +69,7 @@ def test_a_camera_that_does_not_count_is_told():
             faults={},
         )
         latest = Latest(now=now, cameras={"north": Seen(own, 0.0)}, status=Seen(status, 0.0))
-        return tabulate_cameras(latest).rows[0][-1]
+        return tabulate_cameras(latest).rows[0].note
 
     assert advice(health) == "moved: set aside until it is placed anew"
     assert advice(msgspec.structs.replace(health, calibrated=False)) == "not placed"
@@ -82,9 +91,9 @@ def test_a_robot_whose_markers_are_off_is_told(played: Played, feed: Feed):
     played.pose("rover", (0, 0, 0))
     played.status(misfits={"rover": 2.34})
     wait_for(lambda: (x := feed.latest()).poses and x.status)
-    table = tabulate_robots(feed.latest())
-    assert table.rows[0][1] == "tracked, markers off by 2.3 px"
-    assert table.hues == ["warn"]
+    (row,) = tabulate_robots(feed.latest()).rows
+    assert (row.cells[1], row.hue) == ("tracked", "warn")
+    assert row.note.startswith("its markers are off by 2.3 px")
 
 
 def test_where_a_lost_robot_may_be_is_no_column_of_digits():
@@ -97,8 +106,8 @@ def test_a_silent_robot_is_away(played: Played, feed: Feed):
     wait_for(lambda: feed.latest().poses)
     latest = feed.latest()
     latest.poses["rover"] = replace(latest.poses["rover"], at=time.monotonic() - 2 * STALE_S)
-    assert tabulate_robots(latest).rows[0][1] == "away"
-    assert tabulate_robots(latest).hues == ["bad"]
+    (row,) = tabulate_robots(latest).rows
+    assert (row.cells[1], row.hue) == ("away", "bad")
 
 
 def test_the_status_line_of_nothing():
