@@ -42,7 +42,8 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
 
 void Detector::follow(const ImageView& image) {
     for (const auto& expected : tracks_.expect())
-        if (!accept(image, fit_circles(image, expected.seed, settings_), expected.track))
+        if (!(expected.steady && accept(image, expected.start(), expected.track)) &&
+            !accept(image, fit_circles(image, expected.seed, settings_), expected.track))
             lost_.push_back(expected);
 }
 

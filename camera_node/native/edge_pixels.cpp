@@ -74,15 +74,20 @@ class Strips {
     double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
 };
 
-/// Eight grey levels, of which `left` are in the image.
+/// Eight grey levels, of which `left` are in the image. (Wider by two steps: compilers take bytes to words of
+/// four times their size one by one.)
 ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
-    typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
-    Bytes seen{};
+    typedef uint8_t Bytes __attribute__((vector_size(2 * kLanes)));
+    typedef int16_t Wide __attribute__((vector_size(4 * kLanes)));
+    typedef uint64_t Pair __attribute__((vector_size(2 * kLanes)));
+    uint64_t seen = 0;
     if (left >= kLanes)
-        std::memcpy(&seen, from, sizeof seen);
+        std::memcpy(&seen, from, kLanes);
     else
-        for (int i = 0; i < left; ++i) seen[i] = from[i];
-    return __builtin_convertvector(__builtin_convertvector(seen, Bits), Lanes);
+        for (int i = 0; i < left; ++i) seen |= uint64_t(from[i]) << (8 * i);
+    const Wide wide = __builtin_convertvector(Bytes(Pair{seen, 0}), Wide);
+    return __builtin_convertvector(
+        __builtin_convertvector(__builtin_shufflevector(wide, wide, 0, 1, 2, 3, 4, 5, 6, 7), Bits), Lanes);
 }
 
 /// Appends columns [begin, end) of row y, as far as they are inside the image; eight at a time, where what is
@@ -127,7 +132,30 @@ ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, co
         append_row(image, y + to.origin_y, k % kWideRows ? narrow : wide, to);
 }
 
+struct Mean {
+    Lanes sum, n;
+};
+
+ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& card, Mean& mean) {
+    const double det = card.shape.det();
+    const float xx = float(card.shape.yy / det), xy = float(-2 * card.shape.xy / det);
+    const float yy = float(card.shape.xx / det), x0 = float(card.x), y0 = float(card.y);
+    for (int k = 0; k < pixels.count; k += kLanes) {
+        const Lanes dx = load(pixels.x + k) - x0, dy = load(pixels.y + k) - y0,
+                    level = load(pixels.level + k);
+        const Bits outside = (dx * (xx * dx + xy * dy) + yy * dy * dy > 1.0f) & (level >= 0.0f);
+        mean.sum += outside ? level : all(0), mean.n += outside ? all(1) : all(0);
+    }
+}
+
 }  // namespace
+
+double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
+    Mean mean{};
+    add_outside(pixels, circle_image(p, p[kCard]), mean);
+    const double n = double(sum(mean.n));
+    return n > 0 ? double(sum(mean.sum)) / n : p[kBright];
+}
 
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels) {

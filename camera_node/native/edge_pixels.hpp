@@ -21,4 +21,7 @@ struct Band {
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels);
 
+/// The mean level of those that lie beyond the card's edge; the bright one where none do.
+double level_beyond_card(const EdgePixels& pixels, const Parameters& p);
+
 }  // namespace roundel

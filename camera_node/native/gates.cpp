@@ -56,10 +56,11 @@ bool has_limits(const Fit& fit, const Settings& settings) {
 std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
                                bool known) {
     start.prints = settings.inner_ratios;
-    const auto fit = refine(image, start);
+    auto fit = refine(image, start);
     if (!fit) return std::nullopt;
     const bool whole = is_whole(image, *fit, settings, noise, kMisfit);
-    if (whole && !shows_cover(image, *fit, noise)) return fit;
+    fit->plain = whole && !shows_cover(image, *fit, noise);
+    if (fit->plain || start.model) return fit->plain ? fit : std::nullopt;
     const auto rest = fit_rest(image, start, *fit, noise, known || whole);
     if (rest && has_limits(*rest, settings)) return rest;
     if (whole) return fit;

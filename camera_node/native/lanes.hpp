@@ -33,31 +33,21 @@ ROUNDEL_INLINE Lanes inverse_sqrt(const Lanes& x) {
     return y * (1.5f - half * y * y);
 }
 
-/// exp(x) of x <= 0 to 4e-6 of itself, and 0 below -20, which keeps products from the slow numbers next to 0:
-/// 2^n by the exponent's bits, n the nearest whole number to x / ln 2, and what is left by Taylor's series to
-/// the fifth power.
-ROUNDEL_INLINE Lanes exp_negative(const Lanes& x) {
-    const Lanes shifted = x * 1.44269504f + 12582912.0f;  // 1.5 x 2^23: the low bits hold n
-    const Lanes z = x - (shifted - 12582912.0f) * 0.693147181f;
-    const Lanes zz = z * z,
-                series = (1.0f + z) + zz * ((0.5f + z * (1.0f / 6)) + zz * (1.0f / 24 + z * (1.0f / 120)));
-    return x < -20.0f ? all(0) : Lanes(Words(series) + (Words(shifted) << 23));
-}
-
 /// Of the normal distribution: 1 - Phi(t), and exp(-t^2 / 2).
 struct Normal {
     Lanes tail, density;
 };
 
-/// The tail over the density, Mills' ratio, by the polynomial of fifth degree that is nearest on [0, 5]: the
-/// tail is within 6.3e-5. A division would take longer.
+/// By the polynomials of t^2 that are nearest on [-3.5, 3.5]: the tail is within 3e-5 there, and 2e-4 beyond,
+/// the density within 3e-3, and 0 beyond. Terms that do not wait for each other are faster than a chain.
 ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
-    const Lanes density = exp_negative(-0.5f * t * t), far = magnitude(t), u = far < 5.0f ? far : all(5);
-    const Lanes uu = u * u;
-    const Lanes mills = (0.49993733f - 0.39656799f * u) +
-                        uu * ((0.23543442f - 0.099663184f * u) + uu * (0.025280868f - 0.0027397065f * u));
-    const Lanes tail = density * mills;
-    return {t > 0.0f ? tail : 1.0f - tail, density};
+    const Lanes above = t > -3.5f ? t : all(-3.5f), z = above < 3.5f ? above : all(3.5f);
+    const Lanes u = z * z, uu = u * u;
+    const Lanes odd = (0.398817865f - 0.0660721718f * u) + uu * (0.00956194028f - 0.00100343984f * u) +
+                      uu * uu * ((7.07925185e-05f - 2.94779384e-06f * u) + uu * 5.38789068e-08f);
+    const Lanes even = (0.997568669f - 0.483258972f * u) + uu * (0.106027517f - 0.0125441721f * u) +
+                       uu * uu * (0.000765829199f - 1.87586468e-05f * u);
+    return {0.5f - z * odd, z == t ? even : all(0)};
 }
 
 /// Sum in an order that all machines keep.

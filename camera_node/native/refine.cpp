@@ -21,7 +21,10 @@ constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
 constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
-constexpr double kConverged = 0.4;         // standard deviations that may be left to go
+constexpr double kConverged = 1;           // standard deviations that may be left to go
+constexpr double kShows = 2.5;             // times the noise: an edge's slope is 0.4 of contrast over blur
+constexpr int kResumed = 3;                // steps at most from the model of the frame before, and
+constexpr double kLost = 0.25;             // the contrast's share in the residuals of edges half a blur off
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
 constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of its weighed residuals
 constexpr double kNoiseFloor = 1;  // grey levels
@@ -43,14 +46,23 @@ class Fitter {
         pixels_.origin_y = int(std::lround(start.outer.y));
         p = start_ = starting_point(start, pixels_.origin_x, pixels_.origin_y, kStartBlur);
         prior_ = prior_information(start.outer.major, kAnyRatio, kAnyBlur);
+        resumed_ = start.model.has_value();
+        if (resumed_) {
+            p = *start.model, start_[kGround] = p[kGround];
+            p[kX] -= pixels_.origin_x, p[kY] -= pixels_.origin_y;
+        }
     }
 
-    bool solve() {
+    /// From the start to near the solution.
+    bool approach() {
         // Perspective moves the inner edge and the card's from where the start has them.
         const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
         if (!select({wide, wide, true}, kCoarsePixels)) return false;
-        p[kGround] = start_[kGround] = level_beyond_card();
-        if (!iterate(2)) return false;
+        p[kGround] = start_[kGround] = level_beyond_card(pixels_, p);
+        return iterate(2);
+    }
+
+    bool finish() {
         const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
         const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
                         card};
@@ -70,38 +82,30 @@ class Fitter {
         return pixels_.used >= 2 * kCount;
     }
 
-    /// The mean level of what lies beyond the card's edge; the bright one where nothing does.
-    double level_beyond_card() const {
-        const double det = p[kAxx] * p[kAyy] - square(p[kAxy]);
-        const float xx = float(p[kAyy] / det), xy = float(-p[kAxy] / det), yy = float(p[kAxx] / det);
-        const float x0 = float(p[kX]), y0 = float(p[kY]), edge = float(square(p[kCard]));
-        float sum = 0, n = 0;
-        for (int k = 0; k < pixels_.used; ++k) {
-            const float dx = pixels_.x[k] - x0, dy = pixels_.y[k] - y0;
-            const float qx = xx * dx + xy * dy, qy = xy * dx + yy * dy;
-            if (qx * qx + qy * qy > edge) sum += pixels_.level[k], n += 1;
-        }
-        return n > 0 ? double(sum / n) : p[kBright];
-    }
-
-    /// Steps until what is left, of the order of one's square over the blur, will be small against the
-    /// standard deviation `ahead` steps later.
+    /// Steps until what is left, of the order of one's square over the blur, is small against the standard
+    /// deviation, or, a step ahead of that, will be and shows less than the noise. The model of the frame
+    /// before has to be near enough for a step or a few.
     bool iterate(int ahead) {
         for (int k = 0; k < kMaxSteps; ++k) {
             model_.evaluate(pixels_, p);
-            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * edge_scale());
+            const double seen = edge_scale();
+            if (resumed_ && (k == kResumed || seen > kLost * (p[kBright] - p[kDark]))) return false;
+            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * seen);
             equations_ = model_.accumulate(used);
             add_prior(used);
             factor_.emplace(equations_.H);
             if (!factor_->positive()) return false;
-            const double moved = advance(used);
+            const double left = square(advance(used)) / p[kBlur];
             if (!is_sane()) return false;
-            const double deviation = noise_ / std::sqrt(equations_.H[kX][kX] + equations_.H[kY][kY]);
-            double left = moved;
-            for (int i = 0; i < ahead; ++i) left *= left / p[kBlur];
-            if (left < kConverged * deviation && (ahead > 1 || scale_ > 0.7 * used)) return true;
+            if (ahead > 1 ? is_near(left) : is_there(left) && scale_ > 0.7 * used) return true;
         }
         return true;
+    }
+
+    bool is_there(double left) const { return left < kConverged * noise_ / std::sqrt(edge_information()); }
+    bool is_near(double left) const {
+        return left * (p[kBright] - p[kDark]) < kShows * noise_ * p[kBlur] &&
+               is_there(square(left) / p[kBlur]);
     }
 
     /// Of the residuals at the ring's edges (1.48 of their median is a standard deviation).
@@ -118,24 +122,38 @@ class Fitter {
         }
     }
 
-    /// Takes a step, and gives its greatest move in pixels.
+    /// Takes a step, and gives how far it moves the edges, pixels RMS. (Its unknowns go further: the centre
+    /// and the perspective may trade places.) Weights fall with the residuals that a step takes away, and
+    /// make it shorter than Newton's by psi' over w.
     double advance(double scale) {
-        const Parameters delta = factor_->solve(equations_.g);
-        for (int i = 0; i < kCount; ++i) p[i] += delta[i];
-        p[kBlur] = std::max(p[kBlur], kMinBlur);
+        Parameters delta = factor_->solve(equations_.g);
         left_ = model_.after(delta, scale);
         update_noise();
-        double moved = std::abs(delta[kBlur]);
-        for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[i]));
-        return moved;
+        for (int i = 0; i < kCount; ++i) delta[i] /= slope_, p[i] += delta[i];
+        p[kBlur] = std::max(p[kBlur], kMinBlur);
+        return std::sqrt(change(delta) / edge_information());
     }
+
+    /// The sum of squared changes of the levels that a step brings about by its edges.
+    double change(const Parameters& delta) const {
+        double sum = 0;
+        for (int i = kBlur; i < kCount; ++i) {
+            double row = equations_.H[i][i] * delta[i];
+            for (int j = kBlur; j < i; ++j) row += 2 * equations_.H[i][j] * delta[j];
+            sum += row * delta[i];
+        }
+        return sum;
+    }
+
+    /// Sum of the levels' squared slopes.
+    double edge_information() const { return equations_.H[kX][kX] + equations_.H[kY][kY]; }
 
     /// Of residuals on the edges; `freedom` is the share of them that the unknowns do not follow.
     void update_noise() {
         const double freedom = std::max(0.1, 1 - kEdgeUnknowns * left_.mm / square(left_.m));
-        const double slope = std::max(0.5, left_.mpsi / left_.m);
+        slope_ = std::clamp(left_.mpsi / left_.m, 0.5, 1.0);
         scale_ = std::max(kNoiseFloor, kScale * std::sqrt(left_.mrr / (left_.m * freedom)));
-        noise_ = std::max(kNoiseFloor, std::sqrt(left_.mwrr / (left_.m * freedom)) / slope);
+        noise_ = std::max(kNoiseFloor, std::sqrt(left_.mwrr / (left_.m * freedom)) / slope_);
     }
 
     bool is_sane() const {
@@ -157,7 +175,8 @@ class Fitter {
     Leftover left_;
     std::optional<Cholesky<kCount>> factor_;
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
-    double scale_ = 255, noise_ = 0;
+    double scale_ = 255, noise_ = 0, slope_ = 1;
+    bool resumed_;
 };
 
 /// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
@@ -192,7 +211,7 @@ Fit Fitter::fit() const {
 
 std::optional<Fit> refine(const ImageView& image, const Start& start) {
     Fitter fitter(image, start);
-    if (!fitter.solve()) return std::nullopt;
+    if (!(start.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
     if (!start.prints.empty()) fitter.learn_print(nearest_ratio(start.prints, fitter.p[kRatio]));
     return fitter.fit();
 }

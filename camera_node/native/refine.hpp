@@ -14,8 +14,9 @@ namespace roundel {
 struct Start {
     Ellipse outer;
     double ratio, dark, bright;
-    std::span<const double> prints{};  // ratios that the prints in use were made with, where they are known
-    Hidden hidden{};                   // what is covered, and left out of the fit
+    std::span<const double> prints{};   // ratios that the prints in use were made with, where they are known
+    Hidden hidden{};                    // what is covered, and left out of the fit
+    std::optional<Parameters> model{};  // good to a third of a pixel, in the image's frame, where it is known
 };
 
 /// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
@@ -33,6 +34,7 @@ struct Fit {
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double support;        // share of the ring's edges that is in the image and agrees
     Parameters p;          // as the model has them, in the image's frame
+    bool plain = false;    // fitted to the picture as it is, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
     double noise = 0;                   // of what the fit of a moving one leaves, grey levels
     /// Of the ellipse's centre and of the offset, square pixels.
@@ -45,8 +47,9 @@ struct Fit {
 /// three levels, blur, the inner circle's and the card's ratio, and seven of a plane's view. Pixels that
 /// disagree count less (Tukey's biweight).
 ///
-/// A few steps on a part of the pixels come near enough for the last one, on all of them, to be efficient
-/// (Le Cam's one-step estimator). Large roundels are sampled: no more than 6144 pixels are used.
+/// A few steps on a part of the pixels, or the model of the frame before, come near enough for the last one,
+/// on all of them, to be efficient (Le Cam's one-step estimator). Large roundels are sampled: no more than
+/// 6144 pixels are used.
 ///
 /// Known prints tell the ratio to 0.002: that of the one nearest to what the fit says without them, unless it
 /// is three standard deviations away and so another print. Small roundels owe it most of what they know of

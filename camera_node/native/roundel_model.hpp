@@ -61,17 +61,17 @@ struct Gradient {
 class Model {
   public:
     explicit Model(const Parameters& p) {
-        const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
+        const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy], blur = p[kBlur];
+        const double xx = p[kAyy] / det, xy = -p[kAxy] / det, yy = p[kAxx] / det;
         x_ = float(p[kX]), y_ = float(p[kY]), gx_ = float(p[kGx]), gy_ = float(p[kGy]);
-        inverse_xx_ = float(p[kAyy] / det), inverse_xy_ = float(-p[kAxy] / det);
-        inverse_yy_ = float(p[kAxx] / det);
+        inverse_xx_ = float(xx), inverse_xy_ = float(xy), inverse_yy_ = float(yy);
         ratio_ = float(p[kRatio]), card_ = float(p[kCard]);
         bright_ = float(p[kBright]), fall_ = float(p[kDark] - p[kBright]);
         drop_ = float(p[kGround] - p[kBright]);
-        per_blur_ = float(1 / p[kBlur]), peak_ = float(0.39894228 / p[kBlur]);
-        zgx_ = inverse_xx_ * gx_ + inverse_xy_ * gy_, zgy_ = inverse_xy_ * gx_ + inverse_yy_ * gy_;
-        blur_ = float(p[kBlur]), half_bend_ = float(p[kBlur] / (2 * det * det));
-        half_flat_ = float(1.5 * p[kBlur]);
+        zgx_ = float(xx * p[kGx] + xy * p[kGy]), zgy_ = float(xy * p[kGx] + yy * p[kGy]);
+        turn_ = float((yy * yy - xx * xx) * kRootHalf), shear_ = float(xy * (xx + yy) * kRootHalf);
+        per_blur_ = float(1 / blur), peak_ = float(-kPeak / blur);
+        half_bend_ = float(blur / (2 * det * det)), half_flat_ = float(1.5 * blur);
     }
 
     /// `x` and `y` are `count` lanes of pixels in the frame of the parameters, `seen` their grey levels.
@@ -79,6 +79,7 @@ class Model {
                                  Gradient& to) const {
         Geometry at;
         for (int k = 0; k < count; ++k) locate(load(x + k * kLanes), load(y + k * kLanes), k, at);
+        for (int k = 0; k < count; ++k) face(k, at);
         Edge outer, inner, card;
         blur_edge(at, 1, count, outer);
         blur_edge(at, ratio_, count, inner);
@@ -90,6 +91,8 @@ class Model {
     }
 
   private:
+    static constexpr double kRootHalf = 0.70710678, kPeak = 0.39894228;  // sqrt(1/2), 1 / sqrt(2 pi)
+
     /// Where pixels are: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the shift of
     /// an edge of radius 1 by blur, and by how much the distance changes with g . q.
     struct Geometry {
@@ -97,22 +100,28 @@ class Model {
             bend[kChunk], flat[kChunk], tip[kChunk];
     };
 
+    /// Leaves the gradient times the depth in n, the depth over the blur in `stretch`, 1 / |q| in `bow` and
+    /// the curvature of the lines of equal f, but for powers of the gradient, in `tip`.
     ROUNDEL_INLINE void locate(const Lanes& x, const Lanes& y, int k, Geometry& at) const {
         const Lanes dx = x - x_, dy = y - y_;
         const Lanes qx = inverse_xx_ * dx + inverse_xy_ * dy, qy = inverse_xy_ * dx + inverse_yy_ * dy;
-        const Lanes qq = qx * qx + qy * qy + 1e-12f, per_q = inverse_sqrt(qq);
-        const Lanes depth = 1.0f - gx_ * qx - gy_ * qy, per_depth = 1.0f / depth, f = qq * per_q * per_depth;
+        const Lanes xx = qx * qx, yy = qy * qy, qq = xx + yy + 1e-12f, per_q = inverse_sqrt(qq);
+        const Lanes depth = 1.0f - gx_ * qx - gy_ * qy, f = qq * per_q / depth;
         const Lanes mx = qx * per_q + f * gx_, my = qy * per_q + f * gy_;  // grad f = A^-1 m / depth
-        const Lanes vx = inverse_xx_ * mx + inverse_xy_ * my, vy = inverse_xy_ * mx + inverse_yy_ * my;
-        const Lanes vv = vx * vx + vy * vy + 1e-12f, per_v = inverse_sqrt(vv);
-        at.qx[k] = qx, at.qy[k] = qy, at.f[k] = f;
+        at.qx[k] = qx, at.qy[k] = qy, at.f[k] = f, at.stretch[k] = depth, at.bow[k] = per_q;
+        at.nx[k] = inverse_xx_ * mx + inverse_xy_ * my, at.ny[k] = inverse_xy_ * mx + inverse_yy_ * my;
+        at.tip[k] = (turn_ * qx * qy + shear_ * (xx - yy)) * (per_q * per_q);
+    }
+
+    /// Ends what `locate` began.
+    ROUNDEL_INLINE void face(int k, Geometry& at) const {
+        const Lanes vx = at.nx[k], vy = at.ny[k], vv = vx * vx + vy * vy + 1e-12f, per_v = inverse_sqrt(vv);
+        const Lanes f = at.f[k], depth = at.stretch[k], per_q = at.bow[k], per_vv = per_v * per_v;
+        const Lanes near = per_v * f * per_q, across = at.tip[k] * per_v;
         at.nx[k] = vx * per_v, at.ny[k] = vy * per_v;
-        const Lanes near = per_v * per_depth;
         at.stretch[k] = per_v * depth, at.tip[k] = f * per_v;
         at.bend[k] = half_bend_ * near * near * near, at.flat[k] = half_flat_ * vv * per_v;
-        const Lanes zx = inverse_xx_ * vx + inverse_xy_ * vy, zy = inverse_xy_ * vx + inverse_yy_ * vy;
-        const Lanes across = (qx * zy - qy * zx) * per_q * per_v, persp = vx * zgx_ + vy * zgy_;
-        at.bow[k] = per_v * per_v * (0.5f * across * across * per_q + persp);
+        at.bow[k] = per_vv * (across * across * per_q + (vx * zgx_ + vy * zgy_));
     }
 
     /// The share of the inside that a pixel sees, and its derivatives by the distance and by the blur.
@@ -120,17 +129,19 @@ class Model {
         Lanes inside[kChunk], slope[kChunk], by_blur[kChunk];
     };
 
+    /// Distances and shifts in blurs.
     ROUNDEL_INLINE void blur_edge(const Geometry& at, float r, int count, Edge& to) const {
         const float per_r = 1 / r;
         for (int k = 0; k < count; ++k) {
             const Lanes over = at.f[k] - r, bow = over * at.bow[k];
-            const Lanes distance = over * at.stretch[k] * (1.0f + (bow > -0.5f ? bow : all(-0.5f)));
+            const Lanes distance =
+                over * (at.stretch[k] * per_blur_) * (1.0f + (bow > -0.5f ? bow : all(-0.5f)));
             const Lanes bend = at.bend[k] * per_r, bb = bend * bend < 0.5f ? bend * bend : all(0.5f);
             const Lanes narrow = 1.0f - bb * (1.0f - bb);
-            const Lanes shift = blur_ * bend * (1.0f + bend * at.flat[k] * per_r);
-            const Normal normal = normal_tail((distance + shift) * per_blur_ * narrow);
-            to.inside[k] = normal.tail, to.slope[k] = -peak_ * normal.density * narrow;
-            to.by_blur[k] = to.slope[k] * (shift - distance) * per_blur_;
+            const Lanes shift = bend * (1.0f + bend * at.flat[k] * per_r);
+            const Normal normal = normal_tail((distance + shift) * narrow);
+            to.inside[k] = normal.tail, to.slope[k] = (peak_ * narrow) * normal.density;
+            to.by_blur[k] = to.slope[k] * (shift - distance);
         }
     }
 
@@ -158,7 +169,7 @@ class Model {
     }
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;
-    float bright_, fall_, drop_, per_blur_, peak_, blur_, half_bend_, half_flat_, zgx_, zgy_;
+    float bright_, fall_, drop_, per_blur_, peak_, half_bend_, half_flat_, zgx_, zgy_, turn_, shear_;
 };
 
 }  // namespace roundel

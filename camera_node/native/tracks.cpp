@@ -10,6 +10,7 @@ namespace {
 
 constexpr int kPatience = 30;      // frames that a lost track keeps its number
 constexpr int kNumbers = 1 << 30;  // numbers begin anew after these
+constexpr double kSteady = 0.3;    // pixels off its expected place: a fit's step converges from there
 
 }  // namespace
 
@@ -19,9 +20,22 @@ std::vector<Tracks::Expected> Tracks::expect() const {
         if (t.missed) continue;
         const auto x = float(t.fit.outer.x + t.vx), y = float(t.fit.outer.y + t.vy);
         const auto reach = float(t.fit.outer.major);
-        expected.push_back({{x, y, reach, int(t.fit.dark), int(t.fit.bright)}, t.number, t.fit, t.vx, t.vy});
+        expected.push_back(
+            {{x, y, reach, int(t.fit.dark), int(t.fit.bright)}, t.number, t.fit, t.vx, t.vy, t.steady});
     }
     return expected;
+}
+
+Start Tracks::Expected::start() const {
+    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p};
+    start.outer.x += vx, start.outer.y += vy;
+    (*start.model)[kX] += vx, (*start.model)[kY] += vy;
+    return start;
+}
+
+/// How far from where a track is expected a roundel is seen, pixels.
+double Tracks::off(const Track& t, const Fit& fit) {
+    return std::hypot(t.fit.outer.x + t.vx - fit.outer.x, t.fit.outer.y + t.vy - fit.outer.y);
 }
 
 /// The free track that is expected nearest to a roundel, within a diameter.
@@ -31,8 +45,7 @@ const Tracks::Track* Tracks::nearest(const Fit& fit, const std::vector<bool>& ta
     for (size_t k = 0; k < tracks_.size(); ++k) {
         const Track& t = tracks_[k];
         if (taken[k]) continue;
-        const double apart =
-            std::hypot(t.fit.outer.x + t.vx - fit.outer.x, t.fit.outer.y + t.vy - fit.outer.y);
+        const double apart = off(t, fit);
         if (apart < least) least = apart, best = &t;
     }
     return best;
@@ -46,7 +59,8 @@ void Tracks::update(std::vector<Roundel>& found) {
         roundel.track = t.number;
         const double frames = t.missed + 1;
         now.push_back({t.number, roundel.fit, (roundel.fit.outer.x - t.fit.outer.x) / frames,
-                       (roundel.fit.outer.y - t.fit.outer.y) / frames, 0});
+                       (roundel.fit.outer.y - t.fit.outer.y) / frames, 0,
+                       roundel.fit.plain && off(t, roundel.fit) < kSteady});
     };
     for (Roundel& roundel : found)
         for (const Track& t : tracks_)
@@ -57,7 +71,7 @@ void Tracks::update(std::vector<Roundel>& found) {
             continue_track(roundel, *t);
         } else {
             roundel.track = next_, next_ = (next_ + 1) % kNumbers;
-            now.push_back({roundel.track, roundel.fit, 0, 0, 0});
+            now.push_back({roundel.track, roundel.fit, 0, 0, 0, false});
         }
     }
     for (size_t k = 0; k < tracks_.size(); ++k)

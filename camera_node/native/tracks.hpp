@@ -22,6 +22,9 @@ class Tracks {
         int track;
         Fit fit;        // of the last frame
         double vx, vy;  // pixels a frame
+        bool steady;    // was where it was expected, and all of it was seen
+        /// The last frame's model, moved to where it is expected.
+        Start start() const;
     };
     std::vector<Expected> expect() const;
     /// Takes the roundels of a frame. Those without a number (below 0) get that of a track that is expected
@@ -34,7 +37,9 @@ class Tracks {
         Fit fit;
         double vx, vy;  // pixels a frame
         int missed;     // frames
+        bool steady;
     };
+    static double off(const Track& track, const Fit& fit);
     const Track* nearest(const Fit& fit, const std::vector<bool>& taken) const;
 
     std::vector<Track> tracks_;

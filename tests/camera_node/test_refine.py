@@ -113,3 +113,18 @@ def test_the_middle_of_a_slanted_hole_is_no_edge(diameter: float):
         disc = Disc((80.3 + rng.uniform(), 60.6 + rng.uniform()), diameter, np.radians(60), turn)
         (found,) = Detector().detect(expose(render([disc], ground=190), 3, rng))
         assert np.linalg.norm(found.uv - outer_conic(disc, PRINCIPAL)[0]) < 0.1
+
+
+@pytest.mark.parametrize("diameter", [14, 32])
+def test_a_roundel_that_moves_evenly_is_fitted_as_from_scratch(diameter: float):
+    """From the last frame's model, one step, or from rays: the same minimum, to half a standard deviation.
+
+    In the last frame it has jumped: its number stays, and the rays take over.
+    """
+    tracker, rng = Detector(), np.random.default_rng(8)
+    for u, v in [*((70.2 + 1.3 * k, 62.1 - 0.6 * k) for k in range(6)), (83.4, 57.7)]:
+        image = expose(render([Disc((u, v), diameter, 0.5, 0.4)], ground=90), 3, rng)
+        (tracked,), (cold,) = tracker.detect(image), Detector().detect(image)
+        off = tracked.uv - cold.uv
+        assert off @ np.linalg.solve(cold.cov, off) < 0.5**2
+        assert tracked.track == cold.track
