@@ -9,7 +9,7 @@
 #include <random>
 #include <stdexcept>
 
-#include "assignment.hpp"
+#include "candidates.hpp"
 #include "inverse_lens.hpp"
 #include "motion.hpp"
 
@@ -107,7 +107,7 @@ bool estimate(Random& random, double wild) {
     return true;
 }
 
-/// Gates and assignment: pairs of what there is, nothing twice in a frame.
+/// Gates: pairs of what there is, none twice.
 bool associate(Random& random, double wild) {
     const size_t bodies = 1 + random.below(5), frames = 1 + random.below(4), n = random.below(80);
     const Poses poses = poses_of(random, bodies, frames, wild);
@@ -124,13 +124,11 @@ bool associate(Random& random, double wild) {
                   focal = random.numbers(frames, 800, wild);
     const Detections seen{frame.data(), {xy.data(), n}, {scale.data(), n}, {cov.data(), n}, major.data()};
     const std::vector<Candidate> pairs = find_candidates(poses, markers, seen, focal.data());
-    std::vector<char> taken(n), used(frames * markers.size());
-    for (const int64_t row : assign(pairs, frame.data())) {
-        const Candidate& pair = pairs.at(size_t(row));
-        char& detection = taken.at(size_t(pair.detection));
-        char& marker = used.at(size_t(frame[size_t(pair.detection)]) * markers.size() + size_t(pair.marker));
-        if (detection || marker || !std::isfinite(pair.cost)) return false;
-        detection = marker = 1;
+    std::vector<char> found(n * markers.size());
+    for (const Candidate& pair : pairs) {
+        char& before = found.at(size_t(pair.detection) * markers.size() + size_t(pair.marker));
+        if (before || !std::isfinite(pair.cost)) return false;
+        before = 1;
     }
     return true;
 }

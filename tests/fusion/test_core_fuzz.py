@@ -43,7 +43,6 @@ BODIES = TURNS, np.zeros((B, 3)), np.zeros((B, 3)), np.zeros((B, 3))
 EXPOSURES = np.tile(np.eye(3), (F, 1, 1)), -2 * np.ones((F, 3)), np.zeros(F)
 DISCS = FRAME, BODY, np.zeros((3, N)), np.full(N, 0.0625)
 SCALES, FOCAL, FALSE = np.tile(np.eye(2)[..., None], N), np.full(F, 800.0), np.zeros(B, bool)
-PAIRS, COSTS = np.stack([BODY, np.arange(N)]), np.zeros(N)
 ROWS, STEPS = np.zeros((N, 2, 13)), np.zeros((B, 12))
 POSES = _core.Poses(*BODIES, *EXPOSURES)
 MARKERS = _core.ExpectedMarkers(TURNS, EYES, BODY, DISCS[2], DISCS[3])
@@ -57,7 +56,6 @@ CALLS = {
     ),
     "ExpectedMarkers": (_core.ExpectedMarkers, (TURNS, EYES, BODY, DISCS[2], DISCS[3])),
     "candidates": (MARKERS.candidates, (POSES, FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), FOCAL)),
-    "assign": (_core.assign, (PAIRS, COSTS, FRAME)),
     "shears": (
         _core.shears,
         (np.ones((2, N)), np.zeros(N), np.ones((3, N)), np.ones((3, N)), np.ones(N), SCALES),
@@ -114,8 +112,6 @@ def test_arrays_of_another_shape_or_length_are_refused(name: str):
 def test_indices_that_name_nothing_are_refused(name: str):
     function, given = CALLS[name]
     for k, array in enumerate(given):
-        if name == "assign" and k == 2:  # frames' labels
-            continue
         if isinstance(array, np.ndarray) and array.dtype == np.int64:
             for wrong in (-1, 1 << 40):
                 spoiled = array.copy()
@@ -135,9 +131,7 @@ def test_wild_numbers_do_no_harm(name: str, value: float):
                 function(*given[:k], np.full_like(array, value), *given[k + 1 :])
 
 
-@pytest.mark.parametrize(
-    "name", ["view", "linearise", "linearise_outlines", "candidates", "assign", "shears"]
-)
+@pytest.mark.parametrize("name", ["view", "linearise", "linearise_outlines", "candidates", "shears"])
 def test_of_no_detections_there_are_no_columns(name: str):
     function, given = CALLS[name]
     none = [a[..., :0].copy() if isinstance(a, np.ndarray) and a.shape[-1] == N else a for a in given]
