@@ -24,8 +24,9 @@ constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows
 constexpr int kTurns = 4;            // pictures in which both diagonals have their turn
 constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
-constexpr int kBatch = 16;  // lines that are scanned at once
-constexpr int kGroup = 8;   // numbers that are written without asking how many there are
+constexpr int kBatch = 16;                       // lines that are scanned at once
+constexpr int kBeyond = 2 * kWord + 4 * kLanes;  // numbers that are read behind the last one
+constexpr int kGroup = 8;                        // numbers that are written without asking how many there are
 
 /// The places of the bits of a word. Volatile, or they would be gathered in vectors first, which takes
 /// longer.
@@ -48,10 +49,12 @@ ROUNDEL_INLINE int find_runs(const BitImage& picture, int first, int last, int s
         for (int n = 0; n < words; ++n) {
             const uint64_t turns = word[n] ^ (word[n] << 1 | carry);
             carry = word[n] >> (kWord - 1);
-            if (turns) to = append_bits(turns, (line << shift) + n * kWord, to);
+            if (turns) to = append_bits(turns, ((line - first) << shift) + n * kWord, to);
         }
-        if (carry) *to++ = (line << shift) + picture.length;
+        if (carry) *to++ = ((line - first) << shift) + picture.length;
     }
+    const int last_edge = to > edges ? to[-1] : 0;
+    for (int k = 0; k < kBeyond; ++k) to[k] = last_edge;  // runs of no length
     return int(to - edges) / 2;
 }
 
@@ -137,12 +140,14 @@ bool ChordSearch::is_diametral(int dark, int inner) const {
 }
 
 void ChordSearch::scan_lines(const BitImage& along, int first, int last) {
-    const int shift = std::bit_width(unsigned(along.length + limits_.most));
-    const int found = find_chords(along, first, last, shift, limits_, edges_.get(), numbers_.get());
+    Proportions limits = limits_;
+    limits.most = std::min(limits.most, along.length);
+    const int shift = std::bit_width(unsigned(along.length + limits.most));
+    const int found = find_chords(along, first, last, shift, limits, edges_.get(), numbers_.get());
     for (int n = 0; n < found; ++n) {
         const int* edge = &edges_[2 * size_t(numbers_[size_t(n)])];
         const int line = edge[1] >> shift, b = edge[1] - (line << shift), inner = edge[2] - edge[1];
-        add_chord(b + (inner - 1) / 2, inner, edge[3] - edge[0], line);
+        add_chord(b + (inner - 1) / 2, inner, edge[3] - edge[0], first + line);
     }
 }
 
@@ -257,8 +262,7 @@ void ChordSearch::add_streak(const Stack& stack) {
 void ChordSearch::scan(const BitImage& along, const BitImage* across, const Raster& raster,
                        const Proportions& limits) {
     across_ = across, along_rows_ = raster.step_y == 0, raster_ = raster, limits_ = limits;
-    const size_t most =
-        size_t(kBatch) * size_t(along.length + 1) + 4 * kWord;  // more are read than there are
+    const size_t most = size_t(kBatch) * size_t(along.length + 1) + kBeyond;
     if (most > room_) {
         edges_ = std::make_unique_for_overwrite<int[]>(most);
         numbers_ = std::make_unique_for_overwrite<int[]>(room_ = most);
