@@ -25,7 +25,7 @@ from camera_node.errors import NetworkError
 from camera_node.messages import Keys, MessageError, decode
 from camera_node.network import open_client
 from fusion.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.requests import change_robots, undo_correction
+from fusion.requests import AGAIN_S, change_robots, undo_correction
 from fusion.robots import Robot as RobotBody
 
 T = TypeVar("T")
@@ -222,11 +222,14 @@ class Arena:
         """
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
+            # asked before the rig: a session that has just been opened may reach the server in between
+            there = any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0)))
             for reply in self._session.get(self.keys.rig, timeout=min(left, 1.0)):
                 if reply.ok is not None and (rig := self._read_rig(reply.ok.payload.to_bytes())):
                     return rig
-            if any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0))):
+            if there:
                 return None
+            time.sleep(min(AGAIN_S, left))
         raise NetworkError(f"no rig {self._where} within {timeout_s:g} s; is python -m fusion running there?")
 
     def _read_rig(self, data: bytes) -> Rig | None:
