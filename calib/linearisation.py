@@ -106,7 +106,7 @@ class Linearisation:
         """Where the observed markers were when they were observed, (n, 3), world."""
         return self._pass(state).points
 
-    def _pass(self, state: State) -> "_Passage":
+    def _pass(self, state: State) -> _Passage:
         """Where what was observed was."""
         t_s, knot_s, motion = self.times(state), self.problem.knot_s, state.motion
         place = locate(knot_s, t_s, self.problem.gap_s)
@@ -190,7 +190,7 @@ class Linearisation:
             terms.append(((a, b), tuple(rows), np.array([1 - np.linalg.norm(gap) / distance]) / FIXED))
         return terms
 
-    def _jacobians(self, state: State, passage: "_Passage") -> tuple[Array, Array, Array]:
+    def _jacobians(self, state: State, passage: _Passage) -> tuple[Array, Array, Array]:
         """Residuals (n, 2), and the derivatives of what is expected by the camera's parameters (n, 2, d) and by the
         marker's place in the world (n, 2, 3)."""
         seen, free = self.observations, list(self.problem.free)

@@ -17,12 +17,8 @@ Index = NDArray[np.intp]
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
 POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-SHAPE = (
-    12,
-    13,
-    14,
-    15,
-)  # taken for known, but tested: log fx / fy, and the three distortion numbers after k1
+# Taken for known, but tested: log fx / fy, and the three distortion numbers after k1.
+SHAPE = (12, 13, 14, 15)
 SHAPE_SIGMA = [0.02, 0.3, 0.02, 0.02]
 POSE_SIGMA, CLOCK_SIGMA = [np.inf] * 6, [0.5, 5e-4]  # before anything is seen; clocks may be slewed
 

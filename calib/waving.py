@@ -73,6 +73,30 @@ class Progress:
     enough: bool
     advice: str
 
+    @property
+    def standing(self) -> str:
+        """How long it lasts, and what it would give now."""
+        if self.trial is None or self.trial.expected_mm is None:
+            return f"{self.seconds:.0f} s"
+        return (
+            f"{self.seconds:.0f} s, grade {self.trial.grade}, expected error {self.trial.expected_mm:.2f} mm"
+        )
+
+    def cells(self) -> list[tuple[str, ...]]:
+        """By camera: its name, frames, share of the image, part of what it shares with others, strain; the last two are
+        empty before the first trial."""
+        trial = self.trial or Trial()
+        return [
+            (
+                name,
+                str(frames),
+                f"{self.covered.get(name, 0):.0%}",
+                f"{trial.used[name]:.0%}" if name in trial.used else "",
+                f"{trial.strain[name]:.2f}" if name in trial.strain else "",
+            )
+            for name, frames in self.frames.items()
+        ]
+
 
 @dataclass(slots=True)
 class Rule:

@@ -98,9 +98,7 @@ def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: thr
             view.add(ReplayControls(view.server, source))
         else:
             if files is not None:
-                calibrating = Calibrating(view.server, source, files)
-                stack.callback(calibrating.close)
-                view.add(calibrating)
+                stack.callback(Calibrating(view.server, source, files).close)
             view.add(LiveControls(view.server, source))
             view.add(Picking(view.server, source))
         print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)

@@ -18,7 +18,6 @@ from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
 from web.errors import WebError
-from web.feed import Latest
 from web.panel import plain, write
 from web.subscription import Subscription
 from web.tables import Row, Table
@@ -54,9 +53,6 @@ class Calibrating:
             self._answer = server.gui.add_markdown("")
             self._seen = server.gui.add_html("")
         self._button.on_click(lambda _: self.press())
-
-    def update(self, latest: Latest) -> None:
-        """Nothing: a wave tells of itself."""
 
     def press(self) -> None:
         """Begin a wave, or end the one that goes on; while cameras are placed, nothing."""
@@ -106,22 +102,9 @@ class Calibrating:
         )
 
     def _show(self, told: Progress) -> None:
-        trial = told.trial
-        rows = []
-        for name, frames in told.frames.items():
-            used = trial.used.get(name) if trial else None
-            cells = (
-                name,
-                str(frames),
-                f"{told.covered.get(name, 0):.0%}",
-                "" if used is None else f"{used:.0%}",
-            )
-            rows.append(Row(cells, "warn" if used is None else "ok"))
+        rows = [Row((*rest, used), "ok" if used else "warn") for *rest, used, _ in told.cells()]
         write(self._seen, Table(("camera", "frames", "image", "shared part"), rows, "no roundel yet").html())
-        now = f"{told.seconds:.0f} s"
-        if trial and trial.expected_mm is not None:
-            now += f", grade {trial.grade}, expected error {trial.expected_mm:.1f} mm"
-        self._tell(f"{now}: {told.advice}")
+        self._tell(f"{told.standing}: {told.advice}")
 
     def _tell(self, text: str) -> None:
         write(self._answer, plain(text))

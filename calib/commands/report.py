@@ -58,15 +58,9 @@ def _drifts(result: Calibration) -> list[str]:
 def show_progress(told: Progress) -> Group:
     """A wave as it goes: what each camera has seen, what it would give now, and what to do next."""
     table = Table("camera", "frames", "image", "shared part", "place over noise")
-    trial = told.trial
-    for name, frames in told.frames.items():
-        used = f"{trial.used[name]:.0%}" if trial and name in trial.used else ""
-        strain = f"{trial.strain[name]:.2f}" if trial and name in trial.strain else ""
-        table.add_row(name, str(frames), f"{told.covered.get(name, 0):.0%}", used, strain)
-    now = f"{told.seconds:.0f} s"
-    if trial and trial.expected_mm is not None:
-        now += f", grade {trial.grade}, expected error {trial.expected_mm:.2f} mm"
-    return Group(Text(now, "bold"), table, Text(told.advice, "green" if told.enough else "yellow"))
+    for cells in told.cells():
+        table.add_row(*cells)
+    return Group(Text(told.standing, "bold"), table, Text(told.advice, "green" if told.enough else "yellow"))
 
 
 def _remarks(report: WandReport) -> list[str]:

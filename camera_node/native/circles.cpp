@@ -16,8 +16,8 @@ namespace {
 
 constexpr int kLeast = 9;  // rays of each kind that must agree: what 30 % of a disc covered leaves
 constexpr int kLeastOfHalf = 14, kLeastCovered = 6;
-constexpr float kUnlike =
-    0.35f;  // ratios of rays that nothing covers are less apart, from half a radius off the middle
+// Ratios of rays that nothing covers are less apart, from half a radius off the middle.
+constexpr float kUnlike = 0.35f;
 constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
 constexpr int kReweights = 4;       // at most, where crossings disagree
 constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
@@ -213,9 +213,8 @@ constexpr std::array<uint16_t, 12> kWhole = [] {
 float most_apart(const Crossings& crossings, uint16_t rays) {
     float least = 1, most = 0;
     for (int k = 0; k < crossings.count; ++k)
-        if (crossings.ratio[k] > 0 && rays >> crossings.ray[k] & 1) {
+        if (crossings.ratio[k] > 0 && rays >> crossings.ray[k] & 1)
             least = std::min(least, crossings.ratio[k]), most = std::max(most, crossings.ratio[k]);
-        }
     return most - least;
 }
 

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The detector on pictures made to break it: under sanitizers, and by the clock."""
 
-import subprocess
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -11,30 +9,16 @@ import numpy as np
 import pytest
 
 from camera_node.detector import Detector
+from tests.sanitizers import fuzz
 
-ROOT = Path(__file__).resolve().parents[2]
-NATIVE = ROOT / "camera_node" / "native"
-FLAGS = ["-std=c++20", "-O1", "-g", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
-SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-
-
-def build(source: Path, folder: Path) -> Path:
-    made = folder / f"{source.stem}.o"
-    subprocess.run(["c++", *FLAGS, *SANITIZERS, "-c", source, "-o", made], check=True, timeout=300)
-    return made
+NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
 
 
 @pytest.mark.slow
 def test_no_picture_breaks_the_core(tmp_path: Path):
     """Sizes from 0 x 0, any stride, noise, rings, checkerboards and strokes, under AddressSanitizer and UBSan."""
-    sources = [path for path in NATIVE.glob("*.cpp") if path.name != "bindings.cpp"]
-    with ThreadPoolExecutor(2) as pool:
-        objects = list(
-            pool.map(lambda path: build(path, tmp_path), [*sources, Path(__file__).with_name("fuzz.cpp")])
-        )
-    subprocess.run(["c++", *SANITIZERS, *objects, "-o", tmp_path / "fuzz"], check=True, timeout=300)
-    done = subprocess.run([tmp_path / "fuzz", "500"], capture_output=True, text=True, timeout=300)
-    assert (done.returncode, done.stderr) == (0, "")
+    driver = Path(__file__).with_name("fuzz.cpp")
+    assert fuzz(NATIVE, driver, 500, tmp_path) == (0, "")
 
 
 def rings(size: tuple[int, int], step: int, *radii: float) -> np.ndarray:

@@ -2,38 +2,22 @@
 """The native core on what it was not made for: wrong arrays are refused, wild numbers stay within their arrays."""
 
 import contextlib
-import subprocess
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fusion import _core
+from tests.sanitizers import fuzz
 
-ROOT = Path(__file__).resolve().parents[2]
-NATIVE = ROOT / "fusion" / "native"
-FLAGS = ["-std=c++20", "-O1", "-g", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
-SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-
-
-def build(source: Path, folder: Path) -> Path:
-    made = folder / f"{source.stem}.o"
-    subprocess.run(["c++", *FLAGS, *SANITIZERS, "-c", source, "-o", made], check=True, timeout=300)
-    return made
+NATIVE = Path(__file__).resolve().parents[2] / "fusion" / "native"
 
 
 @pytest.mark.slow
 def test_no_numbers_break_the_core(tmp_path: Path):
     """Empty arrays, NaN, infinities, denormal and huge numbers, under AddressSanitizer and UBSan."""
-    sources = [path for path in NATIVE.glob("*.cpp") if not path.name.startswith("bind")]
-    with ThreadPoolExecutor(2) as pool:
-        objects = list(
-            pool.map(lambda path: build(path, tmp_path), [*sources, Path(__file__).with_name("fuzz.cpp")])
-        )
-    subprocess.run(["c++", *SANITIZERS, *objects, "-o", tmp_path / "fuzz"], check=True, timeout=300)
-    done = subprocess.run([tmp_path / "fuzz", "5000"], capture_output=True, text=True, timeout=300)
-    assert (done.returncode, done.stderr) == (0, "")
+    driver = Path(__file__).with_name("fuzz.cpp")
+    assert fuzz(NATIVE, driver, 5000, tmp_path, ("address", "undefined", "float-cast-overflow")) == (0, "")
 
 
 B, F, N = 3, 2, 5

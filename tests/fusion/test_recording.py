@@ -11,7 +11,7 @@ import pytest
 
 from calib.messages import RigMessage
 from calib.recording import RecordingWriter
-from calib.rig import Rig, dump_rig
+from calib.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.messages import encode
 from fusion.messages import Robots
@@ -33,9 +33,7 @@ def write(path: Path, arena: Arena, n: int = 20) -> list:
     messages = sorted(arena.messages(n), key=lambda message: message.t_ns)
     arrivals = [(message.t_ns + 20_000_000, message) for message in messages]
     with RecordingWriter(path) as writer:
-        writer.put(
-            "x/rig", encode(RigMessage(t_ns=0, yaml=dump_rig(Rig(cameras=arena.cameras)))), arrivals[0][0]
-        )
+        writer.put("x/rig", encode(RigMessage.of(Rig(cameras=arena.cameras))), arrivals[0][0])
         writer.put("x/robots", encode(Robots(robots=arena.robots)), arrivals[0][0])
         for received_ns, message in arrivals:
             writer.put(f"x/camera/{message.camera}/detections", encode(message), received_ns)

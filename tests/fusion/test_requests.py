@@ -87,7 +87,7 @@ def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
     kept = tmp_path / "rig.kept.yaml"
     settings = msgspec.structs.replace(config(tmp_path, with_rig=False), kept_rig=str(kept))
     with serving(settings) as (server, client):
-        server.session.put(KEYS.rig, encode(RigMessage(t_ns=0, yaml=dump_rig(Rig(cameras=ARENA.cameras)))))
+        server.session.put(KEYS.rig, encode(RigMessage.of(Rig(cameras=ARENA.cameras))))
         until(lambda: client.rig(DEADLINE_S))
     with serving(settings) as (_, client):
         rig = client.rig(DEADLINE_S)

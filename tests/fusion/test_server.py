@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, save_rig
+from calib.rig import Rig, save_rig
 from camera_node.errors import NetworkError
 from camera_node.messages import ClockReply, Detections, Keys, decode, encode
 from fusion.client import Arena as Client
@@ -143,7 +143,7 @@ def test_a_clock_that_is_set_back_begins_everything_anew(tmp_path, caplog):
 def test_a_calibration_that_arrives_is_applied_and_a_bad_one_is_not(tmp_path):
     with serving(config(tmp_path, with_rig=False)) as (server, client):
         assert client.rig(DEADLINE_S) is None
-        good = encode(RigMessage(t_ns=0, yaml=dump_rig(Rig(cameras=ARENA.cameras))))
+        good = encode(RigMessage.of(Rig(cameras=ARENA.cameras)))
         bad = encode(RigMessage(t_ns=0, yaml="cameras: {cam0: [1, 2"))
         server.session.put(KEYS.rig, good)
         rig = until(lambda: client.rig(DEADLINE_S))

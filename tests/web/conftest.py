@@ -10,7 +10,7 @@ import zenoh
 
 from calib.camera import Camera
 from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig
+from calib.rig import Rig
 from camera_node.messages import CameraStatus, Detections, Keys, encode
 from camera_node.network import open_client, open_router
 from camera_node.pose import Pose, look_at
@@ -112,7 +112,7 @@ class Said:
         self.put(self.keys.fusion_status, encode(message))
 
     def rig(self, rig: Rig) -> None:
-        self.put(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+        self.put(self.keys.rig, encode(RigMessage.of(rig)))
 
 
 class Played(Said):
@@ -131,7 +131,7 @@ class Played(Said):
 
         def answer(query: zenoh.Query) -> None:
             self.rig_queries += 1
-            query.reply(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), yaml=dump_rig(rig))))
+            query.reply(self.keys.rig, encode(RigMessage.of(rig)))
 
         return self.session.declare_queryable(self.keys.rig, answer)
 

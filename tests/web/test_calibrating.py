@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wave that is begun, followed and ended in a real browser places cameras."""
 
-import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,7 @@ from camera_node.network import open_client
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 from tests.web.conftest import Played, wait_for
-from tests.web.test_view import browsing
+from tests.web.test_view import browsing, drawing
 from web.calibrating import Calibrating, Files, place_cameras
 from web.errors import WebError
 from web.subscription import Subscription
@@ -38,16 +38,9 @@ def files(tmp_path: Path) -> Files:
 @pytest.fixture
 def view(subscription: Subscription, files: Files) -> Iterator[View]:
     """A view that draws, with the button."""
-    view, stop = View(subscription.feed, port=free_port()), threading.Event()
-    calibrating = Calibrating(view.server, subscription, files)
-    view.add(calibrating)
-    thread = threading.Thread(target=view.run, args=(stop,))
-    thread.start()
-    yield view
-    calibrating.close()
-    stop.set()
-    thread.join()
-    view.close()
+    view = View(subscription.feed, port=free_port())
+    with drawing(view), closing(Calibrating(view.server, subscription, files)):
+        yield view
 
 
 def test_a_wave_in_the_page_places_the_cameras(played: Played, view: View, files: Files):

@@ -2,7 +2,6 @@
 """A robot is defined by clicks on its markers, in a real browser, of a real server."""
 
 import contextlib
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from tests.conftest import free_port
 from tests.fusion.synthetic import WIDE
 from tests.fusion.test_measuring import DEADLINE_S, STANDS, running, until
 from tests.web.conftest import wait_for
-from tests.web.test_view import browsing
+from tests.web.test_view import browsing, drawing
 from web.feed import Feed
 from web.picking import Picking
 from web.subscription import Subscription
@@ -33,15 +32,11 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     monkeypatch.setattr("web.view.PANEL_EVERY", 2)
     with running(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
         subscription = Subscription(session, Feed("test"))
-        view, stop = View(subscription.feed, port=free_port()), threading.Event()
+        view = View(subscription.feed, port=free_port())
         picking = Picking(view.server, subscription)
         view.add(picking)
-        thread = threading.Thread(target=view.run, args=(stop,))
-        thread.start()
-        yield client, view, picking
-        stop.set()
-        thread.join()
-        view.close()
+        with drawing(view):
+            yield client, view, picking
         subscription.close()
 
 

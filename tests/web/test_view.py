@@ -39,11 +39,19 @@ FLAGS = [
 @pytest.fixture
 def view(subscription: Subscription) -> Iterator[View]:
     """A view that draws."""
-    view, stop = View(subscription.feed, port=free_port()), threading.Event()
+    view = View(subscription.feed, port=free_port())
     view.add(LiveControls(view.server, subscription))
+    with drawing(view):
+        yield view
+
+
+@contextmanager
+def drawing(view: View) -> Iterator[None]:
+    """A view draws, and is closed at the end."""
+    stop = threading.Event()
     thread = threading.Thread(target=view.run, args=(stop,))
     thread.start()
-    yield view
+    yield
     stop.set()
     thread.join()
     view.close()
