@@ -64,13 +64,14 @@ def pose_stamped(pose: RobotPose, frame: str) -> bytes:
 def odometry(pose: RobotPose, frame: str, child: str) -> bytes:
     """`nav_msgs/msg/Odometry`: the pose in `frame`, the twist in the body's frame `child`, and both covariances."""
     R = rotation_from_wxyz(pose.quaternion_wxyz)
-    C = covariance(pose)
+    twist = np.array([pose.velocity, pose.angular_velocity]) @ R
+    C = covariance(pose, R, twist)
     cdr = Cdr()
     _put_header(cdr, pose, frame)
     cdr.text(child)
     _put_pose(cdr, pose)
     cdr.array(C[:6, :6])
-    cdr.array(np.concatenate([R.T @ pose.velocity, R.T @ pose.angular_velocity]))
+    cdr.array(twist)
     cdr.array(C[6:, 6:])
     return cdr.finish()
 
@@ -85,17 +86,19 @@ def transform(pose: RobotPose, frame: str, child: str) -> bytes:
     return cdr.finish()
 
 
-def covariance(pose: RobotPose) -> Array:
+def covariance(pose: RobotPose, R: Array, twist: Array) -> Array:
     """(12, 12) covariance in ROS's order: position and rotation in the world, velocity and turn in the body's frame.
 
     With R exp(theta) for the true rotation, R^T v is off by R^T dv + v_body x theta, and the turn likewise.
+
+    Args:
+        pose: with its own covariance.
+        R: (3, 3) its rotation, body to world.
+        twist: (2, 3) its velocity and angular velocity in the body's frame.
     """
-    R = rotation_from_wxyz(pose.quaternion_wxyz)
-    theta, p, omega, v = (slice(k, k + 3) for k in (0, 3, 6, 9))
-    J = np.zeros((12, 12))
-    J[0:3, p], J[3:6, theta] = np.eye(3), R
-    J[6:9, v], J[6:9, theta] = R.T, skew(R.T @ pose.velocity)
-    J[9:12, omega], J[9:12, theta] = R.T, skew(R.T @ pose.angular_velocity)
+    J = np.zeros((12, 12))  # by rotation (body), position, angular velocity and velocity (world)
+    J[0:3, 3:6], J[3:6, 0:3], J[6:9, 9:12], J[9:12, 6:9] = np.eye(3), R, R.T, R.T
+    J[6:12, 0:3] = skew(twist).reshape(6, 3)
     return J @ pose.covariance_matrix @ J.T
 
 
