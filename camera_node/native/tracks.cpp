@@ -26,6 +26,13 @@ std::vector<Tracks::Expected> Tracks::expect() const {
     return expected;
 }
 
+std::vector<Ellipse> Tracks::lost() const {
+    std::vector<Ellipse> lost;
+    for (const Track& t : tracks_)
+        if (t.missed) lost.push_back(t.fit.outer);
+    return lost;
+}
+
 Start Tracks::Expected::start() const {
     Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p};
     start.outer.x += vx, start.outer.y += vy;
