@@ -15,7 +15,9 @@ SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand
 CLEARLY = 9.0  # by how much the runner-up's chi-square must be worse
 MAX_JUDGED = 40  # fits in one instant: what is more stays open until fewer robots are looked for
-MAX_WAYS = 20_000  # of placing one robot's first markers: more is a scene of nothing but look-alikes
+# Ways of placing one robot's first markers, of three or more of them, and those of which none is part of another: where
+# there are more, as where late frames leave distances uncertain by decimetres, its shape tells nothing.
+MAX_BEGUN, MAX_WAYS, MAX_FITS = 20_000, 5_000, 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,13 +131,10 @@ def _fits(
     faces: Callable[[Marker, Array], bool],
     history: Callable[[int, Array], float],
 ) -> Iterator[Fit]:
-    """All ways to see the robot in three or more of the markers, subsets of a longer one left out."""
+    """All ways to see the robot in three or more of the markers; none where there are too many."""
     usable = np.flatnonzero(~(np.abs(scene.diameters / robot.diameter_m - 1) >= DIAMETER_TOLERANCE))
-    longest: list[dict[int, int]] = []
-    for mapping in sorted(_search(robot, scene, usable), key=len, reverse=True):
-        if any(mapping.items() <= other.items() for other in longest):
-            continue
-        longest.append(mapping)
+    longest = _longest(_search(robot, scene, usable))
+    for mapping in longest if len(longest) <= MAX_FITS else ():
         numbers, points = list(mapping), list(mapping.values())
         chosen = [scene.markers[p] for p in points]
         R, t = align(robot.points[numbers], scene.X[points])
@@ -146,11 +145,23 @@ def _fits(
             yield Fit(index, tuple(numbers), tuple(points), R, t, chi2, history(index, t))
 
 
+def _longest(mappings: list[dict[int, int]]) -> list[dict[int, int]]:
+    """Those that are no part of another; no more than one beyond `MAX_FITS`."""
+    longest: list[dict[int, int]] = []
+    for mapping in sorted(mappings, key=len, reverse=True):
+        if len(longest) <= MAX_FITS and not any(mapping.items() <= other.items() for other in longest):
+            longest.append(mapping)
+    return longest
+
+
 def _search(robot: Robot, scene: _Scene, usable: NDArray[np.intp]) -> list[dict[int, int]]:
     """Mappings of three or more of the robot's markers to points, all distances within the tolerance.
 
-    Breadth first: a row of `table` is one way to place the robot's first markers, -1 for one that is not seen.
+    Breadth first: a row of `table` is one way to place the robot's first markers, -1 for one that is not seen. None
+    where there are too many.
     """
+    if len(usable) < 3:
+        return []
     D, n = distances(robot.points), len(robot.markers)
     E, tolerance = (A[np.ix_(usable, usable)] for A in (scene.distances, scene.tolerance))
     table = np.empty((1, 0), np.intp)
@@ -167,10 +178,12 @@ def _search(robot: Robot, scene: _Scene, usable: NDArray[np.intp]) -> list[dict[
                 np.column_stack([table[row], point]),
                 np.column_stack([skipped, np.full(len(skipped), -1)]),
             ]
-        )[:MAX_WAYS]
-    return [
-        {m: int(usable[p]) for m, p in enumerate(row) if p >= 0} for row in table if (row >= 0).sum() >= 3
-    ]
+        )
+        if len(table) > MAX_BEGUN:
+            return []
+    table = table[(table >= 0).sum(1) >= 3]
+    rows = table.tolist() if len(table) <= MAX_WAYS else []
+    return [{m: int(usable[p]) for m, p in enumerate(row) if p >= 0} for row in rows]
 
 
 def _spread(X: Array, covariance: Array) -> Array:

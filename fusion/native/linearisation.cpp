@@ -74,7 +74,8 @@ void linearise(const Poses& poses, const Outlines& seen, Rows* to) {
         const Vector n = expected.normal;
         const Shear here = at(n), about_x = at(n - kStep * body.R_cam.column1()),
                     about_y = at(n + kStep * body.R_cam.column0());
-        if (!std::isfinite(here.along + expected.x)) continue;
+        const double any = here.along + here.across + about_x.along + about_y.along;
+        if (!std::isfinite(any + expected.x)) continue;  // not before its camera, or seen from its edge
         const double weight = 1 / seen.sigma[k], slope = weight / kStep;
         auto& [along, across] = to[k].A;
         along[0] = slope * (here.along - about_x.along), along[1] = slope * (here.along - about_y.along);

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,7 +20,7 @@ import tyro
 import zenoh
 
 from calib.rig import Rig, save_rig
-from camera_node.messages import Keys, encode
+from camera_node.messages import Detections, Keys, encode
 from camera_node.network import open_client
 from fusion.client import Arena, Stream
 from fusion.messages import FusionStatus
@@ -28,6 +29,7 @@ from tests.conftest import free_port
 
 ARENA = "load"
 DEADLINE_S = 60.0
+SCENE_S = 10.0
 DELAY_NS = 5_000_000  # from an exposure until its detections are sent
 
 
@@ -69,7 +71,7 @@ def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
     (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
     files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml"]
     server = subprocess.Popen(
-        [sys.executable, "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
+        [sys.executable, "-X", "faulthandler", "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
     )
     try:
         yield
@@ -82,13 +84,26 @@ def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[floa
     """Send all detections, each when it is due; yields the seconds since the start after each."""
     keys, pause = Keys(ARENA), threading.Event()
     publishers = {name: session.declare_publisher(keys.detections(name)) for name in load.rig}
-    begun_ns = time.time_ns()
-    for message in load.messages(seconds):
-        t_ns = begun_ns + message.t_ns - START_NS
+    scene, begun_ns = list(load.messages(SCENE_S)), time.time_ns()
+    for seq, (message, after_ns) in enumerate(there_and_back(scene)):
+        t_ns = begun_ns + after_ns
         pause.wait(max(t_ns + DELAY_NS - time.time_ns(), 0) * 1e-9)
-        now = msgspec.structs.replace(message, t_ns=t_ns, sent_ns=time.time_ns())
+        now = msgspec.structs.replace(message, seq=seq, t_ns=t_ns, sent_ns=time.time_ns())
         publishers[message.camera].put(encode(now))
-        yield (t_ns - begun_ns) * 1e-9
+        yield after_ns * 1e-9
+        if after_ns > seconds * 1e9:
+            return
+
+
+def there_and_back(scene: list[Detections]) -> Iterator[tuple[Detections, int]]:
+    """A scene's detections, played forwards and backwards without end, and when: it takes time to make them."""
+    for turn in count():
+        for message in scene if turn % 2 == 0 else reversed(scene):
+            t_ns = message.t_ns - START_NS
+            yield (
+                message,
+                round(turn * SCENE_S * 1e9) + (t_ns if turn % 2 == 0 else round(SCENE_S * 1e9) - t_ns),
+            )
 
 
 def tell(minute: int, stream: Stream[FusionStatus], load: Load) -> float:

@@ -208,3 +208,20 @@ def test_indices_and_lengths_are_checked():
         poses.view(frame, body, marker[:, 1:].copy(), radius)
     with pytest.raises(IndexError):
         _core.remainder(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
+
+
+def test_a_disc_that_is_seen_from_its_edge_gives_numbers_or_nothing():
+    """Its outline is a line: within a step of the derivative (1e-4 rad) of it there is none to compare with."""
+    tilt = np.radians(90) + np.linspace(-3e-4, 3e-4, 61)
+    n, none = len(tilt), np.zeros(len(tilt), np.intp)
+    up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])  # towards the camera
+    R = exp_so3(np.outer(tilt, [1.0, 0.0, 0.0])) @ up
+    still = np.zeros((n, 3))
+    ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
+    poses = _core.Poses(R, ahead, still, still, camera, np.zeros((1, 3)), np.zeros(1))
+    discs = none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04)
+    scale = np.tile(800 * np.eye(2)[..., None], n)
+    axes = np.tile([[30.0], [10.0]], n)
+    rows = poses.linearise_outlines(*discs, axes, np.zeros(n), scale, np.full(n, 0.1))
+    assert np.isfinite(rows).all()
+    assert not rows[n // 2].any()

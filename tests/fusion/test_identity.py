@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Who is who: identical robots, occlusions, crowds; and what is said when nothing tells."""
 
+import time
+
 import numpy as np
 import pytest
 
 from camera_node.roundels import Roundels
 from fusion.errors import FusionError
-from fusion.grouping import group
+from fusion.grouping import Marker, group
 from fusion.instants import Frame, Instant
 from fusion.optics import Optics
 from fusion.robots import Robot, require_distinct
 from fusion.sightings import Sightings
+from fusion.signature import Fit, identify
 from fusion.tracker import Limits
 from tests.benchmarks.fusion_accuracy import accuracy
 from tests.benchmarks.fusion_grouping import cold_grouping
-from tests.benchmarks.fusion_load import Load
+from tests.benchmarks.fusion_load import DIAMETER_M, Load
 from tests.benchmarks.fusion_swaps import identity
 from tests.fusion.conftest import errors, fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line, ring
@@ -117,6 +120,26 @@ def test_no_detection_is_in_two_markers():
     assert len(np.unique(taken)) == len(taken)
     for marker in markers:
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
+
+
+def test_where_distances_are_vague_nothing_is_claimed_and_soon():
+    """Markers whose places are known to 0.2 m, as from late frames: hundreds of thousands of ways to see a robot."""
+    begun = time.process_time()
+    assert not found_among(0.2, DIAMETER_M)
+    assert time.process_time() - begun < 10  # 0.1 s alone; minutes before there was a bound
+
+
+def test_markers_of_another_size_are_no_robot():
+    assert not found_among(0.002, 2 * DIAMETER_M)
+
+
+def found_among(sigma_m: float, diameter_m: float) -> list[Fit]:
+    """What is taken for one of twelve robots among 80 markers anywhere, of places known to `sigma_m`."""
+    rng, none = np.random.default_rng(4), np.empty(0, np.intp)
+    places = rng.uniform([-2, -1, 0], [2, 1, 0.5], (80, 3))
+    markers = [Marker(p, sigma_m**2 * np.eye(3), none, none, diameter_m) for p in places]
+    robots = dict(enumerate(Load(12, 4).bodies.values()))
+    return identify(robots, markers, lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
 
 
 @pytest.mark.parametrize("robot", ["a", "c"])
