@@ -17,6 +17,8 @@ constexpr double kMisfit = 0.045;        // of the contrast, RMS on the ring's e
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
 constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones are alike all around
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged may be letters
+constexpr double kSameLevel = 0.2;       // of the contrast, between ground and card
+constexpr double kLeastCard = 1.1;       // outer diameters of white around the ring, where its edge shows
 constexpr double kMostOff = 0.2;  // share of ring and hole that is not as dark or bright as it should be
 
 /// Whether the ring's edges are as the model says, but for noise and for what print and lens do to them:
@@ -33,9 +35,17 @@ bool has_surface(const ImageView& image, const Fit& fit) {
     return surface.off <= kMostOff * surface.seen;
 }
 
+/// Whether the ring stands on the hole's white, as on any card; without it any dark disc with a light spot in
+/// its middle would pass.
+bool has_card(const Fit& fit) {
+    const double off = std::abs(fit.p[kGround] - fit.bright);
+    return fit.p[kCard] > kLeastCard || off < kSameLevel * (fit.bright - fit.dark);
+}
+
 /// The gates that end false positives.
 bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, double noise, double misfit) {
-    return has_limits(fit, settings) && is_as_modelled(fit, noise, misfit) && has_surface(image, fit);
+    return has_limits(fit, settings) && has_card(fit) && is_as_modelled(fit, noise, misfit) &&
+           has_surface(image, fit);
 }
 
 /// Whether a fit that failed looks as if only its edges were ragged.
