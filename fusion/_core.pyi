@@ -6,6 +6,7 @@ Index = NDArray[np.intp]
 
 CAUCHY: float
 NOMINAL_WEIGHT: float
+MIN_PARALLAX: float
 
 class Poses:
     """Every body in every frame, at the frame's own time."""
@@ -108,3 +109,19 @@ def remainder(rows: Array, body: Index, steps: Array, /) -> Array:
 
 def inverses(information: Array, /) -> Array:
     """(K, 12, 12) of positive definite matrices; raises RuntimeError where one is not."""
+
+def densest_ranges(
+    camera: Index,
+    centre: Array,
+    moved: Array,
+    frame: Index,
+    direction: Array,
+    reach: Array,
+    ranges: Array,
+    /,
+) -> Array:
+    """(N,) the range of each ray at which most rays of other cameras meet it; NaN where none does.
+
+    Of F frames the camera (F,), a row of the centres (C, 3), and how far a marker moves until then (F,); of N rays the
+    frame (N,), direction (N, 3), noise by metre of range (N,) and ranges (N, K, 2): see `native/meetings.hpp`.
+    """

@@ -8,6 +8,7 @@ log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,23 @@ from fusion.state import States
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
+MOST = 1 << 32  # detections: more than any frame has
 TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Frames that were matched at once: of each match the row of its frame, that of the detection there, the disc."""
+
+    frames: tuple[Frame, ...]
+    frame: Index
+    row: Index
+    disc: Index
+
+    def rows(self, first: dict[int, int]) -> Index:
+        """The detections' rows in an instant whose frames begin at `first`, by id(); below 0 of frames not in it."""
+        begin = np.array([first.get(id(frame), -MOST) for frame in self.frames], np.intp)
+        return begin[self.frame] + self.row
 
 
 class Association:
@@ -51,7 +68,8 @@ class Association:
         discs = catalogue.robot[self._markers], catalogue.marker.take(self._markers, 1)
         self._expected = _core.ExpectedMarkers(states.R, states.P, *discs, catalogue.radius[self._markers])
         self._t_ns, self._floor_px = t_ns, floor_px
-        self._done: dict[int, tuple[Frame, Matches]] = {}  # by the frame's id(), each with its rows from 0
+        self._parts: list[_Part] = []
+        self._done: set[int] = set()  # the frames' id(): what is in a part lives on
 
     def missing(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
         """Those of the frames that are not matched yet."""
@@ -62,17 +80,24 @@ class Association:
         new = self.missing(frames)
         if new:
             sightings = Sightings.of(Instant(self._t_ns, new), self._optics, self._floor_px)
-            parts = self._match(sightings).split([len(frame.roundels) for frame in new])
-            self._done |= {id(frame): (frame, part) for frame, part in zip(new, parts, strict=True)}
+            sighting, disc = self._match(sightings)
+            frame = sightings.frame[sighting]
+            self._parts.append(_Part(new, frame, sighting - _first_rows(new)[frame], disc))
+            self._done.update(map(id, new))
 
     def whole(self, instant: Instant) -> tuple[Sightings, Matches]:
-        """All detections of the instant, and what they are matched to."""
+        """All detections of the instant, and what they are matched to, in order of the detections."""
         self.add(instant.frames)
         sightings = Sightings.of(instant, self._optics, self._floor_px)
-        counts = [len(frame.roundels) for frame in instant.frames]
-        return sightings, Matches.stack([self._done[id(frame)][1] for frame in instant.frames], counts)
+        first = dict(zip(map(id, instant.frames), _first_rows(instant.frames).tolist(), strict=True))
+        rows = [part.rows(first) for part in self._parts]
+        sighting = np.concatenate([np.empty(0, np.intp), *rows])
+        disc = np.concatenate([np.empty(0, np.intp), *(part.disc for part in self._parts)])
+        order = np.argsort(sighting)[np.count_nonzero(sighting < 0) :]
+        return sightings, Matches.of(sighting[order], disc[order])
 
-    def _match(self, sightings: Sightings) -> Matches:
+    def _match(self, sightings: Sightings) -> tuple[Index, Index]:
+        """Rows of the sightings and of the catalogue."""
         exposures = sightings.exposures
         pairs, cost = self._expected.candidates(
             self._optics.pose(self._states, exposures),
@@ -84,7 +109,12 @@ class Association:
             self._optics.focal[exposures.camera],
         )
         marker, sighting = pairs[:, assign(pairs, cost, sightings.frame)]
-        return Matches.of(sighting, self._markers[marker])
+        return sighting, self._markers[marker]
+
+
+def _first_rows(frames: Sequence[Frame]) -> Index:
+    """Where each frame's detections begin, of all of them one after the other."""
+    return np.cumsum([0, *(len(frame.roundels) for frame in frames)])[:-1]
 
 
 def assign(pairs: Index, cost: Array, frame: Index) -> Index:

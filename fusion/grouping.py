@@ -11,7 +11,8 @@ well joins neither. Free-running cameras see a moving marker at different places
 """
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import pairwise
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from camera_node.pose import skew
+from fusion._core import densest_ranges
 from fusion.optics import Optics
 from fusion.sightings import Sightings
 
@@ -29,10 +30,7 @@ SPEED_M_S = 2.0  # of the fastest marker that is looked for
 SIGMAS = 3.5
 SLACK_PX = 0.5  # what a calibration may be off, and an outline's centre from the disc's
 DIAMETER_TOLERANCE = 0.2  # between the size that a view implies and a robot's marker
-MIN_PARALLAX = np.sin(np.radians(3)) ** 2
 FAR_M = 50.0  # the range where no size tells one
-RAY_STEP = 1e4  # m: keeps the rays' ranges apart on one sorted axis
-FEW = 60  # rays of which all pairs are looked at
 CLEARLY = 0.5  # how much nearer a ray must be to one marker than to any other, of their distances
 
 
@@ -63,15 +61,6 @@ class _Rays:
     camera: Index
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Meetings:
-    """E candidates seen from one ray each: the ray, the range along it, and how well that range is known."""
-
-    ray: Index
-    range_m: Array
-    reach_m: Array
-
-
 def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -> list[Marker]:
     """Markers that two or more cameras saw, as one grouping in which no detection is of two markers.
 
@@ -83,7 +72,7 @@ def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -
     """
     rows = rows[np.isfinite(sightings.xy[0, rows])]
     rays = _cast(optics, sightings, rows)
-    met, points = _agree(rays, _meet(rays, diameters))
+    met, points = _agree(optics, sightings, rays, diameters)
     if not len(points):
         return []
     owner, centres = _cluster(rays, met, points, np.min(diameters) / 2)
@@ -104,78 +93,22 @@ def _cast(optics: Optics, sightings: Sightings, rows: Index) -> _Rays:
     return _Rays(optics.centres[camera], d, noise * depth / focal, size, seen.tau, seen.frame, camera)
 
 
-def _meet(rays: _Rays, diameters: Array) -> _Meetings:
-    """Where two rays of different cameras meet and the sizes agree; told to both rays."""
-    i, j = _pairs(rays, diameters)
-    w, b = rays.o[i] - rays.o[j], np.einsum("ni,ni->n", rays.d[i], rays.d[j])
-    wi, wj = np.einsum("ni,ni->n", w, rays.d[i]), np.einsum("ni,ni->n", w, rays.d[j])
-    parallax = np.maximum(1 - b * b, 1e-12)
-    s, t = (b * wj - wi) / parallax, (wj - b * wi) / parallax
-    fits = (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
-    fits &= _fits(rays.size[i] * s, diameters) & _fits(rays.size[j] * t, diameters)
-    i, j, s, t, parallax = i[fits], j[fits], s[fits], t[fits], parallax[fits]
-    between = w[fits] + s[:, None] * rays.d[i] - t[:, None] * rays.d[j]
-    reach = SIGMAS * np.hypot(rays.sigma[i] * s, rays.sigma[j] * t)
-    reach += SPEED_M_S * np.abs(rays.tau[i] - rays.tau[j])
-    meets = np.einsum("ni,ni->n", between, between) < reach**2
-    i, j, s, t = i[meets], j[meets], s[meets], t[meets]
-    along = (reach / np.sqrt(parallax))[meets]
-    return _Meetings(np.concatenate([i, j]), np.concatenate([s, t]), np.concatenate([along, along]))
+def _agree(optics: Optics, sightings: Sightings, rays: _Rays, diameters: Array) -> tuple[Index, Array]:
+    """The rays that meet others, and the point (K, 3) of each at the range on which most of these agree."""
+    exposures = sightings.exposures
+    frames = exposures.camera, optics.centres, SPEED_M_S * exposures.tau
+    reach, ranges = SIGMAS * rays.sigma, _ranges(rays.size, diameters)
+    range_m = densest_ranges(*frames, rays.frame, rays.d, reach, ranges)
+    met = np.flatnonzero(np.isfinite(range_m))
+    return met, rays.o[met] + range_m[met, None] * rays.d[met]
 
 
-def _pairs(rays: _Rays, diameters: Array) -> tuple[Index, Index]:
-    """Pairs of rays of different cameras that may meet; of few rays, all pairs."""
-    if len(rays.frame) <= FEW:
-        i, j = np.triu_indices(len(rays.frame), 1)
-        other = rays.camera[i] != rays.camera[j]
-        return i[other], j[other]
-    order = np.argsort(rays.frame, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(rays.frame[order])) + 1)
-    farthest = np.where(np.isfinite(rays.size), (1 + DIAMETER_TOLERANCE) * diameters.max() / rays.size, FAR_M)
-    near = [
-        _near_pairs(rays, a, b, farthest)
-        for a, b in combinations(parts, 2)
-        if rays.camera[a[0]] != rays.camera[b[0]]
-    ]
-    i, j = (np.concatenate([np.empty(0, np.intp), *(pair[k] for pair in near)]) for k in (0, 1))
-    return i, j
-
-
-def _near_pairs(rays: _Rays, a: Index, b: Index, farthest: Array) -> tuple[Index, Index]:
-    """Rays of two frames that pass each other as near as noise at their farthest range explains, at the least.
-
-    With w from one centre to the other their distance is |w (d_a x d_b)| / |d_a x d_b|: a matrix product.
-    """
-    w = rays.o[a[0]] - rays.o[b[0]]
-    reach = SIGMAS * rays.sigma[a] * farthest[a] + np.max(SIGMAS * rays.sigma[b] * farthest[b])
-    reach += SPEED_M_S * abs(rays.tau[a[0]] - rays.tau[b[0]])
-    d_a, d_b = rays.d[a].astype(np.float32), rays.d[b].T.astype(np.float32)
-    plane = d_a @ (skew(w).T.astype(np.float32)) / reach[:, None].astype(np.float32)
-    i, j = np.nonzero((plane @ d_b) ** 2 + (d_a @ d_b) ** 2 < 1)
-    return a[i], b[j]
-
-
-def _fits(size: Array, diameters: Array) -> NDArray[np.bool_]:
-    ratio = size[..., None] / diameters
-    return np.isnan(size) | (np.abs(ratio - 1) < DIAMETER_TOLERANCE).any(-1)
-
-
-def _agree(rays: _Rays, met: _Meetings) -> tuple[Index, Array]:
-    """The rays that meet any other, and the point (K, 3) of each at the range on which most meetings agree."""
-    order = np.argsort(met.ray * RAY_STEP + met.range_m)
-    ray, range_m, reach = met.ray[order], met.range_m[order], met.reach_m[order]
-    key = ray * RAY_STEP + range_m
-    first, last = np.searchsorted(key, key - reach), np.searchsorted(key, key + reach)
-    total = np.concatenate([[0.0], np.cumsum(range_m)])
-    weight = (last - first) - reach / (1 + reach)  # among equals, what is known best
-    if not len(ray):
-        return ray, np.empty((0, 3))
-    begin = np.flatnonzero(np.diff(ray, prepend=-1))
-    highest = np.maximum.reduceat(weight, begin)
-    best = np.flatnonzero(weight == np.repeat(highest, np.diff(begin, append=len(ray))))
-    best = best[np.diff(ray[best], prepend=-1) > 0]
-    mean = (total[last] - total[first])[best] / (last - first)[best]
-    return ray[best], rays.o[ray[best]] + mean[:, None] * rays.d[ray[best]]
+def _ranges(size: Array, diameters: Array) -> Array:
+    """(N, K, 2) the least and the largest range that a ray's size (N,) suits, for each of the diameters (K,)."""
+    tolerance = np.array([-DIAMETER_TOLERANCE, DIAMETER_TOLERANCE])
+    ranges = diameters[:, None] * (1 + tolerance) / size[:, None, None]
+    ranges[np.isnan(size)] = 0, FAR_M
+    return ranges
 
 
 def _cluster(rays: _Rays, met: Index, points: Array, radius: float) -> tuple[Index, Array]:
@@ -277,7 +210,8 @@ def _markers(rays: _Rays, owner: Index, centres: Array, rows: Index) -> list[Mar
     held = np.flatnonzero(owner >= 0)
     sizes = rays.size[held] * np.linalg.norm(centres[owner[held]] - rays.o[held], axis=1)
     order = np.argsort(owner[held], kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(owner[held][order])) + 1) if len(held) else []
+    ends = np.cumsum(np.bincount(owner[held], minlength=len(centres))).tolist()
+    parts = [order[first:last] for first, last in pairwise([0, *ends])]
     return [
         Marker(centres[k], covariance[k], rows[held[part]], rays.camera[held[part]], _median(sizes[part]))
         for k, part in enumerate(parts)
@@ -285,5 +219,5 @@ def _markers(rays: _Rays, owner: Index, centres: Array, rows: Index) -> list[Mar
 
 
 def _median(sizes: Array) -> float:
-    known = np.sort(sizes[np.isfinite(sizes)])
-    return float(known[len(known) // 2]) if len(known) else np.nan
+    known = sorted(size for size in sizes.tolist() if isfinite(size))
+    return known[len(known) // 2] if known else np.nan

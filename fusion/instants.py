@@ -79,11 +79,12 @@ class _Camera:
     interval_ns: int = 0  # median
 
     def note(self, t_ns: int) -> None:
-        """Take a frame's time."""
+        """Take a frame's time; what came before a long silence is another rhythm's."""
+        if self.times and t_ns - self.times[-1] > MAX_GAP_NS:
+            self.times.clear()
         self.times.append(t_ns)
         steps = sorted(b - a for a, b in pairwise(self.times))
-        if steps:
-            self.interval_ns = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) // 2
+        self.interval_ns = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) // 2 if steps else 0
 
 
 class Instants:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.pose import skew
+from fusion._core import ExpectedMarkers
 from fusion.grouping import Marker
 from fusion.instants import Instant
 from fusion.loose import Free
@@ -154,23 +154,21 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
 def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
-    owner = tracker.catalogue.robot[discs]
-    R, marker = tracker.states.R[owner], tracker.catalogue.marker[:, discs].T
-    J = np.concatenate([-R @ skew(marker), np.tile(np.eye(3), (len(discs), 1, 1))], 2)
-    labelled = J @ tracker.states.P[owner, :6, :6] @ J.transpose(0, 2, 1)
-    none = np.full(len(free.markers), -1)
-    arm = np.einsum("nij,nj->ni", R, marker)
-    position = tracker.states.p[owner] + arm
-    velocity = tracker.states.v[owner] + np.cross(tracker.states.omega[owner], arm)
+    owner, marker = tracker.catalogue.robot[discs], tracker.catalogue.marker.take(discs, 1)
+    states, none = tracker.states, np.full(len(free.markers), -1)
+    R, omega = states.R[owner], states.omega[owner]
+    places = ExpectedMarkers(states.R, states.P, owner, marker, tracker.catalogue.radius[discs])
+    arm = np.einsum("nij,jn->ni", R, marker)
+    turning = omega[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - omega[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
     free_bits = np.array([_bits(m.cameras) for m in free.markers], np.uint64)
     return Markers(
         t_ns=t_ns,
         robots=tracker.names,
         camera_names=tracker.optics.names,
-        position=np.concatenate([position, free.position]).astype("<f8").tobytes(),
-        covariance=np.concatenate([labelled, free.covariance]).astype("<f4").tobytes(),
+        position=np.concatenate([states.p[owner] + arm, free.position]).astype("<f8").tobytes(),
+        covariance=np.concatenate([places.covariances(0.0), free.covariance]).astype("<f4").tobytes(),
         normal=np.concatenate([R[:, :, 2], free.normal]).astype("<f4").tobytes(),
-        velocity=np.concatenate([velocity, free.velocity]).astype("<f4").tobytes(),
+        velocity=np.concatenate([states.v[owner] + turning, free.velocity]).astype("<f4").tobytes(),
         robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
         marker=np.concatenate([tracker.catalogue.number[discs], none]).astype("<i4").tobytes(),
         cameras=np.concatenate([_packed(seen.by_marker[discs]), free_bits]).astype("<u8").tobytes(),

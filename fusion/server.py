@@ -138,7 +138,7 @@ class Server:
     def _take_detections(self, data: bytes, key: str, received_ns: int) -> None:
         frame = self._intake.receive(data, key, received_ns, self._cameras())
         if frame is not None:
-            self.health.noted(frame.camera, self._instants.add(frame), (received_ns - frame.t_ns) * 1e-6)
+            self.health.noted(frame.camera, self._instants.add(frame), (time.time_ns() - frame.t_ns) * 1e-6)
 
     def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tables that fusion works on: an instant's detections, the robots' markers, and which is of which."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,27 +127,6 @@ class Matches:
     def none(cls) -> "Matches":
         """No match."""
         return cls.of(np.empty(0, np.intp), np.empty(0, np.intp))
-
-    @classmethod
-    def stack(cls, parts: Sequence["Matches"], counts: Sequence[int]) -> "Matches":
-        """Those of frames side by side, of which frame k has `counts[k]` sightings."""
-        if not parts:
-            return cls.none()
-        first = np.cumsum([0, *counts[:-1]])
-        rows = [part.sighting + begin for part, begin in zip(parts, first, strict=True)]
-        return cls.of(np.concatenate(rows), np.concatenate([part.disc for part in parts]))
-
-    def split(self, counts: Sequence[int]) -> list["Matches"]:
-        """The opposite of `stack`."""
-        ends = np.cumsum([0, *counts])
-        frame = np.searchsorted(ends, self.sighting, side="right") - 1
-        order = np.argsort(frame, kind="stable")
-        cuts = np.searchsorted(frame[order], np.arange(1, len(counts)))
-        parts = np.split(order, cuts)
-        return [
-            Matches.of(self.sighting[rows] - begin, self.disc[rows])
-            for rows, begin in zip(parts, ends[:-1], strict=True)
-        ]
 
     def __len__(self) -> int:
         return len(self.sighting)

@@ -57,7 +57,7 @@ class Fitter {
     bool approach() {
         // Perspective moves the inner edge and the card's from where the start has them.
         const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select({wide, wide, true}, kCoarsePixels)) return false;
+        if (!select({wide, wide, true, !hidden_.any()}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card(pixels_, p);
         return iterate(2);
     }
@@ -65,7 +65,7 @@ class Fitter {
     bool finish() {
         const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
         const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
-                        card};
+                        card, !hidden_.any()};
         return select(band, EdgePixels::kMax) && iterate(1);
     }
 

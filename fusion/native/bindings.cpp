@@ -5,6 +5,7 @@ namespace roundel::fusion {
 void bind_detections(nanobind::module_& m);
 void bind_poses(nanobind::module_& m);
 void bind_equations(nanobind::module_& m);
+void bind_rays(nanobind::module_& m);
 }  // namespace roundel::fusion
 
 NB_MODULE(_core, m) {
@@ -12,4 +13,5 @@ NB_MODULE(_core, m) {
     roundel::fusion::bind_detections(m);
     roundel::fusion::bind_poses(m);
     roundel::fusion::bind_equations(m);
+    roundel::fusion::bind_rays(m);
 }

@@ -13,17 +13,32 @@ namespace {
 constexpr int kReweightings = 4;  // by one linearisation at the most; two mostly
 constexpr double kSettled = 0.1;  // change of a weight that ends them
 
-ROUNDEL_CLONES void add(const System& system, const double* weights, Square* H, Step* g) {
-    for (size_t k = 0; k < system.n_rows; ++k) {
-        Square& information = H[system.body[k]];
-        Step& right = g[system.body[k]];
-        const Rows rows = system.rows[k];  // a copy, which the sums can't be part of
-        const double *a = rows.A[0], *b = rows.A[1], weight = weights[k];
-        for (int i = 0; i < kErrors; ++i) {
-            const double by_a = weight * a[i], by_b = weight * b[i];
-            for (int j = 0; j < kErrors; ++j) information[i][j] += by_a * a[j] + by_b * b[j];
-            right[i] += by_a * a[kErrors] + by_b * b[kErrors];
-        }
+/// One body's rows and their weights, and the sums of its prior and these.
+struct Sums {
+    std::vector<Rows> rows;
+    std::vector<double> weights;
+    Square H;  // its lower triangle, until they are done
+    Step g;
+};
+
+/// Rows `first` to `first + 3` of the sums, as far as the lower triangle reaches.
+template <int first>
+inline void add_strip(const double* a, const double* b, double weight, Square& H) {
+    for (int i = first; i < first + 4; ++i) {
+        const double by_a = weight * a[i], by_b = weight * b[i];
+        for (int j = 0; j < first + 4; ++j) H[i][j] += by_a * a[j] + by_b * b[j];
+    }
+}
+
+ROUNDEL_CLONES void add(Sums& sums) {
+    for (size_t k = 0; k < sums.rows.size(); ++k) {
+        const Rows rows = sums.rows[k];  // a copy, which the sums can't be part of
+        const double *a = rows.A[0], *b = rows.A[1], weight = sums.weights[k];
+        add_strip<0>(a, b, weight, sums.H);
+        add_strip<4>(a, b, weight, sums.H);
+        add_strip<8>(a, b, weight, sums.H);
+        for (int i = 0; i < kErrors; ++i)
+            sums.g[i] += weight * a[i] * a[kErrors] + weight * b[i] * b[kErrors];
     }
 }
 
@@ -33,39 +48,57 @@ Step solve(const Square& H, const Step& g) {
 }
 
 double left(const double* row, const double* step) {
-    double rest = row[kErrors];
-    for (int i = 0; i < kErrors; ++i) rest -= row[i] * step[i];
-    return rest;
+    double lanes[4] = {};
+    for (int i = 0; i < kErrors; i += 4)
+        for (int k = 0; k < 4; ++k) lanes[k] += row[i + k] * step[i + k];
+    return row[kErrors] - ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3]));
 }
 
 /// The largest change of a weight.
-double weigh(const System& system, const std::vector<Step>& steps, double* weights) {
+double weigh(Sums& sums, const Step& step) {
     double change = 0;
-    for (size_t k = 0; k < system.n_rows; ++k) {
-        const double* step = steps[system.body[k]].data();
-        const double x = left(system.rows[k].A[0], step), y = left(system.rows[k].A[1], step);
+    for (size_t k = 0; k < sums.rows.size(); ++k) {
+        const double x = left(sums.rows[k].A[0], step.data()), y = left(sums.rows[k].A[1], step.data());
         const double weight = 1 / (kNominalWeight * (1 + (x * x + y * y) / (kCauchy * kCauchy)));
-        change = std::max(change, std::abs(weight - weights[k]));
-        weights[k] = weight;
+        change = std::max(change, std::abs(weight - sums.weights[k]));
+        sums.weights[k] = weight;
     }
     return change;
+}
+
+/// See `reweigh`; of one body.
+void settle(Sums& sums) {
+    const Square H = sums.H;
+    const Step g = sums.g;
+    double change = 1;
+    for (int round = 0; round <= kReweightings; ++round) {
+        sums.H = H, sums.g = g;
+        add(sums);
+        if (round == kReweightings || change < kSettled) break;
+        change = weigh(sums, solve(sums.H, sums.g));
+    }
+    for (int i = 0; i < kErrors; ++i)
+        for (int j = 0; j < i; ++j) sums.H[j][i] = sums.H[i][j];
+}
+
+/// The rows of each body.
+std::vector<std::vector<size_t>> sorted(const System& system) {
+    std::vector<std::vector<size_t>> of_body(system.n_bodies);
+    for (size_t k = 0; k < system.n_rows; ++k) of_body[system.body[k]].push_back(k);
+    return of_body;
 }
 
 }  // namespace
 
 void reweigh(const System& system, Square* H, Step* g, double* weights) {
-    const size_t n = system.n_bodies;
-    const std::vector<Square> prior_H(H, H + n);
-    const std::vector<Step> prior_g(g, g + n);
-    std::vector<Step> steps(n);
-    double change = 1;
-    for (int round = 0; round <= kReweightings; ++round) {
-        std::copy(prior_H.begin(), prior_H.end(), H);
-        std::copy(prior_g.begin(), prior_g.end(), g);
-        add(system, weights, H, g);
-        if (round == kReweightings || change < kSettled) break;
-        std::transform(H, H + n, g, steps.begin(), solve);
-        change = weigh(system, steps, weights);
+    Sums sums;
+    for (const auto& mine : sorted(system)) {
+        sums.rows.clear(), sums.weights.clear();
+        for (const size_t k : mine) sums.rows.push_back(system.rows[k]), sums.weights.push_back(weights[k]);
+        sums.H = *H, sums.g = *g;
+        settle(sums);
+        *H++ = sums.H, *g++ = sums.g;
+        for (size_t k = 0; k < mine.size(); ++k) weights[mine[k]] = sums.weights[k];
     }
 }
 

@@ -22,7 +22,8 @@ struct System {
 };
 
 /// Adds up priors and equations, these by weights that follow from what the solution leaves of them:
-/// iteratively reweighted least squares (Holland and Welsch 1977) with Cauchy's weights, until they settle.
+/// iteratively reweighted least squares (Holland and Welsch 1977) with Cauchy's weights, until those of a
+/// body settle.
 ///
 /// K matrices H and right sides g hold the priors before, and the sums by the last weights afterwards; N
 /// `weights` those to start with before, and the last ones afterwards. A body whose sums have no solution is

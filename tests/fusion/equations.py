@@ -4,7 +4,9 @@
 Arrays hold one row's N columns last, (3, N) for N vectors. See `fusion/native/disc_view.hpp` for the equations' source.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,22 +171,28 @@ def shape_rows(poses: Poses, discs: Discs, views: Views, observations: Observati
 def reweigh(
     rows: Array, body: Index, information: Array, right: Array, weights: Array
 ) -> tuple[Array, Array, Array]:
-    """Sums of priors and rows by Cauchy's weights, these renewed until they settle, four times at the most."""
-    A, b = rows[:, :, :12], rows[:, :, 12]
+    """Sums of priors and rows by Cauchy's weights, these renewed until a body's settle, four times at the most."""
+    A, b, weights = rows[:, :, :12], rows[:, :, 12], weights.copy()
+    information, right = information.copy(), right.copy()
+    for k in range(len(information)):
+        mine = body == k
+        sums = partial(_sums, A[mine], b[mine], information[k], right[k])
+        weights[mine] = _settled(A[mine], b[mine], sums, weights[mine])
+        information[k], right[k] = sums(weights[mine])
+    return information, right, weights
 
-    def sums() -> tuple[Array, Array]:
-        H, g = information.copy(), right.copy()
-        np.add.at(H, body, np.einsum("n,nai,naj->nij", weights, A, A))
-        np.add.at(g, body, np.einsum("n,nai,na->ni", weights, A, b))
-        return H, g
 
-    for _ in range(4):
-        H, g = sums()
-        rest = b - np.einsum("nai,ni->na", A, np.linalg.solve(H, g[:, :, None])[body, :, 0])
+def _sums(A: Array, b: Array, H: Array, g: Array, weights: Array) -> tuple[Array, Array]:
+    return H + np.einsum("n,nai,naj->ij", weights, A, A), g + np.einsum("n,nai,na->i", weights, A, b)
+
+
+def _settled(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], weights: Array) -> Array:
+    for _ in range(4 if len(A) else 0):
+        rest = b - A @ np.linalg.solve(*sums(weights))
         before, weights = weights, 1 / (NOMINAL_WEIGHT * (1 + np.sum(rest**2, 1) / CAUCHY**2))
         if np.abs(weights - before).max() < SETTLED:
             break
-    return *sums(), weights
+    return weights
 
 
 def candidates(

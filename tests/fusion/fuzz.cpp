@@ -11,6 +11,7 @@
 
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
+#include "meetings.hpp"
 #include "motion.hpp"
 
 namespace {
@@ -133,6 +134,27 @@ bool associate(Random& random, double wild) {
     return true;
 }
 
+/// Ranges that rays agree on: each of those that its ray can have, or none.
+bool meet(Random& random, double wild) {
+    const size_t frames = 1 + random.below(5), n = random.below(60), sizes = 1 + random.below(3);
+    std::vector<Viewpoint> viewpoints;
+    for (size_t f = 0; f < frames; ++f)
+        viewpoints.push_back({int64_t(random.below(3)), random.vector(3, wild), random.number(0.01, wild)});
+    const Indices frame = random.indices(n, frames);
+    std::vector<Vector> directions;
+    for (size_t k = 0; k < n; ++k) {
+        const Vector d = random.vector(1, wild);
+        directions.push_back((1 / std::sqrt(dot(d, d))) * d);
+    }
+    const Numbers reach = random.numbers(n, 0.1, wild), limits = random.numbers(2 * n * sizes, 9, wild);
+    const Rays rays{frame.data(), directions.data(), reach.data(), limits.data(), n, sizes};
+    const std::vector<double> ranges = densest_ranges(rays, viewpoints);
+    for (size_t k = 0; k < n; ++k)
+        if (std::isfinite(ranges[k]) && !(ranges[k] > 0 && ranges[k] <= rays.farthest(k) * (1 + 1e-9)))
+            return false;
+    return ranges.size() == n;
+}
+
 bool undistort(Random& random, double wild) {
     const size_t columns = 1 + random.below(4), rows = 1 + random.below(4), n = random.below(30);
     const Numbers cells = random.numbers(20 * (columns + 2) * (rows + 2), 1, wild);
@@ -149,7 +171,8 @@ int main(int argc, char** argv) {
     Random random(argc > 2 ? unsigned(std::atoi(argv[2])) : 1);
     for (int round = 0; round < rounds; ++round) {
         const double wild = round % 4 == 0 ? 0 : 0.3 / (round % 4 * round % 4 + 1);
-        if (!estimate(random, wild) || !associate(random, wild) || !undistort(random, wild)) {
+        if (!estimate(random, wild) || !associate(random, wild) || !meet(random, wild) ||
+            !undistort(random, wild)) {
             std::fprintf(stderr, "round %d: a result that can't be\n", round);
             return 1;
         }

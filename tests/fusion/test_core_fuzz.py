@@ -48,6 +48,10 @@ CALLS = {
     "reweigh": (_core.reweigh, (ROWS, BODY, EYES, STEPS, np.ones(N))),
     "remainder": (_core.remainder, (ROWS, BODY, STEPS)),
     "inverses": (_core.inverses, (EYES,)),
+    "densest_ranges": (
+        _core.densest_ranges,
+        (np.arange(F), np.zeros((F, 3)), np.zeros(F), FRAME, np.ones((N, 3)), np.ones(N), np.ones((N, 1, 2))),
+    ),
     "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)))),
 }
 ALONE = {"inverses", "look_up"}  # whose number of rows is anybody's choice

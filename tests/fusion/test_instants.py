@@ -151,3 +151,14 @@ def test_after_a_long_silence_there_is_a_new_row():
     assert used(renewed) == sent(second)
     assert all(abs(f.t_ns - i.t_ns) <= PERIOD for _, i in renewed for f in i.frames)
     assert (steps(renewed) == PERIOD).all()
+
+
+@pytest.mark.parametrize("silence_s", [0.6, 1.0, 1.4, 1.9, 2.5, 10.0])
+def test_cameras_that_start_with_one_frame_and_a_silence_lose_none(silence_s: float):
+    """Their first step is no rhythm: instants that it would foretell must not close before their frames come."""
+    first = [arrival for k in range(4) for arrival in row(f"cam{k}", 1, 0.2 * k)]
+    then = [a for k in range(4) for a in row(f"cam{k}", 60, 0.2 * k + silence_s * 1e9 / PERIOD, 5 * MS)]
+    instants = Instants(None, LATENESS)
+    closed = play(instants, first + then)
+    assert used(closed) == sent(first + then)
+    assert set(instants.late.values()) == {0}

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The real server's memory by the minute: `python -m tests.benchmarks.fusion_server [--minutes 10]`.
+
+`python -m fusion` runs as a process of its own; detections come to it over Zenoh on loopback, each when it is due.
+"""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+import tyro
+import zenoh
+
+from calib.rig import Rig, save_rig
+from camera_node.messages import Keys, encode
+from camera_node.network import open_client
+from fusion.client import Arena, Stream
+from fusion.messages import FusionStatus
+from tests.benchmarks.fusion_load import START_NS, Load
+from tests.conftest import free_port
+
+ARENA = "load"
+DEADLINE_S = 60.0
+DELAY_NS = 5_000_000  # from an exposure until its detections are sent
+
+
+def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 30.0) -> None:
+    """Print what the server tells of itself at each minute's end, and by how much its memory grew in a minute.
+
+    Args:
+        minutes: of real time.
+        robots: of 4 markers each, with a tenth of the detections missing, a false one a frame and 5 of nobody.
+        cameras: free-running.
+        hz: of each camera.
+    """
+    load = Load(robots=robots, cameras=cameras, hz=hz, clutter=5)
+    endpoint, minute, memory = f"tcp/127.0.0.1:{free_port()}", 1, []
+    with (
+        TemporaryDirectory() as folder,
+        serving(load, Path(folder), endpoint),
+        Arena.connect(endpoint, arena=ARENA) as arena,
+        open_client([endpoint]) as session,
+    ):
+        status = arena.status(DEADLINE_S)
+        status.next(DEADLINE_S)
+        for sent_s in publish(load, session, 60 * minutes):
+            if sent_s >= 60 * minute:
+                memory.append(tell(minute, status, load))
+                minute += 1
+    kept = memory[1:]  # what is filled once is filled in the first minute
+    if len(kept) > 1:
+        print(
+            f"{np.polyfit(np.arange(len(kept)), kept, 1)[0]:.3f} MB a minute after the first; goal: flat, 0.1 MB"
+        )
+
+
+@contextmanager
+def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
+    """The server of the load's rig and robots."""
+    save_rig(Rig(cameras=load.rig), folder / "rig.yaml")
+    bodies = {name: msgspec.to_builtins(body) for name, body in load.bodies.items()}
+    (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
+    files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml"]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
+    )
+    try:
+        yield
+    finally:
+        server.terminate()
+        server.wait(DEADLINE_S)
+
+
+def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[float]:
+    """Send all detections, each when it is due; yields the seconds since the start after each."""
+    keys, pause = Keys(ARENA), threading.Event()
+    publishers = {name: session.declare_publisher(keys.detections(name)) for name in load.rig}
+    begun_ns = time.time_ns()
+    for message in load.messages(seconds):
+        t_ns = begun_ns + message.t_ns - START_NS
+        pause.wait(max(t_ns + DELAY_NS - time.time_ns(), 0) * 1e-9)
+        now = msgspec.structs.replace(message, t_ns=t_ns, sent_ns=time.time_ns())
+        publishers[message.camera].put(encode(now))
+        yield (t_ns - begun_ns) * 1e-9
+
+
+def tell(minute: int, stream: Stream[FusionStatus], load: Load) -> float:
+    """Print the server's last status; its memory in MB."""
+    status = stream.latest()
+    assert status is not None
+    tracked = sum(state == "tracked" for state in status.robots.values()) / load.robots
+    what = f"{status.memory_mb:.2f} MB, {status.cpu:.0%} of a core, {status.instants_per_s:.1f} instants a second"
+    print(f"{minute:3d} min: {what}, {tracked:.0%} tracked, faults {status.faults or 'none'}", flush=True)
+    return status.memory_mb
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

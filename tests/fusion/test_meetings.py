@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where rays of different cameras meet: the native core against all pairs at once in NumPy."""
+
+import numpy as np
+import pytest
+
+from fusion._core import MIN_PARALLAX, densest_ranges
+from tests.fusion.synthetic import ring
+
+F, EACH, SIZES = 5, 40, np.array([0.1, 0.16])
+
+
+def scene(seed: int) -> tuple[np.ndarray, ...]:
+    """Rays of five frames, two of them of one camera, to points of which each frame sees some, and upwards."""
+    random = np.random.default_rng(seed)
+    camera = np.array([0, 1, 1, 2, 3])
+    centre = np.array([c.matrix()[:3, 3] for c in ring().values()])
+    frame = np.repeat(np.arange(F), EACH)
+    points = random.uniform(-0.6, 0.6, (2 * EACH, 3))[random.integers(0, 2 * EACH, F * EACH)]
+    points[random.random(F * EACH) < 0.1] = 0, 0, 9
+    to = points + random.normal(scale=2e-3, size=points.shape) - centre[camera[frame]]
+    range_m = np.linalg.norm(to, axis=1)
+    ranges = range_m[:, None, None] * random.uniform(0.9, 1.1, (F * EACH, 1, 1)) * SIZES[:, None] / SIZES[0]
+    ranges = ranges * [0.8, 1.2]
+    ranges[random.random(F * EACH) < 0.1] = 0, 6  # of unknown size
+    reach, moved = random.uniform(1e-3, 2e-3, F * EACH), 2.0 * random.uniform(-0.01, 0.01, F)
+    return camera, centre, moved, frame, to / range_m[:, None], reach, ranges
+
+
+def expected(camera, centre, moved, frame, d, reach, ranges) -> np.ndarray:
+    """(N,) by all pairs."""
+    n, o = len(frame), centre[camera[frame]]
+    w, b = o[:, None] - o, d @ d.T
+    wi, wj = np.einsum("ijc,ic->ij", w, d), np.einsum("ijc,jc->ij", w, d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parallax = 1 - b * b
+        s, t = (b * wj - wi) / parallax, (wj - b * wi) / parallax
+        between = w + s[..., None] * d[:, None] - t[..., None] * d
+        limit = np.hypot(reach[:, None] * s, reach * t) + np.abs(moved[frame][:, None] - moved[frame])
+    low, high = ranges[..., 0], ranges[..., 1]
+    suits = ((low[:, None] < s[..., None]) & (s[..., None] < high[:, None])).any(2)
+    suits &= ((low[None] < t[..., None]) & (t[..., None] < high[None])).any(2)
+    meets = (camera[frame][:, None] != camera[frame]) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
+    meets &= suits & ((between**2).sum(2) < limit**2)
+    return np.array(
+        [densest(s[k, meets[k]], limit[k, meets[k]] / np.sqrt(parallax[k, meets[k]])) for k in range(n)]
+    )
+
+
+def densest(ranges: np.ndarray, reach: np.ndarray) -> float:
+    """The mean of those that agree with the one with which most do."""
+    if not len(ranges):
+        return np.nan
+    ranges, reach = ranges[np.argsort(ranges)], reach[np.argsort(ranges)]
+    agree = (ranges >= (ranges - reach)[:, None]) & (ranges < (ranges + reach)[:, None])
+    best = np.argmax(agree.sum(1) - reach / (1 + reach))
+    return float(ranges[agree[best]].mean())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ranges_are_those_of_all_pairs(seed: int):
+    """Both round differently: 1e-12 of a range, over the parallax's 0.003."""
+    given = scene(seed)
+    found = densest_ranges(*given)
+    assert 0.5 < np.isfinite(found).mean() < 1
+    np.testing.assert_allclose(found, expected(*given), rtol=1e-9)
+
+
+def test_nearly_parallel_rays_do_not_meet():
+    """Two rays cross a metre away, under twenty degrees and under two."""
+    ranges = np.tile([0.0, 50.0], (2, 1, 1))
+
+    def crossing(degrees: float) -> np.ndarray:
+        aside = np.tan(np.radians(degrees))
+        d = np.array([[0.0, 0.0, 1.0], [-aside, 0.0, 1.0]]) / [[1.0], [np.hypot(aside, 1)]]
+        centres, one = np.array([[0.0, 0.0, 0.0], [aside, 0.0, 0.0]]), np.arange(2)
+        return densest_ranges(one, centres, np.zeros(2), one, d, np.full(2, 1e-3), ranges)
+
+    assert np.isnan(crossing(2.0)).all()
+    np.testing.assert_allclose(crossing(20.0), [1, 1 / np.cos(np.radians(20))])
