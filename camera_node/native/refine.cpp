@@ -48,7 +48,7 @@ class Fitter {
         prior_ = prior_information(start.outer.major, kAnyRatio, kAnyBlur);
         resumed_ = start.model.has_value();
         if (resumed_) {
-            p = *start.model, start_[kGround] = p[kGround];
+            p = *start.model, start_[kGround] = p[kGround], scale_ = start.noise;
             p[kX] -= pixels_.origin_x, p[kY] -= pixels_.origin_y;
         }
     }
@@ -90,7 +90,8 @@ class Fitter {
             model_.evaluate(pixels_, p);
             const double seen = edge_scale();
             if (resumed_ && (k == kResumed || seen > kLost * (p[kBright] - p[kDark]))) return false;
-            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * seen);
+            const double used = ahead > 1 ? std::min(scale_, kStrict * seen)
+                                          : std::clamp(scale_, kStrict * seen, kSlack * seen);
             equations_ = model_.accumulate(used);
             add_prior(used);
             factor_.emplace(equations_.H);
@@ -203,6 +204,7 @@ std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {
 Fit Fitter::fit() const {
     Fit fit = fit_of(p, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
     fit.edge_residual = std::sqrt(left_.ring_rr / left_.ring);
+    fit.noise = scale_;
     fit.support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected;
     return fit;
 }

@@ -34,7 +34,7 @@ std::vector<Ellipse> Tracks::lost() const {
 }
 
 Start Tracks::Expected::start() const {
-    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p};
+    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise};
     start.outer.x += vx, start.outer.y += vy;
     (*start.model)[kX] += vx, (*start.model)[kY] += vy;
     return start;
