@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
+from calib.clock_jump import ClockJump, find_jump
 from calib.lengths import measure_lengths
 from calib.lens_change import find_changes
 from calib.lens_prior import written
@@ -37,6 +38,7 @@ class Calibration:
         time_offset_ms, time_sigma_ms: (C,) true time = stamp + offset in the middle of the recording, median 0; and
             standard deviations, 0 where the data want no offsets.
         drift_ppm, drift_sigma_ppm: (C,) by which offsets grow, microseconds a second, mean 0; likewise.
+        jump: of the camera whose clock jumped while the wand was waved.
     """
 
     rig: Rig
@@ -49,6 +51,7 @@ class Calibration:
     time_sigma_ms: Array
     drift_ppm: Array
     drift_sigma_ppm: Array
+    jump: ClockJump | None
 
     def as_dict(self) -> dict[str, Any]:
         """For the `calibration` map of `rig.yaml`: the report, clocks where the data want any, and what the wave
@@ -60,7 +63,8 @@ class Calibration:
         clocks = {what: self._by_camera(*column) for what, column in columns.items() if (column[1] > 0).any()}
         changes = find_changes(self.names, self.adjusted)
         lenses = {name: change.as_dict() for name, change in changes.items()}
-        return {**self.report.as_dict(), **clocks, "adjusted_lenses": lenses}
+        jump = {"clock_jump": {self.jump.camera: self.jump.as_dict()}} if self.jump else {}
+        return {**self.report.as_dict(), **clocks, **jump, "adjusted_lenses": lenses}
 
     def _by_camera(self, values: Array, sigmas: Array) -> dict[str, dict[str, float]]:
         return {
@@ -107,6 +111,7 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
         offset_sigma,
         drift,
         drift_sigma,
+        find_jump(told.names, adjusted, solution.observations),
     )
 
 

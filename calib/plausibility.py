@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
+from calib.clock_jump import find_jump
 from calib.errors import CalibrationError, CameraFault
 from calib.lengths import distances, free_markers
 from calib.lens_prior import usual_sigma
@@ -71,6 +72,9 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations
     share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / sightings
     if share.min() < AGREE:
         k = int(share.argmin())
+        jump = find_jump(names, adjusted, seen)
+        if jump is not None and jump.camera == names[k]:
+            raise CameraFault({names[k]: jump.words()}, certain=False)
         told = (
             f"only {fitting[k]} of its {sightings[k]} sightings fit what the others saw: if these are few, wave before "
             "it; else are its name and its intrinsics its own, and did it stand still? run python -m calib intrinsics "

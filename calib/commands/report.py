@@ -41,6 +41,7 @@ def print_report(result: Calibration, trust: Trust, console: Console) -> None:
     for line in [
         *_remarks(report),
         *_drifts(result),
+        *([f"warning: camera {jump.camera}: {jump.words()}"] if (jump := result.jump) else []),
         *lenses,
         *foretold,
         *wave,
