@@ -47,11 +47,13 @@ class Free:
 
     def joined(self, other: "Free") -> "Free":
         """Both."""
-        rest = (np.concatenate([getattr(self, k), getattr(other, k)]) for k in self.__slots__[1:])
-        return Free((*self.markers, *other.markers), *rest)
+        names = "position", "covariance", "velocity", "normal", "candidates"
+        columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return Free((*self.markers, *other.markers), **columns)
 
 
-NONE = Free((), np.empty((0, 3)), np.empty((0, 3, 3)), *(np.empty((0, 3)),) * 2, np.empty((0, 2, 3)))
+NO_ROWS, NO_PAIRS = np.empty((0, 3)), np.empty((0, 2, 3))
+NONE = Free((), NO_ROWS, np.empty((0, 3, 3)), NO_ROWS, NO_ROWS, NO_PAIRS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
