@@ -26,12 +26,15 @@ format: .venv/ready
 
 setup: .venv/ready
 
+# Not isolated: what was built before is built again only where it changed, here and by the wheel's test.
 .venv/ready: pyproject.toml CMakeLists.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "error: $(PYTHON) is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@$(PYTHON) -m venv .venv
 	@echo "setting up .venv (a few minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[server,dev]'
+	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' \
+	  | $(BIN)/python -m pip install --quiet --disable-pip-version-check -r /dev/stdin
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[server,dev]'
 	@touch $@
 
 clean:

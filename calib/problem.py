@@ -20,7 +20,8 @@ POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
 # Taken for known, but tested: log fx / fy, and the three distortion numbers after k1.
 SHAPE = (12, 13, 14, 15)
 SHAPE_SIGMA = [0.02, 0.3, 0.02, 0.02]
-POSE_SIGMA, CLOCK_SIGMA = [np.inf] * 6, [0.5, 5e-4]  # before anything is seen; clocks may be slewed
+POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]  # before anything is seen
+SLEWED, CRYSTAL = 5e-4, 3e-5  # s/s by which clocks drift: while they are set, and left alone (50 ppm at most)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +113,7 @@ class Problem:
         fixed_distance: two cameras and their distance, where no wand length carries the scale.
         sought: the cameras that are sought; the others stand where they stand. All, unless given.
         lens_doubt: (C, 4) what covariances take these four to be off by, `lens_sigma` unless given.
+        drift_sigma: standard deviation of the clocks' drift before anything is seen, s/s.
     """
 
     lenses: list[Lens]
@@ -125,6 +127,7 @@ class Problem:
     fixed_distance: tuple[int, int, float] | None = None
     sought: tuple[int, ...] | None = None
     lens_doubt: Array | None = None
+    drift_sigma: float = SLEWED
 
     def prior_sigma(self) -> Array:
         """(C, d) what holds the free parameters before anything is seen; infinite for poses."""
@@ -135,7 +138,7 @@ class Problem:
         return self._before(self.lens_sigma if self.lens_doubt is None else self.lens_doubt)
 
     def _before(self, lenses: Array) -> Array:
-        rest = np.tile(POSE_SIGMA + CLOCK_SIGMA, (len(self.lenses), 1))
+        rest = np.tile(POSE_SIGMA + OFFSET_SIGMA + [self.drift_sigma], (len(self.lenses), 1))
         shapes = np.tile(SHAPE_SIGMA, (len(self.lenses), 1))
         return np.concatenate([rest, lenses, shapes], axis=1)[:, self.free]
 

@@ -13,7 +13,7 @@ from calib.errors import CalibrationError
 from calib.lens_prior import settle
 from calib.linearisation import Linearisation
 from calib.plausibility import check_agreement, check_lenses, check_sizes, check_spacing
-from calib.problem import DRIFT, LENS, OFFSET, POSE, Observations, Problem, State
+from calib.problem import CRYSTAL, DRIFT, LENS, OFFSET, POSE, SLEWED, Observations, Problem, State
 from calib.trajectory import acceleration_density
 from calib.wave import Wave
 
@@ -62,16 +62,19 @@ def solve(
     few = adjust(problem, centred, state)
     check_lenses(wave.names, few)
     judged = widen(few)
-    free = [LENS, *(part for part in clocks if _tells(judged, part))]
-    offset_s = few.state.clocks[:, 0] if OFFSET in free else np.zeros(len(cameras))
-    drift = few.state.clocks[:, 1] if DRIFT in free else np.zeros(len(cameras))
+    told = [part for part in clocks if _tells(judged, part)]
+    free = (LENS, *(clocks if OFFSET in told else told))
+    offset_s = few.state.clocks[:, 0] if OFFSET in told else np.zeros(len(cameras))
+    drift = few.state.clocks[:, 1] if DRIFT in told else np.zeros(len(cameras))
     corrected = [few.state.lens(k, lens) for k, lens in enumerate(wave.lenses)]
     problem, start, observations = _around(
         wave.seen_through(corrected), few.state.cameras, offset_s, MANY, known
     )
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
-    problem = replace(problem.freeing(POSE, *free), density=density)
+    # A clock that runs on its own drifts, though a short wave may not show it.
+    drift_sigma = SLEWED if DRIFT in told else CRYSTAL
+    problem = replace(problem.freeing(POSE, *free), density=density, drift_sigma=drift_sigma)
     observations = with_disc_centres(wave, problem, start, observations)
     first = replace(adjust(problem, observations, start, rounds=1), dependence=judged.dependence)
     adjusted = adjust(settle(problem, first), observations, first.state)

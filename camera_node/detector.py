@@ -26,9 +26,10 @@ class Detector:
         ratio_tolerance: how far a measured ratio may be from one of them.
         min_diameter_px, max_diameter_px: of the outer ellipse's major axis.
         min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
-        search_share: of each frame's rows that is searched for new roundels; those that were in the last frame are
-            looked for where they are expected, whatever this is. Less costs less, and finds what is new within
-            1 / share frames (if it is larger than 64 px and two frames share it, perhaps later).
+        search_share: of each frame that is searched for new roundels at most. What has not changed since it was
+            searched is left out for up to 15 frames; those that were in the last frame are looked for where they are
+            expected. Less bounds the cost where much changes, and finds what is new then within 1 / share frames (if
+            it is larger than 64 px and two frames share it, perhaps later).
         mask: polygons (N, 2) of raw pixels; a roundel whose centre lies in one is left out.
 
     Attributes:

@@ -2,6 +2,7 @@
 """A simulated arena as a pure function of time: cameras, a wand that is waved, then robots that drive and fly."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -103,8 +104,15 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return look_at(self.position_m, self.look_at_m)
 
 
-class _Bodies(msgspec.Struct, forbid_unknown_fields=True):
-    robots: dict[str, Body]
+class _Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The server's file is read here too; how a robot is tracked is not the scene's to judge."""
+
+    motion: object = None
+    start_m: object = None
+
+
+class _Robots(msgspec.Struct, forbid_unknown_fields=True):
+    robots: dict[str, _Robot]
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -126,7 +134,7 @@ class Scene:
     While `t_s < wave_s` the wand is waved and no robot is there; after that the wand is gone.
     """
 
-    def __init__(self, file: _File, wand: Body, robots: dict[str, Body]) -> None:
+    def __init__(self, file: _File, wand: Body, robots: Mapping[str, Body]) -> None:
         self.seed, self.clutter = file.seed, file.clutter
         self.wave_s, self.cameras = file.wave_s, file.cameras
         self.wand, self.robots = wand, robots
@@ -141,7 +149,7 @@ class Scene:
         """
         file = load_yaml(path, _File)
         wand = load_yaml(path.parent / file.wand, Body)
-        robots = load_yaml(path.parent / file.robots, _Bodies).robots
+        robots = load_yaml(path.parent / file.robots, _Robots).robots
         if not file.cameras:
             raise ConfigError(f"{path} names no camera; give at least one under cameras")
         if odd := set(robots) ^ set(file.robot_motions):

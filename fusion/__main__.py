@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m fusion` is the live server; `run`, `record` and `replay` are about recordings;
-`define` and `undo` ask something of a server that runs."""
+`define` and `undo` ask something of a server that runs, `ros2` passes its poses on."""
 
 import logging
 import signal
@@ -20,6 +20,7 @@ COMMANDS = {
     "record": "fusion.recording",
     "define": "fusion.defining",
     "undo": "fusion.undoing",
+    "ros2": "fusion.ros2",
 }
 
 
@@ -30,6 +31,7 @@ class Serve:
     For recordings: python -m fusion run | record | replay --help
     For a new robot, measured where it stands: python -m fusion define --help
     For a camera that was placed anew wrongly: python -m fusion undo --help
+    For the robots as topics of ROS 2: python -m fusion ros2 --help
     """
 
     config: Path | None = None

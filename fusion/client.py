@@ -143,6 +143,7 @@ class Arena:
         self._lock = threading.Lock()
         self._robots: dict[str, Robot] = {}
         self._streams: dict[str, Stream] = {}
+        self._all: Stream[RobotPose] = Stream(f"poses {self._where}", TIMEOUT_S)
         self._known: set[str] = set()
         poses = session.declare_subscriber(self.keys.robot_pose(), self._take_pose)
         self._subscribers: list[Any] = [poses]
@@ -165,7 +166,7 @@ class Arena:
 
     def close(self) -> None:
         """End all iterations and the connection."""
-        for stream in (*self._robots.values(), *self._streams.values()):
+        for stream in (self._all, *self._robots.values(), *self._streams.values()):
             stream._close()
         for subscriber in self._subscribers:
             subscriber.undeclare()
@@ -177,6 +178,11 @@ class Arena:
             robot = self._robots.setdefault(name, Robot(f"pose of '{name}' {self._where}", timeout_s))
         robot.timeout_s = timeout_s
         return robot
+
+    def poses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[RobotPose]:
+        """The poses of all robots as they come, each in every instant: a callback has them all."""
+        self._all.timeout_s = timeout_s
+        return self._all
 
     def robots(self) -> tuple[str, ...]:
         """Names of the robots that were heard of so far."""
@@ -271,3 +277,4 @@ class Arena:
         if robot is None:
             robot = self.robot(pose.robot)
         robot._put(pose)
+        self._all._put(pose)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What several folders of tests need."""
 
+import re
+import shutil
 import signal
 import socket
 from collections.abc import Callable
@@ -9,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+WAVE_S = 8.0  # enough for every camera of the demo to see the wand in most of its image
 
 # A shell that runs the tests in the background has them, and the programs that they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -24,6 +27,18 @@ def free_port() -> int:
 def endpoint() -> str:
     """A Zenoh endpoint on loopback that is free."""
     return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """The demo's own scene with a shorter wave, in a folder of its own."""
+    folder = tmp_path / "demo"
+    shutil.copytree(ROOT / "configs" / "demo", folder)
+    path = folder / "scene.yaml"
+    text, count = re.subn(r"(?m)^wave_s: *[0-9.]+", f"wave_s: {WAVE_S}", path.read_text())
+    assert count == 1
+    path.write_text(text)
+    return path
 
 
 @pytest.fixture

@@ -2,34 +2,17 @@
 """The whole arena end to end, as `make demo` runs it: every program real, only the light is simulated."""
 
 import re
-import shutil
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import psutil
-import pytest
-
-CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "demo"
-WAVE_S = 8.0  # enough for every camera to see the wand in most of its image
 
 
 def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "web", "--demo", "--headless", "--scene", str(scene), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    """The demo's own scene with a shorter wave, in a folder of its own."""
-    folder = tmp_path / "demo"
-    shutil.copytree(CONFIGS, folder)
-    path = folder / "scene.yaml"
-    text, count = re.subn(r"(?m)^wave_s: *[0-9.]+", f"wave_s: {WAVE_S}", path.read_text())
-    assert count == 1
-    path.write_text(text)
-    return path
 
 
 def test_from_a_wave_to_poses_that_are_right(scene: Path):

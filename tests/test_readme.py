@@ -163,12 +163,13 @@ def wait_for_port(port: int) -> None:
             time.sleep(0.05)
 
 
-def test_the_subscription_prints_poses(tmp_path: Path, endpoint: str):
-    """The README's Python follows the rover of a running demo."""
+def test_the_subscription_prints_poses(tmp_path: Path, scene: Path, endpoint: str):
+    """The README's Python follows the rover of a running demo, and ROS 2 gets its topics."""
     (code,) = [block for block in blocks("python") if "Arena.connect" in block]
     (tmp_path / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
-    demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60", "--listen", endpoint]
+    demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60"]
     env = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    demo += ["--listen", endpoint, "--scene", str(scene)]
     with subprocess.Popen(demo, stdout=subprocess.PIPE, text=True) as arena:
         assert arena.stdout is not None
         assert any(line.startswith("calibrated") for line in arena.stdout)
@@ -177,5 +178,10 @@ def test_the_subscription_prints_poses(tmp_path: Path, endpoint: str):
             assert follower.stdout is not None
             line = follower.stdout.readline()
             follower.kill()
+        ros2 = words(find("python -m fusion ros2").replace("tcp/localhost:7447", endpoint))
+        with subprocess.Popen(ros2, stderr=subprocess.PIPE, text=True) as bridge:
+            assert bridge.stderr is not None
+            assert any("publishes /rover/odometry" in told for told in bridge.stderr)
+            bridge.kill()
         arena.terminate()
     assert re.match(r"\d{19} \(.*\) \(.*\)", line), line

@@ -130,8 +130,9 @@ def placed(result: Calibration) -> Placed:
     adjusted = result.adjusted
     free, count = list(adjusted.problem.free), len(result.names)
     pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
-    noise = adjusted.by_noise()[:, pose][:, :, :, pose].reshape(6 * count, 6 * count)
     by_prior = adjusted.by_prior().reshape(count, len(free), count, len(free))[:, pose][:, :, :, lens]
+    by_lens = by_prior.reshape(6 * count, 4 * count)
+    rest = result.covariance - by_lens @ by_lens.T
     sigma = adjusted.problem.doubt()[:, lens]
     lenses = {
         name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
@@ -139,7 +140,7 @@ def placed(result: Calibration) -> Placed:
     }
     scaled_by = result.report.scaled_by
     metric = adjusted.problem.fixed_distance is None or (scaled_by is not None and scaled_by.sigma_m > 0)
-    return Placed(result.names, adjusted.state.cameras, noise, lenses, metric)
+    return Placed(result.names, adjusted.state.cameras, rest, lenses, metric)
 
 
 def _figures(agreement: Agreement | None) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A calibration, and a wave as it goes, as a person reads it on the terminal."""
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.table import Table
@@ -14,6 +15,7 @@ from calib.trust import Trust
 from calib.waving import Progress
 
 WIDENED = 1.2  # below, it is not worth a line
+CLEAR = 3.0  # sigmas: below, a drift is not worth one either
 WORST = 5  # outliers that are listed one by one
 
 
@@ -49,7 +51,7 @@ def print_report(result: Calibration, trust: Trust, console: Console) -> None:
 
 
 def _drifts(result: Calibration) -> list[str]:
-    if not (result.drift_sigma_ppm > 0).any():
+    if not (np.abs(result.drift_ppm) > CLEAR * result.drift_sigma_ppm).any():
         return []
     rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
     return ["clocks drift apart, in ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]

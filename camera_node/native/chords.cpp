@@ -21,7 +21,6 @@ constexpr int kDrift = 3;         // pixels that the middle may move from one li
 constexpr int kStreakLines = 3, kStreakWidth = 14;  // the least; pixels
 constexpr float kStreakLong = 0.5f;  // of its width, and less where bars pass each other aslant:
 constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows or columns see better
-constexpr int kTurns = 4;            // pictures in which both diagonals have their turn
 constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
 
 constexpr int kBatch = 16;                       // lines that are scanned at once
@@ -131,7 +130,6 @@ ChordSearch::ChordSearch(const Settings& settings) {
     fine_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2), thick, thin, kSlack};
     coarse_ = {kCoarseLeast, int(settings.max_diameter / 2.8) + 2, thick, thin, kCoarseSlack};
     min_contrast_ = int(settings.min_contrast / 2);
-    partial_ = settings.search_share < 1;
 }
 
 bool ChordSearch::is_diametral(int dark, int inner) const {
@@ -280,25 +278,20 @@ void ChordSearch::scan(const BitImage& along, const BitImage* across, const Rast
 
 /// For smeared ones, and for those whose rows and columns are covered.
 void ChordSearch::scan_diagonals() {
-    if (both_ || turn_ % (kTurns / 2) == 0) thin_out(rows_, thin_);
-    for (const bool growing : {true, false}) {
-        if (!both_ && turn_ != (growing ? 0 : kTurns / 2)) continue;
-        shear(thin_, growing, diagonals_);
-        const Raster raster =
-            growing ? Raster{float(-4 * (rows_.lines / 2)), 0.5f, 2, 2, 4, 0} : Raster{0, 0.5f, -2, 2, 4, 0};
-        scan(diagonals_, nullptr, raster, coarse_);
-    }
-    both_ = partial_, turn_ = (turn_ + 1) % kTurns;
+    thin_out(rows_, thin_);
+    shear(thin_, true, diagonals_);
+    scan(diagonals_, nullptr, {float(-4 * (rows_.lines / 2)), 0.5f, 2, 2, 4, 0}, coarse_);
+    shear(thin_, false, diagonals_);
+    scan(diagonals_, nullptr, {0, 0.5f, -2, 2, 4, 0}, coarse_);
 }
 
-const std::vector<Seed>& ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
+void ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
     seeds_.clear(), streaks_.clear();
     image_ = &image;
     binarise(image, threshold, rows_, columns_);
     scan(rows_, &columns_, {0, 0.5f, 1, 0, 0, 2}, fine_);
     scan(columns_, &rows_, {0.5f, 0, 0, 1, 2, 0}, fine_);
     scan_diagonals();
-    return seeds_;
 }
 
 }  // namespace roundel

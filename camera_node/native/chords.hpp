@@ -33,13 +33,12 @@ struct Proportions {
 /// the dark runs is enough, so a roundel that something covers in part is found by the other direction.
 ///
 /// One that moves is seen across its motion only, wherever that is within half a right angle of the lines.
-/// Diagonals are scanned by turns, one in every second picture; both of the first one, and of pictures that
-/// are parts.
 class ChordSearch {
   public:
     explicit ChordSearch(const Settings& settings);
-    /// The seeds of an image; a roundel may have several.
-    const std::vector<Seed>& run(const ImageView& image, const ThresholdMap& threshold);
+    void run(const ImageView& image, const ThresholdMap& threshold);
+    /// The seeds of the last image; a roundel may have several.
+    const std::vector<Seed>& seeds() const { return seeds_; }
     /// The streaks of that image; sharp roundels are among them.
     const std::vector<Streak>& streaks() const { return streaks_; }
 
@@ -83,8 +82,6 @@ class ChordSearch {
     const ImageView* image_ = nullptr;
     const BitImage* across_ = nullptr;
     bool along_rows_ = true;
-    bool partial_, both_ = true;  // whether the next picture is searched along both diagonals
-    int turn_ = 0;                // pictures since one was
 };
 
 }  // namespace roundel

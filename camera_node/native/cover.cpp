@@ -7,6 +7,7 @@
 
 #include "bar.hpp"
 #include "sector_view.hpp"
+#include "settings.hpp"
 
 namespace roundel {
 
@@ -16,10 +17,12 @@ constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, w
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
 constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
 constexpr double kShows = 0.06;  // likewise: where a cover would show on a fit that passes all other gates
-constexpr int kMostHidden = 22, kMostOfBoth = 36;   // sectors of 32, of an edge and of both
+constexpr int kMostHidden = 26, kMostOfBoth = 44;  // sectors of 32, of an edge and of both
+constexpr double kPrintOff = 0.01;  // ratio measured off a print's, by which a bias of the rest shows
 constexpr double kLeastKnown = 12, kLeastNew = 16;  // pixels: smaller ones tell too little
 constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
 constexpr double kInked = 0.12;             // likewise, of a thin stroke
+constexpr double kRim = 1.06;               // outer radii: ink there goes on from the ring
 constexpr double kBright = 0.3;             // likewise, of a place in the ring that is no ink, and
 constexpr int kMostOpen = 2;                // as many sectors where nothing seems to cover it
 constexpr int kBlurred = 4;                 // sectors of a run that a cover's blurred edge alone may hide
@@ -56,7 +59,7 @@ bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, dou
             view.find(fit.ratio + share * (1 - fit.ratio), [](double level) { return level > kBright; });
     if (count_sectors(bright & ~covered) > kMostOpen) return true;
     Sectors inked = 0;
-    for (const double radius : {0.8 * fit.ratio, 1.12, 1.2})
+    for (const double radius : {0.8 * fit.ratio, kRim, 1.12, 1.2})
         inked |= view.find(radius, [](double level) { return std::abs(level) < kInked; });
     if (!bar && inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
     for (Sectors left = covered; left;) {
@@ -70,6 +73,12 @@ bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, dou
 bool is_hidden_too_much(const Hidden& hidden) {
     const int outer = count_sectors(hidden.outer), inner = count_sectors(hidden.inner);
     return std::max(outer, inner) > kMostHidden || outer + inner > kMostOfBoth;
+}
+
+/// Whether the ratio, which is all that is known of a new roundel before it is seen, is that of a print. What
+/// covers an edge unseen, and so biases the place, biases the ratio first.
+bool is_of_print(const Fit& fit, std::span<const double> prints) {
+    return prints.empty() || std::abs(nearest_ratio(prints, fit.ratio) - fit.ratio) < kPrintOff;
 }
 
 }  // namespace
@@ -91,7 +100,8 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
         if (!rest) return std::nullopt;
         fit = *rest;
     }
-    if (!is_below(fit, noise, kMisfit) || (!known && is_letter(image, fit, start.hidden, noise)))
+    if (!is_below(fit, noise, kMisfit)) return std::nullopt;
+    if (!known && (!is_of_print(fit, start.prints) || is_letter(image, fit, start.hidden, noise)))
         return std::nullopt;
     return fit;
 }

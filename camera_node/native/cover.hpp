@@ -15,7 +15,8 @@ bool shows_cover(const ImageView& image, const Fit& fit, double noise);
 /// the fit `whole` are left out and the rest is fitted anew, ever more strictly, until what is left is as the
 /// model says; a biased fit does not come through, and the covariance is that of the rest.
 ///
-/// A roundel that is `known` may look like a letter; a new one may not.
+/// A roundel that is `known` may look like a letter, and have a ratio a little off its print's; a new one may
+/// not.
 std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known);
 
 }  // namespace roundel

@@ -16,6 +16,9 @@ namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
 constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
+constexpr int kFramesOfTrust = 16;     // in which what did not change is searched once
+constexpr double kMostInParts = 0.5;   // of a frame that are searched apart, not as a whole
+constexpr double kStill = 1 / 8.0;     // of the least contrast, by which a tile's mean may move
 constexpr int kMaxFits = 512;          // to new places of a frame
 constexpr size_t kMaxSmeared = 8;      // lost roundels of a frame that are looked for smeared
 constexpr int kMaxMoving = 32;         // fits of new smeared ones, of which
@@ -26,8 +29,8 @@ constexpr double kNoiseSpan = 9.5;     // standard deviations
 
 std::vector<Roundel> Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear(), lost_.clear(), streaks_.clear();
-    postponed_ = fits_ = 0;
+    found_.clear(), lost_.clear(), places_.clear(), streaks_.clear();
+    fits_ = 0;
     if (image.width < 3 || image.height < 3) return found_;
     noise_ = noise_level(image);
     claims_ = Claims(image.width, image.height);
@@ -36,6 +39,7 @@ std::vector<Roundel> Detector::detect(const ImageView& image) {
     follow_smeared(image);
     search_smeared(image);
     tracks_.update(found_);
+    settle();
     update_theta();
     return found_;
 }
@@ -65,45 +69,75 @@ void Detector::follow_smeared(const ImageView& image) {
     }
 }
 
-/// The rows of the image that this frame's search looks at.
-ImageView Detector::next_band(const ImageView& image, int& top) {
-    if (settings_.search_share >= 1) return image;
+/// The rows of the image that are searched where all of it changed.
+Box Detector::next_band(const ImageView& image) {
+    if (settings_.search_share >= 1) return {0, 0, image.width, image.height};
     if (searched_to_ > 1 - 1e-9) searched_to_ = 0;
-    top = std::max(0, int(searched_to_ * image.height) - kOverlap);
+    int top = std::max(0, int(searched_to_ * image.height) - kOverlap);
     searched_to_ = std::min(1.0, searched_to_ + settings_.search_share);
     const int bottom = std::clamp(int(std::ceil(searched_to_ * image.height)), 3, image.height);
-    top = std::min(top, bottom - 3);
-    return image.window(0, top, image.width, bottom - top);
+    return {0, std::min(top, bottom - 3), image.width, bottom};
+}
+
+/// What changed and is not where a roundel was found already; a band of the frame where that is too much.
+std::vector<Box> Detector::parts_to_search(const ImageView& image) {
+    if (frames_ == kFramesOfTrust || postponed_) watch_.forget(), frames_ = 0;
+    ++frames_;
+    watch_.look(image);
+    for (const Roundel& roundel : found_) watch_.explain(roundel.fit.outer);
+    const double share = std::min(kMostInParts, settings_.search_share);
+    auto parts = watch_.changed(kStill * settings_.min_contrast, share);
+    const bool all = parts.size() == 1 && parts[0].area() == double(image.width) * image.height;
+    return all ? std::vector{next_band(image)} : parts;
+}
+
+/// What was searched need not be again while it stays as it is, but for where roundels are or were of late.
+void Detector::settle() {
+    if (settings_.by_paper) return;
+    for (const Roundel& roundel : found_) watch_.explain(roundel.fit.outer);
+    for (const Box& part : parts_) watch_.settle(part);
+    for (const Ellipse& lost : tracks_.lost()) watch_.doubt(lost);
 }
 
 void Detector::search(const ImageView& image) {
-    int top = 0;
-    const ImageView band = next_band(image, top);
+    parts_ = settings_.by_paper ? std::vector{next_band(image)} : parts_to_search(image);
+    postponed_ = 0;
+    for (const Box& part : parts_) search_part(image, part);
+    fit_places(image);
+}
+
+/// Seeds and streaks are kept for later; what the paper's search finds is fitted at once.
+void Detector::search_part(const ImageView& image, const Box& part) {
+    const ImageView view = image.window(part.left, part.top, part.right - part.left, part.bottom - part.top);
     const auto theta = uint8_t(std::lround(std::clamp(theta_.value(), 1.0, 255.0)));
     // Ten thousand pixels that only noise tells apart span eight deviations, the widest tile of a frame nine.
     const double contrast = std::clamp(kNoiseSpan * noise_, settings_.min_contrast, 255.0);
-    const ThresholdMap threshold = local_threshold(band, contrast, settings_.by_paper ? theta : 0);
-    if (!settings_.by_paper) return search_chords(image, band, threshold, top);
-    for (Start start : find_by_segments(band, threshold, settings_)) {
-        start.outer.y += top;
-        accept(image, start, -1);
+    const ThresholdMap threshold = local_threshold(view, contrast, settings_.by_paper ? theta : 0);
+    if (settings_.by_paper) {
+        for (Start start : find_by_segments(view, threshold, settings_)) {
+            start.outer.y += part.top;
+            accept(image, start, -1);
+        }
+        return;
+    }
+    chords_.run(view, threshold);
+    for (Seed seed : chords_.seeds()) {
+        seed.x += float(part.left), seed.y += float(part.top);
+        places_.push_back(seed);
+    }
+    for (Streak streak : chords_.streaks()) {
+        streak.x += float(part.left), streak.y += float(part.top);
+        streaks_.push_back(streak);
     }
 }
 
-/// Seeds are fitted at once, streaks kept for later.
-///
 /// Where there are more places than fits are allowed, the next frame begins with those that were left.
-void Detector::search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold,
-                             int top) {
-    const std::vector<Seed>& seeds = chords_.run(band, threshold);
-    streaks_ = chords_.streaks();
-    for (Streak& streak : streaks_) streak.y += float(top);
-    const size_t n = seeds.size(), first = size_t(begin_at_ * double(n));
+void Detector::fit_places(const ImageView& image) {
+    const size_t n = places_.size(), first = size_t(begin_at_ * double(n));
     const int most = fits_ + kMaxFits;
     size_t looked_at = 0;
     for (; looked_at < n && fits_ < most; ++looked_at) {
-        Seed seed = seeds[(first + looked_at) % n];
-        seed.y += float(top);
+        const Seed& seed = places_[(first + looked_at) % n];
         if (claims_.cover_quickly(double(seed.x), double(seed.y))) continue;
         accept(image, fit_circles(image, seed, settings_), -1);
     }

@@ -9,12 +9,13 @@
 #include "paper.hpp"
 #include "threshold.hpp"
 #include "tracks.hpp"
+#include "watch.hpp"
 
 namespace roundel {
 
-/// Roundels of grey images, frame after frame: those of the last frame where they are expected, then the
-/// rest of the frame under a local threshold, each one fitted to its grey levels. Calls from several threads
-/// wait for each other.
+/// Roundels of grey images, frame after frame: those of the last frame where they are expected, then what
+/// changed since it was searched under a local threshold, each one fitted to its grey levels. Every 16th
+/// frame all counts as changed. Calls from several threads wait for each other.
 class Detector {
   public:
     explicit Detector(Settings settings)
@@ -32,10 +33,13 @@ class Detector {
     void search(const ImageView& image);
     void follow_smeared(const ImageView& image);
     void search_smeared(const ImageView& image);
-    void search_chords(const ImageView& image, const ImageView& band, const ThresholdMap& threshold, int top);
+    void search_part(const ImageView& image, const Box& part);
+    void fit_places(const ImageView& image);
+    std::vector<Box> parts_to_search(const ImageView& image);
+    void settle();
     bool accept(const ImageView& image, const std::optional<Start>& start, int track);
     bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
-    ImageView next_band(const ImageView& image, int& top);
+    Box next_band(const ImageView& image);
     void update_theta();
 
     Settings settings_;
@@ -43,14 +47,18 @@ class Detector {
     StreakMatcher smeared_;
     Theta theta_;
     Tracks tracks_;
+    Watch watch_;
     Claims claims_{0, 0};
     std::vector<Roundel> found_;
+    std::vector<Box> parts_;
+    std::vector<Seed> places_;
     std::vector<Tracks::Expected> lost_;
     std::vector<Streak> streaks_;
     double noise_ = 0;        // grey levels
     double searched_to_ = 0;  // share of the height
     double begin_at_ = 0;     // share of the places to look at, where a frame had too many
     int postponed_ = 0, fits_ = 0;
+    int frames_ = 0;  // since all counted as changed
     std::mutex mutex_;
 };
 

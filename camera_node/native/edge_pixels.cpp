@@ -7,31 +7,67 @@
 #include <numbers>
 
 #include "simd.hpp"
+#include "strips.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr int kMinRows = 10;  // fewer do not tell an ellipse
-constexpr int kEdges = 3;
-constexpr int kWideRows = 3;  // one in so many
-constexpr int kNowhere = INT32_MIN / 2;
+constexpr int kMinRows = 10;     // fewer do not tell an ellipse
+constexpr int kWideRows = 3;     // one in so many
+constexpr double kUnseen = 0.5;  // grey levels by which another edge may show
 
 double square(double x) { return x * x; }
 
-ROUNDEL_INLINE Bits floor_of(const Lanes& x) {
-    const Bits near = __builtin_convertvector(x, Bits);
-    return near + (__builtin_convertvector(near, Lanes) > x);  // a comparison that is true is -1
-}
+/// The images of the edges, as far as they are the band's.
+struct EdgeImages {
+    CircleImage of[kEdges];
+    bool card;
+    EdgeImages(const Parameters& p, const Band& band) : card(band.card) {
+        for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge})
+            of[edge] = circle_image(p, radius_of(edge, p));
+    }
+    /// The least distance of two edges.
+    double gap(Edge outside, Edge inside) const {
+        const CircleImage &a = of[outside], &b = of[inside];
+        return minor_half_axis(a) - minor_half_axis(b) - std::hypot(a.x - b.x, a.y - b.y);
+    }
 
-/// What lies within a distance of the edges, card's, outer and inner, as ellipses to be cut by rows: lanes 0
-/// to 2 are those around the edges, lanes 4 to 6 the holes within them. Other lanes are empty.
+  private:
+    static double minor_half_axis(const CircleImage& e) {
+        const double twice = 2 * std::sqrt(std::max(e.shape.det(), 0.0)), trace = e.shape.xx + e.shape.yy;
+        return (std::sqrt(trace + twice) - std::sqrt(std::max(trace - twice, 0.0))) / 2;
+    }
+};
+
+/// How far from each edge no other one shows. An edge of contrast C does so by at most
+/// C exp(-(distance / blur)^2 / 2) / 2.
+struct Clearance {
+    double of[kEdges];
+    Clearance(const EdgeImages& images, const Parameters& p) {
+        const auto shown_within = [&](double contrast) {
+            return p[kBlur] * std::sqrt(2 * std::log(std::max(1.0, std::abs(contrast) / (2 * kUnseen))));
+        };
+        const double ring = shown_within(p[kBright] - p[kDark]);
+        const double card = images.card ? ring : shown_within(p[kGround] - p[kBright]);
+        const double within = images.gap(kOuterEdge, kInnerEdge), beyond = images.gap(kCardEdge, kOuterEdge);
+        of[kInnerEdge] = within - ring, of[kCardEdge] = beyond - ring;
+        of[kOuterEdge] = std::min(within - ring, beyond - card);
+    }
+};
+
+/// What lies within a distance of the edges, as ellipses to be cut by rows: lanes 0 to 2 are those around the
+/// edges, from the card's inwards, lanes 4 to 6 the holes within them. Other lanes are empty.
 class Strips {
   public:
-    Strips(const Parameters& p, double distance, bool card) {
-        for (int k = card ? 0 : 1; k < kEdges; ++k) {
-            const CircleImage e = circle_image(p, k == 0 ? p[kCard] : k == 1 ? 1 : p[kRatio]);
-            set(k, e, distance), set(4 + k, e, -distance);
+    Strips(const EdgeImages& edges, double distance) {
+        for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
+            if (edge == kCardEdge && !edges.card) continue;
+            const CircleImage& e = edges.of[edge];
+            const int k = edge == kCardEdge ? 0 : 1 + edge;
+            const Oval around(e, distance);
+            ovals_.set(k, around), ovals_.set(4 + k, Oval(e, -distance));
+            top_ = std::min(top_, around.top), bottom_ = std::max(bottom_, around.bottom);
             area_ += 2 * distance * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
             const double whole = std::numbers::pi * square(std::sqrt(e.shape.xx + e.shape.yy) + distance);
             most_ = std::max(most_, whole);
@@ -40,37 +76,10 @@ class Strips {
     double area() const { return std::min(area_, most_); }  // about
     double top() const { return top_; }
     double bottom() const { return bottom_; }
-
-    /// Columns [begin, end) of row y that lie inside.
-    struct Spans {
-        Bits begin, end;
-        bool has(int k) const { return begin[k] < end[k]; }
-    };
-    ROUNDEL_INLINE Spans cut(float y) const {
-        const Lanes dy = y - y_, t = dy * per_height_, left = 1.0f - t * t;
-        const Bits inside = left > 1e-6f;
-        const Lanes share = inside ? left : all(1), half = width_ * share * inverse_sqrt(share);
-        const Lanes middle = x_ + lean_ * dy;
-        return {inside ? -floor_of(half - middle) : Bits{} + kNowhere,
-                inside ? floor_of(middle + half) + 1 : Bits{} + kNowhere};
-    }
+    ROUNDEL_INLINE Spans cut(float row) const { return ovals_.cut(all(row)); }
 
   private:
-    /// Lane k is the ellipse `e` with both half axes a and b longer by `more`; empty where one vanishes.
-    void set(int k, const CircleImage& e, double more) {
-        const double ab = std::sqrt(std::max(e.shape.det(), 0.0)),
-                     sum = std::sqrt(e.shape.xx + e.shape.yy + 2 * ab);
-        const double product = ab + more * (sum + more);  // (a + more) (b + more)
-        if (!(product > 0 && sum + 2 * more > 0)) return;
-        // (S^(1/2) + more)^2, where S^(1/2) = (S + a b) / (a + b)
-        const double scale = 1 + 2 * more / sum, yy = scale * e.shape.yy + more * (2 * ab / sum + more);
-        const double height = std::sqrt(yy);
-        x_[k] = float(e.x), y_[k] = float(e.y), per_height_[k] = float(1 / height);
-        width_[k] = float(product / height), lean_[k] = float(scale * e.shape.xy / yy);
-        top_ = std::min(top_, e.y - height), bottom_ = std::max(bottom_, e.y + height);
-    }
-
-    Lanes x_{}, y_{}, per_height_ = all(1e6f), width_{}, lean_{};
+    Ovals ovals_{};
     double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
 };
 
@@ -95,11 +104,11 @@ ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
 ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
     to.expected += std::max(0, end - begin);
     if (y < 0 || y >= image.height) return;
-    begin = std::max(begin, 0), end = std::min({end, image.width, begin + EdgePixels::kMax - to.used});
+    begin = std::max(begin, 0), end = std::min({end, image.width, begin + EdgePixels::kMax - to.end()});
     const uint8_t* row = image.row(y);
     constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     for (int u = begin; u < end; u += kLanes) {
-        const int at = to.used + u - begin;
+        const int at = to.end() + u - begin;
         store(to.x + at, float(u - to.origin_x) + kSteps);
         store(to.y + at, all(float(y - to.origin_y)));
         store(to.level + at, load_levels(row + u, image.width - u));
@@ -109,7 +118,7 @@ ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, Ed
 
 /// Appends what row y has of the strips, left to right and each pixel once.
 ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& strips, EdgePixels& to) {
-    const Strips::Spans spans = strips.cut(float(y - to.origin_y));
+    const Spans spans = strips.cut(float(y - to.origin_y));
     int begin[2 * kEdges], end[2 * kEdges];  // left of the middle, then right
     for (int k = 0; k < kEdges; ++k) {
         const bool hole = spans.has(4 + k);
@@ -130,6 +139,40 @@ ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, co
     const int top = int(std::ceil(wide.top())), bottom = int(std::floor(wide.bottom()));
     for (int y = top, k = 0; y <= bottom; y += step, ++k)
         append_row(image, y + to.origin_y, k % kWideRows ? narrow : wide, to);
+}
+
+/// Appends what every `step`-th row from `first` on has of one edge's strip.
+ROUNDEL_INLINE void append_strip(const ImageView& image, const CircleImage& edge, double distance, int first,
+                                 int step, EdgePixels& to) {
+    const Oval around(edge, distance), hole(edge, -distance);
+    const Ovals outside = Ovals::all_of(around), inside = Ovals::all_of(hole);
+    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
+    const int bottom = int(std::floor(around.bottom));
+    for (int y = first; y <= bottom; y += kLanes * step) {
+        const Lanes rows = float(y) + float(step) * kSteps;
+        const Spans strip = outside.cut(rows), open = inside.cut(rows);
+        for (int k = 0; k < kLanes; ++k) {
+            const int row = y + k * step + to.origin_y;
+            if (!strip.has(k)) continue;
+            append(image, row, strip.begin[k] + to.origin_x,
+                   (open.has(k) ? open.begin[k] : strip.end[k]) + to.origin_x, to);
+            if (open.has(k)) append(image, row, open.end[k] + to.origin_x, strip.end[k] + to.origin_x, to);
+        }
+    }
+}
+
+/// Edge by edge: every `step`-th row of the narrow strip, the wide one in every third of these.
+ROUNDEL_CLONES void append_edges(const ImageView& image, const EdgeImages& edges, const Clearance& clearance,
+                                 const Band& band, int step, EdgePixels& to) {
+    for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
+        if (edge == kCardEdge && !edges.card) continue;
+        const CircleImage& e = edges.of[edge];
+        const double wide = std::min(band.wide, clearance.of[edge]);
+        const int top = int(std::ceil(Oval(e, wide).top));
+        for (int k = 0; k < kWideRows; ++k)
+            append_strip(image, e, k ? band.narrow : wide, top + k * step, kWideRows * step, to);
+        to.end_part(edge);
+    }
 }
 
 struct Mean {
@@ -159,13 +202,17 @@ double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
 
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels) {
-    const Strips narrow(p, band.narrow, band.card), wide(p, band.wide, band.card);
+    const EdgeImages edges(p, band);
+    const Strips narrow(edges, band.narrow), wide(edges, band.wide);
     const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
-    pixels.used = pixels.expected = 0;
     const int rows = int(wide.bottom() - wide.top());
     const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
+    const Clearance clearance(edges, p);
+    pixels.clear();
+    if (band.apart && clearance.of[kOuterEdge] >= band.narrow)
+        return append_edges(image, edges, clearance, band, step, pixels);
     append_rows(image, narrow, wide, step, pixels);
-    pixels.fill_up();
+    pixels.end_part(kAnyEdge);
 }
 
 }  // namespace roundel

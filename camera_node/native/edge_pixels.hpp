@@ -1,23 +1,52 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <array>
+
 #include "image.hpp"
 #include "pixel_columns.hpp"
 #include "roundel_model.hpp"
 
 namespace roundel {
 
-/// Pixels near the edges of one roundel.
-using EdgePixels = PixelColumns<6144>;
+/// Pixels near the edges of one roundel, part by part: those of one edge each, or of all of them.
+struct EdgePixels : PixelColumns<6144> {
+    struct Part {
+        Edge edge;
+        int begin, count;  // whole lanes
+    };
+    std::array<Part, kEdges> parts;
+    int part_count = 0;
+
+    void clear() { used = expected = count = part_count = padding_ = 0; }
+    /// Of pixels that are not told apart, the first `n`.
+    void keep(int n) {
+        expected -= used - n, used = n, count = part_count = padding_ = 0;
+        end_part(kAnyEdge);
+    }
+    int end() const { return used + padding_; }
+    /// Makes a part of what was added since the last one.
+    void end_part(Edge edge) {
+        while (end() % kLanes) x[end()] = y[end()] = 0, level[end()] = -1, ++padding_;
+        parts[size_t(part_count++)] = {edge, count, end() - count}, count = end();
+    }
+
+  private:
+    int padding_ = 0;
+};
 
 /// Which pixels, by their distance from the nearest edge: those within `narrow` in every row, and in every
 /// third one those within `wide`, which tell of the levels.
 struct Band {
     double narrow, wide;
-    bool card;  // whether the card's edge is one of them
+    bool card;           // whether the card's edge is one of them
+    bool apart = false;  // whether pixels that see one edge only may be told apart
 };
 
 /// Fills `pixels` by the band along the edges that `p` says, in every n-th row: n is the least that leaves
 /// about `limit` pixels or less, or ten rows.
+///
+/// Where edges are so far from each other that no pixel within `narrow` sees two of them, each has a part of
+/// its own, and `wide` ends before the next one.
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels);
 

@@ -15,14 +15,18 @@ namespace {
 constexpr double kBeyond = 30;           // grey levels by which a blurred ring's may seem beyond the scale
 constexpr double kMisfit = 0.045;        // of the contrast, RMS on the ring's edges
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
+constexpr double kMost = 2.5;            // times as much of the largest ones, and
+constexpr double kMostRagged = 1.5;      // where softening took most of it already
 constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones are alike all around
 constexpr double kTellable = 16;         // pixels: smaller ones that are ragged may be letters
+constexpr double kSameLevel = 0.2;       // of the contrast, between ground and card
+constexpr double kLeastCard = 1.1;       // outer diameters of white around the ring, where its edge shows
 constexpr double kMostOff = 0.2;  // share of ring and hole that is not as dark or bright as it should be
 
 /// Whether the ring's edges are as the model says, but for noise and for what print and lens do to them:
-/// `misfit` of the contrast, and more where large ones are drawn or cut by hand.
-bool is_as_modelled(const Fit& fit, double noise, double misfit) {
-    const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, 2.5);
+/// `misfit` of the contrast, and up to `most` times that where large ones are drawn or cut by hand.
+bool is_as_modelled(const Fit& fit, double noise, double misfit, double most) {
+    const double least = misfit * std::clamp(fit.outer.major / 30, 1.0, most);
     return fit.edge_residual < std::hypot(1.2 * noise, least * (fit.bright - fit.dark));
 }
 
@@ -33,9 +37,18 @@ bool has_surface(const ImageView& image, const Fit& fit) {
     return surface.off <= kMostOff * surface.seen;
 }
 
+/// Whether the ring stands on the hole's white, as on any card; without it any dark disc with a light spot in
+/// its middle would pass.
+bool has_card(const Fit& fit) {
+    const double off = std::abs(fit.p[kGround] - fit.bright);
+    return fit.p[kCard] > kLeastCard || off < kSameLevel * (fit.bright - fit.dark);
+}
+
 /// The gates that end false positives.
-bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, double noise, double misfit) {
-    return has_limits(fit, settings) && is_as_modelled(fit, noise, misfit) && has_surface(image, fit);
+bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, double noise, double misfit,
+              double most) {
+    return has_limits(fit, settings) && has_card(fit) && is_as_modelled(fit, noise, misfit, most) &&
+           has_surface(image, fit);
 }
 
 /// Whether a fit that failed looks as if only its edges were ragged.
@@ -58,7 +71,7 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     start.prints = settings.inner_ratios;
     auto fit = refine(image, start);
     if (!fit) return std::nullopt;
-    const bool whole = is_whole(image, *fit, settings, noise, kMisfit);
+    const bool whole = is_whole(image, *fit, settings, noise, kMisfit, kMost);
     fit->plain = whole && !shows_cover(image, *fit, noise);
     if (fit->plain || start.model) return fit->plain ? fit : std::nullopt;
     const auto rest = fit_rest(image, start, *fit, noise, known || whole);
@@ -67,7 +80,8 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     if (!may_be_ragged(*fit, settings)) return std::nullopt;
     const auto soft = refine_softened(image, start);
     const double ragged = start.outer.major < kTellable ? kMisfit : kRaggedMisfit;
-    return soft && is_whole(image, *soft, settings, noise * 6 / 16, ragged) ? soft : std::nullopt;
+    return soft && is_whole(image, *soft, settings, noise * 6 / 16, ragged, kMostRagged) ? soft
+                                                                                         : std::nullopt;
 }
 
 }  // namespace roundel

@@ -1,5 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <array>
+#include <span>
+
+#include "edge_ellipse.hpp"
 #include "edge_pixels.hpp"
 #include "roundel_model.hpp"
 
@@ -35,8 +39,18 @@ class Linearisation {
     Leftover after(const Parameters& delta, double scale) const;
 
   private:
-    static constexpr int kChunks = EdgePixels::kMax / (kChunk * kLanes) + 1;
-    int count_ = 0;  // lanes, of all chunks
+    /// Chunks of pixels of one edge, or of all.
+    struct Part {
+        Edge edge;
+        int lanes;
+        const Gradient* chunks;
+        EdgeEllipse::Moves moves;  // of that edge's ellipse
+    };
+    std::span<const Part> parts() const { return {parts_.data(), size_t(part_count_)}; }
+
+    static constexpr int kChunks = EdgePixels::kMax / (kChunk * kLanes) + kEdges;
+    std::array<Part, kEdges> parts_;
+    int part_count_ = 0;
     Gradient chunks_[kChunks];
 };
 

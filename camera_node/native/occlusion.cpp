@@ -122,9 +122,7 @@ ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePix
             pixels.x[kept] = x[k], pixels.y[kept] = y[k], pixels.level[kept++] = level[k];
         }
     }
-    pixels.expected -= pixels.used - kept;
-    pixels.used = kept;
-    pixels.fill_up();
+    pixels.keep(kept);
 }
 
 Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack) {

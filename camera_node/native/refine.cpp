@@ -48,7 +48,7 @@ class Fitter {
         prior_ = prior_information(start.outer.major, kAnyRatio, kAnyBlur);
         resumed_ = start.model.has_value();
         if (resumed_) {
-            p = *start.model, start_[kGround] = p[kGround];
+            p = *start.model, start_[kGround] = p[kGround], scale_ = start.noise;
             p[kX] -= pixels_.origin_x, p[kY] -= pixels_.origin_y;
         }
     }
@@ -57,7 +57,7 @@ class Fitter {
     bool approach() {
         // Perspective moves the inner edge and the card's from where the start has them.
         const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select({wide, wide, true}, kCoarsePixels)) return false;
+        if (!select({wide, wide, true, !hidden_.any()}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card(pixels_, p);
         return iterate(2);
     }
@@ -65,7 +65,7 @@ class Fitter {
     bool finish() {
         const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
         const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
-                        card};
+                        card, !hidden_.any()};
         return select(band, EdgePixels::kMax) && iterate(1);
     }
 
@@ -90,7 +90,8 @@ class Fitter {
             model_.evaluate(pixels_, p);
             const double seen = edge_scale();
             if (resumed_ && (k == kResumed || seen > kLost * (p[kBright] - p[kDark]))) return false;
-            const double used = std::min(scale_, (ahead > 1 ? kStrict : kSlack) * seen);
+            const double used = ahead > 1 ? std::min(scale_, kStrict * seen)
+                                          : std::clamp(scale_, kStrict * seen, kSlack * seen);
             equations_ = model_.accumulate(used);
             add_prior(used);
             factor_.emplace(equations_.H);
@@ -203,6 +204,7 @@ std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {
 Fit Fitter::fit() const {
     Fit fit = fit_of(p, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
     fit.edge_residual = std::sqrt(left_.ring_rr / left_.ring);
+    fit.noise = scale_;
     fit.support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected;
     return fit;
 }

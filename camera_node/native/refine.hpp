@@ -17,6 +17,7 @@ struct Start {
     std::span<const double> prints{};   // ratios that the prints in use were made with, where they are known
     Hidden hidden{};                    // what is covered, and left out of the fit
     std::optional<Parameters> model{};  // good to a third of a pixel, in the image's frame, where it is known
+    double noise = 0;                   // that the fit of this model left
 };
 
 /// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
@@ -36,7 +37,7 @@ struct Fit {
     Parameters p;          // as the model has them, in the image's frame
     bool plain = false;    // fitted to the picture as it is, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
-    double noise = 0;                   // of what the fit of a moving one leaves, grey levels
+    double noise = 0;                   // that the fit leaves, grey levels
     /// Of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
     Symmetric offset_covariance() const { return {C[5][5], C[5][6], C[6][6]}; }

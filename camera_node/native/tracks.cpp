@@ -26,8 +26,15 @@ std::vector<Tracks::Expected> Tracks::expect() const {
     return expected;
 }
 
+std::vector<Ellipse> Tracks::lost() const {
+    std::vector<Ellipse> lost;
+    for (const Track& t : tracks_)
+        if (t.missed) lost.push_back(t.fit.outer);
+    return lost;
+}
+
 Start Tracks::Expected::start() const {
-    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p};
+    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise};
     start.outer.x += vx, start.outer.y += vy;
     (*start.model)[kX] += vx, (*start.model)[kY] += vy;
     return start;

@@ -27,6 +27,8 @@ class Tracks {
         Start start() const;
     };
     std::vector<Expected> expect() const;
+    /// Where those were seen last that keep their numbers and were not found.
+    std::vector<Ellipse> lost() const;
     /// Takes the roundels of a frame. Those without a number (below 0) get that of a track that is expected
     /// within a diameter, the nearest first, or a new one. A lost track keeps its number for a while.
     void update(std::vector<Roundel>& found);

@@ -6,6 +6,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from calib.discs import displacement
 from calib.errors import CalibrationError
@@ -191,6 +192,23 @@ def test_drift_is_found_and_cameras_in_step_stay_in_step():
         result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
         assert not result.time_sigma_ms.any()
         assert not result.drift_sigma_ppm.any()
+
+
+def test_time_offsets_of_a_short_wave_are_as_sure_as_they_say():
+    """Ten seconds, waved briskly, of clocks up to 80 ppm apart, which so short a wave does not show: squared
+    Mahalanobis errors of the offsets, over four waves, lie between the 0.1 % and 99.9 % quantiles of chi-square. With
+    the drift taken as none where none is told, they were five times the mean."""
+    squared, degrees = 0.0, 0
+    for seed in range(4):
+        wave = Wave(cameras=4, seconds=10, speed=1.5, drift_ppm=80, seed=seed)
+        recorded = record_wave(wave)
+        result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
+        truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
+        apart = np.linalg.svd(np.ones((len(truth), 1)))[0][:, 1:]
+        off = apart.T @ (result.time_offset_ms - truth) / 1e3
+        covariance = apart.T @ result.adjusted.covariance(OFFSET)[:, 0, :, 0] @ apart
+        squared, degrees = squared + off @ np.linalg.solve(covariance, off), degrees + len(off)
+    assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
 
 def test_noise_is_no_clock():

@@ -88,12 +88,31 @@ def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
 
 @pytest.mark.parametrize(
     ("share", "from_rim", "least"),
-    [(0.2, True, 0.88), (0.2, False, 0.72), (0.3, True, 0.59), (0.3, False, 0.42)],
+    [(0.2, True, 0.88), (0.2, False, 0.71), (0.3, True, 0.59), (0.3, False, 0.51)],
 )
 def test_a_covered_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
     """What the benchmark measures, less four sigmas of 90."""
     chance = 4 * np.sqrt(least * (1 - least) / 90)
     assert recall(Run("chords", Detector, False), 3, covered(share, from_rim)) > least - chance
+
+
+def test_a_new_one_is_where_it_seems_although_much_is_hidden():
+    """Of those found under bars over 30 % of the diameter one disc's centre in fifty at most is beyond nine sigmas.
+
+    A cover that hides in an edge unseen is told by the ratio, which then is not the print's.
+    """
+    squared = []
+    for seed in range(300, 308):
+        frame, cards = covered(0.3, False)(np.random.default_rng(seed))
+        detector = Detector()
+        found = detector.detect(frame)
+        offsets, cov = detector.disc_offsets()
+        for centre, C in zip(found.uv + offsets, cov, strict=True):
+            error = min((centre - card.uv for card in cards), key=lambda e: float(e @ e))
+            both = C[:2, :2] + C[5:, 5:] + C[:2, 5:] + C[5:, :2] + MODEL_PX**2 * np.eye(2)
+            squared.append(error @ np.linalg.solve(both, error))
+    assert len(squared) > 100
+    assert np.mean(np.array(squared) > 9**2) < 0.02
 
 
 def test_letters_and_other_rings_are_no_covered_roundels():

@@ -137,6 +137,14 @@ def test_a_faulty_scene_says_what_and_where(tmp_path, change, says):
     assert "\n" not in str(fault.value)
 
 
+def test_robots_are_the_server_s_file(tmp_path):
+    """What only the server reads passes by; a misspelt key does not."""
+    robot = DISC | {"motion": "ground", "start_m": [0.0, 0.0, 0.0]}
+    assert set(Scene.load(write_scene(tmp_path, {"disc": robot}, {"disc": {}})).robots) == {"disc"}
+    with pytest.raises(ConfigError, match="moton"):
+        Scene.load(write_scene(tmp_path, {"disc": DISC | {"moton": "ground"}}, {"disc": {}}))
+
+
 def test_a_robot_can_not_be_called_wand(tmp_path):
     with pytest.raises(ConfigError, match="rename the robot"):
         Scene.load(write_scene(tmp_path, {"wand": DISC}, {"wand": {}}))

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pixels of a single edge say of the pose what they say as pixels of a whole roundel."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
+SOURCES = [NATIVE / f"{name}.cpp" for name in ("edge_pixels", "normal_equations", "ellipse")]
+
+
+def test_edges_apart_and_together_give_the_same_normal_equations(tmp_path: Path):
+    """All 13 x 13 products, by the moves of three ellipses and by the columns of the whole.
+
+    Those of the whole are taken at a pixel, of an ellipse at the point of the edge that is nearest to it: half a blur
+    (0.4 px) in radii of the hole, 0.3 of the diameter, is the difference, and what is left of it in a product of one
+    column that is even across the edge and one that is odd.
+    """
+    driver = Path(__file__).with_name("edges.cpp")
+    flags = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
+    subprocess.run(["c++", *flags, driver, *SOURCES, "-o", tmp_path / "edges"], check=True, timeout=300)
+    done = subprocess.run([tmp_path / "edges"], capture_output=True, check=True, timeout=60)
+    diameter, _, parts, off = np.loadtxt(done.stdout.decode().splitlines()).T
+    assert np.all(parts[diameter == 20] == 1)
+    assert np.all(off[diameter == 20] == 0)
+    assert np.all(parts[diameter >= 50] == 3)
+    assert np.all(off < 0.4 / (0.3 * diameter))

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""An arena's robots in ROS 2. `rosbags` is the oracle: an implementation of ROS's messages that is none of ours."""
+
+import contextlib
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+from zenoh.ext import Int64, z_deserialize
+
+from camera_node.errors import ConfigError
+from camera_node.messages import Keys, encode
+from camera_node.network import open_router
+from camera_node.pose import rotation_from_vector, rotation_from_wxyz
+from fusion.client import Arena
+from fusion.messages import RobotPose
+from fusion.ros2 import Node, ros2, ros_name
+from fusion.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
+from tests.conftest import free_port
+
+DEADLINE_S = 60.0
+ROS = get_typestore(Stores.ROS2_JAZZY)
+
+
+def read(data: bytes, kind: str) -> Any:
+    """What ROS reads; its fields are made at run time."""
+    return ROS.deserialize_cdr(data, kind)
+
+
+def draw_pose(robot: str = "rover", state: str = "tracked", seed: int = 7) -> RobotPose:
+    rng = np.random.default_rng(seed)
+    A, q = rng.normal(size=(12, 12)), rng.normal(size=4)
+    return RobotPose(
+        robot=robot,
+        t_ns=1_790_000_000_123_456_789,
+        state=state,  # pyright: ignore[reportArgumentType]: one of the three
+        position=tuple(rng.normal(size=3).tolist()),
+        quaternion_wxyz=tuple((q / np.linalg.norm(q)).tolist()),
+        velocity=tuple(rng.normal(size=3).tolist()),
+        angular_velocity=tuple(rng.normal(size=3).tolist()),
+        covariance=(A @ A.T).astype("<f4").tobytes(),
+        n_markers=3,
+    )
+
+
+POSE = draw_pose()
+
+
+@pytest.mark.parametrize("kind", TYPE_HASHES)
+def test_types_have_ros_s_own_hashes(kind):
+    assert ROS.hash_rihs01(kind) == f"RIHS01_{TYPE_HASHES[kind]}"
+
+
+@pytest.mark.parametrize("frame", ["", "map", "world", "arena1"])  # lengths of every remainder by four
+@pytest.mark.parametrize(
+    ("kind", "write"),
+    [
+        ("geometry_msgs/msg/PoseStamped", lambda frame: pose_stamped(POSE, frame)),
+        ("nav_msgs/msg/Odometry", lambda frame: odometry(POSE, frame, "rover")),
+        ("tf2_msgs/msg/TFMessage", lambda frame: transform(POSE, frame, "rover")),
+    ],
+)
+def test_bytes_are_those_that_ros_writes(kind, write, frame):
+    data = write(frame)
+    assert bytes(ROS.serialize_cdr(read(data, kind), kind)) == data
+
+
+def test_messages_say_what_the_pose_says():
+    stamped = read(pose_stamped(POSE, "world"), "geometry_msgs/msg/PoseStamped")
+    told = read(odometry(POSE, "world", "rover"), "nav_msgs/msg/Odometry")
+    (tf,) = read(transform(POSE, "world", "rover"), "tf2_msgs/msg/TFMessage").transforms
+    for message in (stamped, told, tf):
+        stamp = message.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == POSE.t_ns
+        assert message.header.frame_id == "world"
+    assert told.child_frame_id == tf.child_frame_id == "rover"
+    for place in (stamped.pose.position, told.pose.pose.position, tf.transform.translation):
+        assert (place.x, place.y, place.z) == POSE.position
+    for q in (stamped.pose.orientation, told.pose.pose.orientation, tf.transform.rotation):
+        assert (q.w, q.x, q.y, q.z) == POSE.quaternion_wxyz
+    R, twist = rotation_from_wxyz(POSE.quaternion_wxyz), told.twist.twist
+    forth = R @ [twist.linear.x, twist.linear.y, twist.linear.z]  # back to the world
+    assert forth == pytest.approx(POSE.velocity, rel=1e-12)
+    assert R @ [twist.angular.x, twist.angular.y, twist.angular.z] == pytest.approx(POSE.angular_velocity)
+    C = told_covariance()
+    assert told.pose.covariance.reshape(6, 6) == pytest.approx(C[:6, :6], rel=1e-12)
+    assert told.twist.covariance.reshape(6, 6) == pytest.approx(C[6:, 6:], rel=1e-12)
+
+
+def told_covariance() -> np.ndarray:
+    R = rotation_from_wxyz(POSE.quaternion_wxyz)
+    return covariance(POSE, R, np.array([R.T @ POSE.velocity, R.T @ POSE.angular_velocity]))
+
+
+def test_covariance_is_that_of_poses_drawn_from_it():
+    """Small errors in our order, carried over by what the messages mean, spread as ROS's covariance says."""
+    scale, rng = 1e-4, np.random.default_rng(3)
+    R, v, w = (
+        rotation_from_wxyz(POSE.quaternion_wxyz),
+        np.array(POSE.velocity),
+        np.array(POSE.angular_velocity),
+    )
+    L = np.linalg.cholesky(POSE.covariance_matrix)
+    drawn = []
+    for error in rng.normal(size=(4000, 12)) @ L.T * scale:
+        true = R @ rotation_from_vector(error[:3])
+        turn = true @ R.T - np.eye(3)  # about the world's axes
+        drawn.append(
+            [
+                *error[3:6],
+                *(turn[2, 1], turn[0, 2], turn[1, 0]),
+                *(true.T @ (v + error[9:]) - R.T @ v),
+                *(true.T @ (w + error[6:9]) - R.T @ w),
+            ]
+        )
+    told = told_covariance()
+    sd = np.sqrt(np.diag(told))
+    ratio = np.cov(np.transpose(drawn)) / scale**2 / np.outer(sd, sd)
+    # correlations of 4000 draws have a standard deviation of at most sqrt(2 / 4000) = 0.022; five of them
+    assert np.abs(ratio - told / np.outer(sd, sd)).max() < 0.11
+
+
+def ros_peer(endpoint: str) -> zenoh.Session:
+    """A session as a node of rmw_zenoh_cpp opens it: a peer that knows the router only."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    config.insert_json5("listen/endpoints", '["tcp/127.0.0.1:0"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+@contextlib.contextmanager
+def passing_on(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
+    command = [sys.executable, "-m", "fusion", "ros2", "--connect", endpoint, "--arena", "test", *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def repeat(session: zenoh.Session, poses: list[RobotPose], done: threading.Event) -> None:
+    """Publish the poses again and again, as a server does."""
+    while not done.wait(0.05):
+        for pose in poses:
+            session.put(Keys("test").robot_pose(pose.robot), encode(pose))
+
+
+@pytest.mark.parametrize("humble", [False, True])
+@pytest.mark.parametrize("own_router", [False, True])
+def test_a_node_of_rmw_zenoh_hears_the_robots_and_sees_the_topics(humble, own_router):
+    endpoint, ros_endpoint = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    options = ["--humble"] * humble
+    heard, tokens, done = queue.Queue(), queue.Queue(), threading.Event()
+    poses = [POSE, draw_pose("gone", "lost")]
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(open_router([endpoint]))
+        if own_router:
+            stack.enter_context(open_router([ros_endpoint]))
+            options += ["--ros", ros_endpoint]
+        ros = stack.enter_context(ros_peer(ros_endpoint if own_router else endpoint))
+        topics = ros.declare_subscriber("3/lab/**", heard.put)
+        graph = ros.liveliness().declare_subscriber("@ros2_lv/3/**", tokens.put, history=True)
+        arena = threading.Thread(target=repeat, args=(server, poses, done))
+        arena.start()
+        try:
+            with passing_on(endpoint, "--domain", "3", "--namespace", "/lab", *options):
+                samples = [heard.get(timeout=DEADLINE_S) for _ in range(6)]
+                entities = {str(tokens.get(timeout=DEADLINE_S).key_expr) for _ in range(4)}
+        finally:
+            topics.undeclare()
+            graph.undeclare()
+            done.set()
+            arena.join(DEADLINE_S)
+    kinds = {"pose": "geometry_msgs/msg/PoseStamped", "odometry": "nav_msgs/msg/Odometry"}
+    for sample in samples:
+        domain, namespace, robot, topic, typed, type_hash = str(sample.key_expr).split("/")
+        kind = kinds[topic]
+        assert (domain, namespace, robot) == ("3", "lab", "rover")
+        assert typed == kind.replace("/msg/", "::msg::dds_::") + "_"
+        assert type_hash == ("TypeHashNotSupported" if humble else ROS.hash_rihs01(kind))
+        assert read(sample.payload.to_bytes(), kind).header.frame_id == "world"
+    numbers = [
+        z_deserialize(tuple[Int64, Int64, bytes], s.attachment)[0]
+        for s in samples
+        if "Odom" in str(s.key_expr)
+    ]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # counted by topic
+    parts = sorted(entity.split("/")[4:] for entity in entities)
+    assert parts[0] == ["0", "NN", "%", "%lab", "roundel"]
+    names = {"%lab%rover%pose", "%lab%rover%odometry", "%tf"}
+    assert {p[5] for p in parts[1:]} == names
+    assert {p[1] for p in parts[1:]} == {"MP"}
+    assert {p[8] for p in parts[1:]} == {"::,10:,:,:,,"}
+
+
+def test_robots_whose_names_ros_can_not_tell_apart_are_counted():
+    assert [ros_name(n) for n in ("rover", "rover-2", "2nd", "öre")] == [
+        "rover",
+        "rover_2",
+        "robot_2nd",
+        "_re",
+    ]
+    with open_router([f"tcp/127.0.0.1:{free_port()}"]) as session:
+        node = Node(session)
+        for name in ("rover-2", "rover_2", "rover_2"):
+            node.publish(draw_pose(name), "world")
+        assert node.faults == {"poses of 'rover_2', whose name ROS can't tell from 'rover-2'": 2}
+
+
+@pytest.mark.parametrize("domain", ["-1", "233", "lab"])
+def test_a_domain_that_is_none_is_refused(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    program = subprocess.run(
+        [sys.executable, "-m", "fusion", "ros2"], capture_output=True, text=True, timeout=DEADLINE_S
+    )
+    assert program.returncode == 2
+    assert f"the ROS domain is '{domain}'; give --domain" in program.stderr
+
+
+@pytest.mark.parametrize("namespace", ["a-b", "1st", "a//b", "*"])
+def test_a_namespace_that_is_none_is_refused(namespace):
+    with pytest.raises(ConfigError, match="is no namespace of ROS"):
+        ros2(namespace=namespace)
+
+
+def test_silence_is_told_once_and_its_end_too():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    done = threading.Event()
+    with open_router([endpoint]) as server, passing_on(endpoint) as process:
+        assert process.stderr is not None
+        assert "no pose from arena 'test'" in process.stderr.readline()
+        arena = threading.Thread(target=repeat, args=(server, [POSE], done))
+        arena.start()
+        try:
+            assert "there are poses again" in process.stderr.readline()
+        finally:
+            done.set()
+            arena.join(DEADLINE_S)
+
+
+def test_poses_of_all_robots_come_in_one_stream():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    done = threading.Event()
+    poses = [POSE, msgspec.structs.replace(POSE, robot="drone")]
+    with open_router([endpoint]) as server, Arena.connect(endpoint, arena="test") as arena:
+        thread = threading.Thread(target=repeat, args=(server, poses, done))
+        thread.start()
+        try:
+            seen = queue.Queue()
+            arena.poses(DEADLINE_S).on_message(seen.put)
+            robots = {seen.get(timeout=DEADLINE_S).robot for _ in range(4)}
+            assert robots == {"rover", "drone"}
+            assert arena.robot("drone", DEADLINE_S).next().robot == "drone"
+        finally:
+            done.set()
+            thread.join(DEADLINE_S)
