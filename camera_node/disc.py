@@ -130,7 +130,7 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array
     odds = np.full((n, 2), 0.5)
     if seen.any():
         Q, radius = _fit_conics(xy[seen]), diameter_m / 2
-        position[seen], normal[seen] = _decompose(Q, radius)
+        position[seen], normal[seen] = decompose(Q, radius)
         if offsets is not None:
             parts = position[seen], normal[seen], ellipses[seen], offsets[0][seen], offsets[1][seen]
             position[seen], normal[seen], odds[seen] = _adjust(Q, radius, lens, *parts)
@@ -183,7 +183,7 @@ def _fit_conics(xy: Array) -> Array:
     return H.mT @ np.moveaxis(Q, 2, 0) @ H / (scale**2)[:, None, None]
 
 
-def _decompose(Q: Array, radius: float) -> tuple[Array, Array]:
+def decompose(Q: Array, radius: float) -> tuple[Array, Array]:
     """Positions and normals (N, 2, 3) of the circles of `radius` whose images are the conics Q (N, 3, 3).
 
     The dual conic of a circle's image is Q^-1 = mu (c c^T - r^2 (I - n n^T)), c its centre.

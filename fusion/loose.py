@@ -34,7 +34,8 @@ NORMAL_RAD = 0.2  # standard deviation under which a normal is told
 class Free:
     """An instant's N markers of nobody: position, velocity and normal (N, 3), covariance (N, 3, 3) of the position.
 
-    Velocity and normal are NaN where they are unknown.
+    Velocity and normal are NaN where they are unknown. `candidates` (N, 2, 3) are the normals of what one camera alone
+    sees, one as probable as the other; NaN of other markers.
     """
 
     markers: Sequence[Marker]
@@ -42,9 +43,17 @@ class Free:
     covariance: Array
     velocity: Array
     normal: Array
+    candidates: Array
+
+    def joined(self, other: "Free") -> "Free":
+        """Both."""
+        names = "position", "covariance", "velocity", "normal", "candidates"
+        columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return Free((*self.markers, *other.markers), **columns)
 
 
-NONE = Free((), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3)))
+NO_ROWS, NO_PAIRS = np.empty((0, 3)), np.empty((0, 2, 3))
+NONE = Free((), NO_ROWS, np.empty((0, 3, 3)), NO_ROWS, NO_ROWS, NO_PAIRS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,4 +183,5 @@ def _told(
         np.where(known[:, None], states.P[:, POSITION, POSITION], spread),
         np.where(known, states.v, np.nan),
         np.where(faces[:, None], states.R[:, :, 2], np.nan),
+        np.full((len(markers), 2, 3), np.nan),
     )

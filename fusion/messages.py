@@ -101,9 +101,10 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
     """Every marker of a fused instant, labelled or not.
 
     Columns, one row a marker: `position` (M, 3) <f8 m, world; `covariance` (M, 9) <f4 m^2, row by row; `normal`
-    (M, 3) <f4 unit vector out of the printed side and `velocity` (M, 3) <f4 m/s, NaN where unknown; `robot` (M,) <i4
-    index into `robots`, -1 for none; `marker` (M,) <i4 index in that robot, -1 for none; `cameras` (M,) <u8 bit k set
-    where `camera_names[k]` saw it.
+    (M, 3) <f4 unit vector out of the printed side and `velocity` (M, 3) <f4 m/s, NaN where unknown; `candidates` (M, 6)
+    <f4 the two normals that one camera alone leaves, each as probable, NaN of other markers; `robot` (M,) <i4 index
+    into `robots`, -1 for none; `marker` (M,) <i4 index in that robot, -1 for none; `cameras` (M,) <u8 bit k set where
+    `camera_names[k]` saw it.
     """
 
     version: int = VERSION
@@ -114,6 +115,7 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
     covariance: bytes
     normal: bytes
     velocity: bytes = b""  # also empty: of a server that does not tell
+    candidates: bytes = b""  # likewise
     robot: bytes
     marker: bytes
     cameras: bytes
@@ -128,8 +130,9 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         for name, size in sizes.items():
             if len(getattr(self, name)) != n * size:
                 raise MessageError(f"column {name} of {len(getattr(self, name))} bytes for {n} markers")
-        if len(self.velocity) not in (0, 12 * n):
-            raise MessageError(f"column velocity of {len(self.velocity)} bytes for {n} markers")
+        for name, size in {"velocity": 12, "candidates": 24}.items():
+            if len(getattr(self, name)) not in (0, size * n):
+                raise MessageError(f"column {name} of {len(getattr(self, name))} bytes for {n} markers")
 
     def positions(self) -> Array:
         """(M, 3) positions, world."""
@@ -143,6 +146,11 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M, 3) m/s, world; NaN where unknown."""
         told = np.frombuffer(self.velocity, "<f4").reshape(-1, 3)
         return told if self.velocity else np.full((len(self), 3), np.nan, np.float32)
+
+    def normal_candidates(self) -> NDArray[np.float32]:
+        """(M, 2, 3) the normals that one camera alone leaves, each as probable; NaN of other markers."""
+        told = np.frombuffer(self.candidates, "<f4").reshape(-1, 2, 3)
+        return told if self.candidates else np.full((len(self), 2, 3), np.nan, np.float32)
 
     def robot_index(self) -> NDArray[np.int32]:
         """(M,) index into `robots`, -1 for none."""

@@ -151,6 +151,15 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
     }
 
 
+def followed_places(tracker: Told) -> tuple[Array, Array]:
+    """(K, 3) and (K, 3, 3) all markers of the robots that are tracked or coasting, seen or not."""
+    alive = np.array([status in ("tracked", "coasting") for status in tracker.status], bool)
+    discs, states = np.flatnonzero(alive[tracker.catalogue.robot]), tracker.states
+    owner, marker = tracker.catalogue.robot[discs], tracker.catalogue.marker.take(discs, 1)
+    places = ExpectedMarkers(states.R, states.P, owner, marker, tracker.catalogue.radius[discs])
+    return states.p[owner] + np.einsum("nij,jn->ni", states.R[owner], marker), places.covariances(0.0)
+
+
 def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
@@ -171,6 +180,9 @@ def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
         velocity=np.concatenate([states.v[owner] + turning, free.velocity]).astype("<f4").tobytes(),
         robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
         marker=np.concatenate([tracker.catalogue.number[discs], none]).astype("<i4").tobytes(),
+        candidates=np.concatenate([np.full((len(discs), 2, 3), np.nan), free.candidates])
+        .astype("<f4")
+        .tobytes(),
         cameras=np.concatenate([_packed(seen.by_marker[discs]), free_bits]).astype("<u8").tobytes(),
     )
 

@@ -18,6 +18,7 @@ MAX_JUDGED = 40  # fits in one instant: what is more stays open until fewer robo
 # Ways of placing one robot's first markers, of three or more of them, and those of which none is part of another: where
 # there are more, as where late frames leave distances uncertain by decimetres, its shape tells nothing.
 MAX_BEGUN, MAX_WAYS, MAX_FITS = 20_000, 5_000, 200
+MAX_COMPARED = 1_000  # fits of all robots: likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +37,6 @@ class Fit:
     def chi2(self) -> float:
         """Of both."""
         return self.shape2 + self.history2
-
-    def rivals(self, other: "Fit") -> bool:
-        """Whether both can't be true."""
-        return self.robot == other.robot or bool(set(self.points) & set(other.points))
 
 
 def identify(
@@ -62,6 +59,8 @@ def identify(
         return []
     scene = _Scene.of(markers)
     fits = [fit for k, robot in robots.items() for fit in _fits(k, robot, scene, faces, history)]
+    if len(fits) > MAX_COMPARED:
+        return []
     fits = _judged(fits, judge)
     fits.sort(key=lambda fit: (-len(fit.points), fit.chi2))
     rivals = _rivals(fits)
@@ -77,8 +76,14 @@ def identify(
 
 
 def _rivals(fits: list[Fit]) -> list[list[int]]:
-    """Of each, the others with which it can't be true."""
-    return [[n for n, other in enumerate(fits) if n != k and fit.rivals(other)] for k, fit in enumerate(fits)]
+    """Of each, the others with which it can't be true: of the same robot, or with a marker of its own."""
+    robot = np.array([fit.robot for fit in fits], np.intp)
+    has = np.zeros((len(fits), 1 + max((max(fit.points) for fit in fits), default=0)), np.float32)
+    for row, fit in zip(has, fits, strict=True):
+        row[list(fit.points)] = 1
+    either = (robot[:, None] == robot) | (has @ has.T > 0)
+    np.fill_diagonal(either, False)
+    return [np.flatnonzero(row).tolist() for row in either]
 
 
 def _alike(fits: list[Fit], rivals: list[list[int]], k: int) -> list[int]:

@@ -21,6 +21,7 @@ from fusion.search import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
 from fusion.shapes import Shapes
 from fusion.shards import Shard, states_of, told_of
 from fusion.sightings import Catalogue, Matches, Observations, Sightings
+from fusion.single_view import SingleViews
 from fusion.state import POSITION, THETA, States
 from fusion.watch import Watch
 
@@ -28,8 +29,7 @@ Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
-# Likewise of its turn: a constellation turned further looks as if its markers were swapped.
-FOLLOWED_RAD = 0.15
+FOLLOWED_RAD = 0.15  # of its turn: a constellation turned further looks as if its markers were swapped
 OTHERS = 1000  # messages of other shards that wait for an instant, at the most
 
 
@@ -39,9 +39,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sigma_floor_px: float = 0.08  # added to the noise that detectors claim
     lost_after_s: float = 0.3  # without an observation
     lateness_ms: float = 150.0  # how long an instant waits for a camera: USB ones may be 100 ms behind
-    tracked_sigma_m: float = (
-        0.05  # a robot whose position is known worse is `coasting`, though a camera sees it
-    )
+    tracked_sigma_m: float = 0.05  # a robot whose position is known worse is `coasting`, though it is seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +83,7 @@ class Tracker:
         self.status: list[State | None] = [None] * n  # None before a robot was ever found
         self.search = Search(self)
         self.loose = Loose(self.optics, self.catalogue.radius)
+        self.single_views = SingleViews(self.optics, self.catalogue.radius)
         self.watch = Watch()
         self.shapes = Shapes(self.names, single)
         self._inspection = Inspection(self)
@@ -104,8 +103,7 @@ class Tracker:
     def anticipate(self, instant: Instant, owed: int) -> None:
         """Do what can be done of an instant of which `owed` frames are still to come.
 
-        Each round costs as much as some frames, so that one waits for more frames than are then left: of eight that
-        come one by one for five, then for two.
+        A round costs as much as some frames: one waits for more frames than are then left, of eight for five, then two.
         """
         association, trusted = self._begin(instant.t_ns).association, self._trusted(instant)
         if len(association.missing(trusted.frames)) > owed > 0:
@@ -141,6 +139,7 @@ class Tracker:
             seen = look(self, sightings, matches)
         self._last = instant, sightings, matches, seen
         loose = self.loose.follow(instant.t_ns, sightings, free)
+        loose = self.single_views.complete(self, instant.t_ns, sightings, matches, loose)
         return report(self, self._trusted(instant), sightings, matches, seen, loose, self._told)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":

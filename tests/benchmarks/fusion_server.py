@@ -71,7 +71,7 @@ def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
     (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
     files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml"]
     server = subprocess.Popen(
-        [sys.executable, "-X", "faulthandler", "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
+        [sys.executable, "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
     )
     try:
         yield
