@@ -95,7 +95,7 @@ def test_noise_does_not_make_another_print_of_it():
     images = frames(disc, 60, 5, blur=1.5, ground=190)
     sizes = [np.mean(found.axes_px) for image in images for found in Detector().detect(image)]
     assert len(sizes) > 50
-    off = np.abs(sizes - np.median(sizes))
+    off = np.abs(np.array(sizes) - np.median(sizes))
     assert off.max() < 5 * np.median(off) / 0.67
 
 
