@@ -167,7 +167,7 @@ ROUNDEL_CLONES void append_edges(const ImageView& image, const EdgeImages& edges
     for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
         if (edge == kCardEdge && !edges.card) continue;
         const CircleImage& e = edges.of[edge];
-        const double wide = std::min(band.wide, clearance.of[edge]);
+        const double wide = std::min(band.apart, clearance.of[edge]);
         const int top = int(std::ceil(Oval(e, wide).top));
         for (int k = 0; k < kWideRows; ++k)
             append_strip(image, e, k ? band.narrow : wide, top + k * step, kWideRows * step, to);
@@ -203,14 +203,14 @@ double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels) {
     const EdgeImages edges(p, band);
-    const Strips narrow(edges, band.narrow), wide(edges, band.wide);
+    const Clearance clearance(edges, p);
+    const bool apart = band.apart > 0 && clearance.of[kOuterEdge] >= band.narrow;
+    const Strips narrow(edges, band.narrow), wide(edges, apart ? band.apart : band.wide);
     const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
     const int rows = int(wide.bottom() - wide.top());
     const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
-    const Clearance clearance(edges, p);
     pixels.clear();
-    if (band.apart && clearance.of[kOuterEdge] >= band.narrow)
-        return append_edges(image, edges, clearance, band, step, pixels);
+    if (apart) return append_edges(image, edges, clearance, band, step, pixels);
     append_rows(image, narrow, wide, step, pixels);
     pixels.end_part(kAnyEdge);
 }

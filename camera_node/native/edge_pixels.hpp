@@ -38,15 +38,15 @@ struct EdgePixels : PixelColumns<6144> {
 /// third one those within `wide`, which tell of the levels.
 struct Band {
     double narrow, wide;
-    bool card;           // whether the card's edge is one of them
-    bool apart = false;  // whether pixels that see one edge only may be told apart
+    bool card;         // whether the card's edge is one of them
+    double apart = 0;  // `wide` where pixels that see one edge only are told apart; 0 if none may be
 };
 
 /// Fills `pixels` by the band along the edges that `p` says, in every n-th row: n is the least that leaves
 /// about `limit` pixels or less, or ten rows.
 ///
 /// Where edges are so far from each other that no pixel within `narrow` sees two of them, each has a part of
-/// its own, and `wide` ends before the next one.
+/// its own, and the wide one ends before the next one.
 void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
                    EdgePixels& pixels);
 

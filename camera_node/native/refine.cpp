@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <tuple>
 
 #include "cholesky.hpp"
 #include "edge_pixels.hpp"
@@ -18,6 +19,8 @@ namespace {
 constexpr double kNarrow = 1.25,
                  kNarrowBlurs = 1.5;             // pixels on either side of an edge, at the least; and blurs
 constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
+constexpr double kApartBlurs =
+    4;  // likewise, away from other edges: flat pixels tell the levels, these the size
 constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
@@ -57,7 +60,7 @@ class Fitter {
     bool approach() {
         // Perspective moves the inner edge and the card's from where the start has them.
         const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
-        if (!select({wide, wide, true, !hidden_.any()}, kCoarsePixels)) return false;
+        if (!select({wide, wide, true, wide}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card(pixels_, p);
         return iterate(2);
     }
@@ -65,7 +68,7 @@ class Fitter {
     bool finish() {
         const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
         const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
-                        card, !hidden_.any()};
+                        card, std::max(kWide, kApartBlurs * p[kBlur])};
         return select(band, EdgePixels::kMax) && iterate(1);
     }
 
@@ -74,9 +77,12 @@ class Fitter {
     Parameters p;
 
   private:
+    bool try_print(double ratio);
+    Parameters covariance_with_ratio() const;
     std::array<Vector<kPoseCount>, kPoseCount> pose_covariance() const;
 
-    bool select(const Band& band, int limit) {
+    bool select(Band band, int limit) {
+        if (hidden_.any()) band.apart = 0;
         select_pixels(image_, p, band, limit, pixels_);
         if (hidden_.any()) leave_out(hidden_, start_, pixels_);
         return pixels_.used >= 2 * kCount;
@@ -92,15 +98,19 @@ class Fitter {
             if (resumed_ && (k == kResumed || seen > kLost * (p[kBright] - p[kDark]))) return false;
             const double used = ahead > 1 ? std::min(scale_, kStrict * seen)
                                           : std::clamp(scale_, kStrict * seen, kSlack * seen);
-            equations_ = model_.accumulate(used);
-            add_prior(used);
-            factor_.emplace(equations_.H);
-            if (!factor_->positive()) return false;
+            if (!factorise(used)) return false;
             const double left = square(advance(used)) / p[kBlur];
             if (!is_sane()) return false;
             if (ahead > 1 ? is_near(left) : is_there(left) && scale_ > 0.7 * used) return true;
         }
         return true;
+    }
+
+    bool factorise(double scale) {
+        equations_ = model_.accumulate(scale);
+        add_prior(scale);
+        factor_.emplace(equations_.H);
+        return factor_->positive();
     }
 
     bool is_there(double left) const { return left < kConverged * noise_ / std::sqrt(edge_information()); }
@@ -180,16 +190,37 @@ class Fitter {
     bool resumed_;
 };
 
-/// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by.
-void Fitter::learn_print(double ratio) {
+Parameters Fitter::covariance_with_ratio() const {
     Parameters unit{};
     unit[kRatio] = square(noise_);
-    const Parameters with = factor_->solve(unit);  // covariance of all with the ratio
+    return factor_->solve(unit);
+}
+
+/// The Gaussian posterior of the fit, given that the ratio is `ratio` to within what prints differ by;
+/// whether that is likely.
+bool Fitter::try_print(double ratio) {
+    const Parameters with = covariance_with_ratio();
     const double off = ratio - p[kRatio], variance = with[kRatio] + square(kPrint);
-    if (square(off) > square(kOtherPrint) * variance) return;
+    if (square(off) > square(kOtherPrint) * variance) return false;
     for (int i = 0; i < kCount; ++i)
         if (i != kRatio) p[i] += with[i] * off / variance;  // what was measured stays to be judged
     for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
+    return true;
+}
+
+/// Where the print seems to be another one, by a step from where the fit would be if it were not: of a small
+/// and blurred roundel the ratio's variance there and at the fit differ (a score test after Wald's).
+void Fitter::learn_print(double ratio) {
+    if (try_print(ratio)) return;
+    const auto found = std::tuple(p, factor_, left_, noise_, scale_);
+    const Parameters with = covariance_with_ratio();
+    const double off = ratio - p[kRatio];
+    for (int i = 0; i < kCount; ++i) p[i] += with[i] * off / with[kRatio];
+    if (is_sane()) {
+        model_.evaluate(pixels_, p);
+        if (factorise(scale_) && (advance(scale_), is_sane()) && try_print(ratio)) return;
+    }
+    std::tie(p, factor_, left_, noise_, scale_) = found;
 }
 
 std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {

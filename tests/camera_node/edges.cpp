@@ -39,7 +39,7 @@ int main() {
     for (const double diameter : {20, 50, 100, 180})
         for (const double slant : {1.0, 0.7}) {
             const Parameters p = seen(diameter, slant);
-            select_pixels({grey.data(), kSide, kSide, kSide}, p, {1.25, 2.5, true, true}, EdgePixels::kMax,
+            select_pixels({grey.data(), kSide, kSide, kSide}, p, {1.25, 2.5, true, 2.5}, EdgePixels::kMax,
                           pixels);
             const int parts = pixels.part_count;
             const NormalEquations apart = products(pixels, p);

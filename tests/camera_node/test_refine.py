@@ -85,6 +85,20 @@ def test_a_known_print_tells_the_size_of_small_roundels():
     assert np.std(known) < 0.8 * np.std(unknown)
 
 
+def test_noise_does_not_make_another_print_of_it():
+    """Blurred by 1.5 px and with noise of 5, the ratio at 20 px is known to 0.02, and its errors are skewed.
+
+    Sizes without the print's prior are eight sigmas off; of 60 Gaussian ones none is beyond five, and the median
+    distance from the middle is 0.67 sigma.
+    """
+    disc = Disc((80.3, 60.6), 20, 0.5)
+    images = frames(disc, 60, 5, blur=1.5, ground=190)
+    sizes = [np.mean(found.axes_px) for image in images for found in Detector().detect(image)]
+    assert len(sizes) > 50
+    off = np.abs(np.array(sizes) - np.median(sizes))
+    assert off.max() < 5 * np.median(off) / 0.67
+
+
 def test_blur_does_not_make_another_print_of_it():
     """The rays that a fit starts from see a blurred hole smaller, near the other configured ratio; the fit does not."""
     disc = Disc((80.3, 60.6), 20, 0.5)
