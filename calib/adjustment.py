@@ -8,6 +8,7 @@ scale that the residuals themselves give, then plain least squares without what 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ ROUGHLY, NOTHING = 5e-3, 1e-4  # of the cost: gained by a step that is the last
 TINY = 1e-4  # of half of chi-square
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Adjusted:
     """The best state.
 
@@ -58,6 +59,7 @@ class Adjusted:
     iterations: int
     dependence: float = 1.0
 
+    @cached_property
     def joint_covariance(self) -> Array:
         """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
         and the time what their clocks say on average (inner constraints; Triggs et al., Bundle Adjustment, section
@@ -107,7 +109,7 @@ class Adjusted:
         full = np.zeros((len(self.state.cameras), len(parameters)) * 2)
         held = [k for k, p in enumerate(parameters) if p in self.problem.free]
         at = [self.problem.free.index(parameters[k]) for k in held]
-        joint = self.joint_covariance()
+        joint = self.joint_covariance
         full[np.ix_(range(len(full)), held, range(len(full)), held)] = joint[:, at][:, :, :, at]
         return full
 

@@ -44,9 +44,9 @@ class Misfit:
         )
 
 
-def find_misfits(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> list[Misfit]:
+def find_misfit(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> Misfit | None:
     """The camera whose lens is least what was given, beyond what a wave adjusts: one that is wrong makes others look
-    wrong, so the worst is named first, and alone.
+    wrong, so the worst is named alone. None where all are.
 
     Args:
         names: of the C cameras.
@@ -58,14 +58,14 @@ def find_misfits(names: Sequence[str], adjusted: Adjusted, seen: Observations) -
     squares = np.array([o @ np.linalg.solve(S, o) for o, S in zip(off, covariance, strict=True)])
     k = int(squares.argmax())
     if chdtrc(len(SHAPE), squares[k]) * len(names) > WRONG:
-        return []
+        return None
     sigma = np.sqrt(np.diag(covariance[k]))
     worst = int(np.abs(off[k] / sigma).argmax())
     lens = adjusted.problem.lenses[k]
     told = shape_of(lens)[worst]
     scale = told if worst == 0 else 1.0
     found = told * np.exp(off[k, 0]) if worst == 0 else told + off[k, worst]
-    return [Misfit(names[k], NAMES[lens.model][worst], told, float(found), float(scale * sigma[worst]))]
+    return Misfit(names[k], NAMES[lens.model][worst], told, float(found), float(scale * sigma[worst]))
 
 
 def _step(adjusted: Adjusted, seen: Observations) -> tuple[Array, Array]:

@@ -212,7 +212,7 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
     """
     wave = waved_points(result)
     rows = {row.name: row for row in result.report.cameras}
-    noise, joint = result.adjusted.by_noise(), result.adjusted.joint_covariance()
+    noise, joint = result.adjusted.by_noise(), result.adjusted.joint_covariance
     cameras = [
         _assess_camera(result, k, rows[name], wave, noise, joint) for k, name in enumerate(result.names)
     ]

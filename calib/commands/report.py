@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.lens_change import describe, find_changes
-from calib.lens_shape import find_misfits
+from calib.lens_shape import find_misfit
 from calib.outcome import Calibration
 from calib.report import WandReport
 from calib.trust import Trust
@@ -37,7 +37,8 @@ def print_report(result: Calibration, trust: Trust, console: Console) -> None:
     foretold = trust.expected.lines() if trust.expected else []
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
     lenses = describe(find_changes(result.names, result.adjusted))
-    lenses += [m.sentence() for m in find_misfits(result.names, result.adjusted, result.observations)]
+    misfit = find_misfit(result.names, result.adjusted, result.observations)
+    lenses += [misfit.sentence()] if misfit else []
     for line in [
         *_remarks(report),
         *_drifts(result),

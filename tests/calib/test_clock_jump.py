@@ -25,7 +25,7 @@ def waved(
     return calibrate(rig, wave.wand, messages)
 
 
-@pytest.mark.parametrize(("seed", "camera", "ms"), [(3, "cam01", -20.0), (5, "cam04", 20.0)])
+@pytest.mark.parametrize(("seed", "camera", "ms"), [(3, "cam01", -20.0)])
 def test_a_clock_that_jumps_is_named(seed: int, camera: str, ms: float):
     """By how much, to four standard deviations and a tenth of a millisecond, which drifts by 50 ppm leave in some
     seconds; when, to half a second, in which the camera may have seen nothing."""
