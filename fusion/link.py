@@ -47,7 +47,8 @@ class Link:
     ) -> None:
         self.session = session
         self._count, self._closing = count, closing
-        self._tasks: queue.Queue[Task] = queue.Queue(QUEUE)
+        self._tasks: queue.Queue[tuple[int, Task]] = queue.Queue(QUEUE)
+        self.reached_ns = 0  # when the last task came that was done
         self._publishers: dict[str, zenoh.Publisher] = {}
 
     def subscribe(self, key: str, take: Callable[[bytes, str, int], None]) -> None:
@@ -73,14 +74,15 @@ class Link:
     def put(self, task: Task) -> None:
         """Have the server's thread do something; callable from any thread."""
         try:
-            self._tasks.put_nowait(task)
+            self._tasks.put_nowait((time.time_ns(), task))
         except queue.Full:
             self._count("queue full")
 
     def work(self, timeout_s: float) -> bool:
         """Do the next task, waiting for one no longer than `timeout_s`; whether there is another."""
         with contextlib.suppress(queue.Empty):
-            self._tasks.get(timeout=timeout_s)()
+            self.reached_ns, task = self._tasks.get(timeout=timeout_s)
+            task()
         return not self._tasks.empty()
 
     def publish(self, key: str, message: msgspec.Struct) -> None:

@@ -46,6 +46,7 @@ from fusion.tracker import Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # how finely the end of a wait is met
+BEHIND_NS = 500_000_000  # by which the server may be behind before it drops what it can't do
 BACK_NS = 1_000_000_000  # by which this machine's clock may be set back without anything being begun anew
 
 
@@ -101,7 +102,9 @@ class Server:
             while not self._stopped.is_set():
                 more = self.link.work(TICK_S)
                 now_ns = self._tell_time()
-                for instant in self._instants.take(now_ns):
+                # What waits in the queue is not late, unless more is asked than this machine can do.
+                heard_ns = max(self.link.reached_ns, now_ns - BEHIND_NS) if more else now_ns
+                for instant in self._instants.take(heard_ns):
                     self._fuse(instant)
                 if not more:
                     self._anticipate()

@@ -140,6 +140,36 @@ def test_a_clock_that_is_set_back_begins_everything_anew(tmp_path, caplog):
     assert "clock was set back" in caplog.text
 
 
+def in_time(server: Server, frames: int) -> None:
+    """Frames of all cameras, each at hand when it is taken, thirty a second."""
+    pause = threading.Event()
+    for k in range(frames):
+        t_ns, rest = time.time_ns(), ARENA.messages(1)
+        send(server, [msgspec.structs.replace(m, seq=k, t_ns=t_ns, sent_ns=t_ns) for m in rest])
+        pause.wait(1 / 30)
+
+
+@pytest.mark.parametrize(("behind_ns", "drops"), [(60 * 10**9, False), (0, True)])
+def test_what_waits_for_the_server_is_late_only_if_it_is_far_behind(tmp_path, monkeypatch, behind_ns, drops):
+    """Frames came in time, and the server was busy meanwhile with something else."""
+    monkeypatch.setattr("fusion.server.BEHIND_NS", behind_ns)
+    settings = msgspec.structs.replace(config(tmp_path), limits=Limits(lateness_ms=50))
+    with Server(settings) as server, Client.connect(*settings.listen, arena="test") as client:
+        until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
+        poses = []
+        client.robot("a").on_pose(poses.append)
+        in_time(server, 30)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        try:
+            until(lambda: client.status(DEADLINE_S).next().instants_per_s > 0)
+            assert (sum(server._instants.late.values()) > 0) == drops
+            assert drops or any(pose.state == "tracked" for pose in poses)
+        finally:
+            server.stop()
+            thread.join(DEADLINE_S)
+
+
 def test_a_calibration_that_arrives_is_applied_and_a_bad_one_is_not(tmp_path):
     with serving(config(tmp_path, with_rig=False)) as (server, client):
         assert client.rig(DEADLINE_S) is None
