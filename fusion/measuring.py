@@ -106,8 +106,7 @@ def robot_of(
 
 def _unlabelled(instant: Markers) -> Array:
     """(K, 6) positions and normals of markers that belong to no robot, and that more than one camera sees."""
-    free = (instant.robot_index() < 0) & np.isnan(instant.normal_candidates()).all((1, 2))
-    rows = np.hstack([instant.positions(), instant.normals().astype(float)])[free]
+    rows = np.hstack([instant.positions(), instant.normals().astype(float)])[instant.free()]
     return rows[np.isfinite(rows[:, :3]).all(1)]
 
 

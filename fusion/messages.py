@@ -156,6 +156,11 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M,) index into `robots`, -1 for none."""
         return np.frombuffer(self.robot, "<i4")
 
+    def free(self) -> NDArray[np.intp]:
+        """(F,) rows of the markers that no robot has and that are placed by more than one camera."""
+        alone = np.isfinite(self.normal_candidates()).any((1, 2))
+        return np.flatnonzero((self.robot_index() < 0) & ~alone)
+
     def camera_bits(self) -> NDArray[np.uint64]:
         """(M,) bit k set where `camera_names[k]` saw the marker."""
         return np.frombuffer(self.cameras, "<u8")

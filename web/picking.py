@@ -28,7 +28,7 @@ class Picking:
     def __init__(self, server: viser.ViserServer, subscription: Subscription) -> None:
         self.picked: list[Array] = []
         self._subscription = subscription
-        self._free = np.empty((0, 3))  # positions of markers that no robot has, now
+        self._free = np.empty((0, 3))  # positions of markers that no robot has and several cameras see, now
         self._picking = False
         with server.gui.add_folder("New robot"):
             self._button = server.gui.add_button(PICK)
@@ -53,7 +53,7 @@ class Picking:
         """Know the markers that there are now, and show those that are picked."""
         seen = latest.markers
         if seen is not None and latest.age(seen) < 1.0:
-            self._free = seen.message.positions()[seen.message.robot_index() < 0]
+            self._free = seen.message.positions()[seen.message.free()]
         self._cloud.visible = bool(self.picked)
         if self.picked:
             self._cloud.points = np.array(self.picked, np.float32)

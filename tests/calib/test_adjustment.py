@@ -184,14 +184,11 @@ def test_drift_is_found_and_cameras_in_step_stay_in_step():
     truth = np.array([recorded.drift_ppm[name] for name in result.names])
     assert not result.time_sigma_ms.any()
     assert (np.abs(result.drift_ppm - truth + truth.mean()) < 4 * result.drift_sigma_ppm).all()
-    for seed in range(3):
-        wave = Wave(
-            cameras=4, seconds=15, rate_hz=30, offset_ms=0, drift_ppm=0, free_running=False, seed=seed
-        )
-        recorded = record_wave(wave)
-        result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
-        assert not result.time_sigma_ms.any()
-        assert not result.drift_sigma_ppm.any()
+    wave = Wave(cameras=4, seconds=15, rate_hz=30, offset_ms=0, drift_ppm=0, free_running=False)
+    recorded = record_wave(wave)
+    result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
+    assert not result.time_sigma_ms.any()
+    assert not result.drift_sigma_ppm.any()
 
 
 def test_time_offsets_of_a_short_wave_are_as_sure_as_they_say():
