@@ -137,4 +137,8 @@ def describe(calibration: dict[str, Any]) -> str:
         if expected
         else ""
     )
-    return f"{calibration.get('because', 'the cameras are placed')}{errors}"
+    jumps = "".join(
+        f"; the clock of {name} jumped by {jump['ms']:.0f} ms: see that nothing sets it, and wave again"
+        for name, jump in calibration.get("clock_jump", {}).items()
+    )
+    return f"{calibration.get('because', 'the cameras are placed')}{errors}{jumps}"

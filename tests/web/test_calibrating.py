@@ -18,7 +18,7 @@ from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 from tests.web.conftest import Played, wait_for
 from tests.web.test_view import browsing, drawing
-from web.calibrating import Calibrating, Files, place_cameras
+from web.calibrating import Calibrating, Files, describe, place_cameras
 from web.errors import WebError
 from web.subscription import Subscription
 from web.view import View
@@ -82,3 +82,12 @@ def test_files_that_are_not_there_are_said_before_a_page_is_shown(files: Files):
     files.wand.unlink()
     with pytest.raises(ConfigError, match=r"wand\.yaml does not exist"):
         files.check()
+
+
+def test_a_clock_that_jumped_is_told():
+    """As `calib wand` writes it; the rest is as it is for any rig."""
+    told = describe(
+        {"because": "grade D", "clock_jump": {"north": {"ms": -19.93, "sigma": 0.1, "at_s": 19.8}}}
+    )
+    assert told.startswith("grade D; the clock of north jumped by -20 ms")
+    assert describe({}) == "the cameras are placed"
