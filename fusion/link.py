@@ -55,7 +55,8 @@ class Link:
         """Have the server's thread take what comes: its bytes, its key, and when it came (ns)."""
 
         def enqueue(sample: zenoh.Sample) -> None:  # whatever else it did would stall the link
-            self.put(partial(take, sample.payload.to_bytes(), str(sample.key_expr), time.time_ns()))
+            data, key = sample.payload.to_bytes(), str(sample.key_expr)
+            self.put(lambda: take(data, key, self.reached_ns))
 
         self._closing.callback(self.session.declare_subscriber(key, enqueue).undeclare)
 

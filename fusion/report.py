@@ -151,23 +151,30 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
     }
 
 
+def _stand(tracker: Told, discs: Index) -> tuple[Array, Array]:
+    """Of markers of the catalogue: the arms (K, 3) from their robots' origins and their places' covariances (K, 3, 3),
+    both in the world."""
+    owner, marker = tracker.catalogue.robot[discs], tracker.catalogue.marker.take(discs, 1)
+    places = ExpectedMarkers(
+        tracker.states.R, tracker.states.P, owner, marker, tracker.catalogue.radius[discs]
+    )
+    return np.einsum("nij,jn->ni", tracker.states.R[owner], marker), places.covariances(0.0)
+
+
 def followed_places(tracker: Told) -> tuple[Array, Array]:
     """(K, 3) and (K, 3, 3) all markers of the robots that are tracked or coasting, seen or not."""
     alive = np.array([status in ("tracked", "coasting") for status in tracker.status], bool)
-    discs, states = np.flatnonzero(alive[tracker.catalogue.robot]), tracker.states
-    owner, marker = tracker.catalogue.robot[discs], tracker.catalogue.marker.take(discs, 1)
-    places = ExpectedMarkers(states.R, states.P, owner, marker, tracker.catalogue.radius[discs])
-    return states.p[owner] + np.einsum("nij,jn->ni", states.R[owner], marker), places.covariances(0.0)
+    discs = np.flatnonzero(alive[tracker.catalogue.robot])
+    arm, covariance = _stand(tracker, discs)
+    return tracker.states.p[tracker.catalogue.robot[discs]] + arm, covariance
 
 
 def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
-    owner, marker = tracker.catalogue.robot[discs], tracker.catalogue.marker.take(discs, 1)
     states, none = tracker.states, np.full(len(free.markers), -1)
-    R, omega = states.R[owner], states.omega[owner]
-    places = ExpectedMarkers(states.R, states.P, owner, marker, tracker.catalogue.radius[discs])
-    arm = np.einsum("nij,jn->ni", R, marker)
+    owner = tracker.catalogue.robot[discs]
+    omega, (arm, covariance) = states.omega[owner], _stand(tracker, discs)
     turning = omega[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - omega[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
     free_bits = np.array([_bits(m.cameras) for m in free.markers], np.uint64)
     return Markers(
@@ -175,8 +182,8 @@ def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
         robots=tracker.names,
         camera_names=tracker.optics.names,
         position=np.concatenate([states.p[owner] + arm, free.position]).astype("<f8").tobytes(),
-        covariance=np.concatenate([places.covariances(0.0), free.covariance]).astype("<f4").tobytes(),
-        normal=np.concatenate([R[:, :, 2], free.normal]).astype("<f4").tobytes(),
+        covariance=np.concatenate([covariance, free.covariance]).astype("<f4").tobytes(),
+        normal=np.concatenate([states.R[owner][:, :, 2], free.normal]).astype("<f4").tobytes(),
         velocity=np.concatenate([states.v[owner] + turning, free.velocity]).astype("<f4").tobytes(),
         robot=np.concatenate([owner, none]).astype("<i4").tobytes(),
         marker=np.concatenate([tracker.catalogue.number[discs], none]).astype("<i4").tobytes(),

@@ -39,10 +39,11 @@ def print_report(result: Calibration, trust: Trust, console: Console) -> None:
     lenses = describe(find_changes(result.names, result.adjusted))
     misfit = find_misfit(result.names, result.adjusted, result.observations)
     lenses += [misfit.sentence()] if misfit else []
+    jump = [f"warning: camera {result.jump.camera}: {result.jump.words()}"] if result.jump else []
     for line in [
         *_remarks(report),
         *_drifts(result),
-        *([f"warning: camera {jump.camera}: {jump.words()}"] if (jump := result.jump) else []),
+        *jump,
         *lenses,
         *foretold,
         *wave,

@@ -19,8 +19,8 @@ namespace {
 constexpr double kNarrow = 1.25,
                  kNarrowBlurs = 1.5;             // pixels on either side of an edge, at the least; and blurs
 constexpr double kWide = 2.5, kWideBlurs = 2.5;  // likewise
-constexpr double kApartBlurs =
-    4;  // likewise, away from other edges: flat pixels tell the levels, these the size
+// Likewise, away from other edges: flat pixels tell the levels, these the size.
+constexpr double kApartBlurs = 4;
 constexpr double kCardTells = 0.2;  // of the contrast, between card and ground; less is not worth its pixels
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;

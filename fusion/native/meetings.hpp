@@ -7,8 +7,8 @@
 /// Where viewing rays of different cameras meet, by epipolar geometry and by the range that sizes allow.
 namespace roundel::fusion {
 
-constexpr double kMinParallax =
-    0.00273905;  // squared sine of 3 degrees: rays nearer to parallel tell no range
+/// Squared sine of 3 degrees: rays nearer to parallel tell no range.
+constexpr double kMinParallax = 0.00273905;
 
 /// A frame's camera, where it stood, and how far the fastest marker moves from the instant until the frame.
 struct Viewpoint {

@@ -2,7 +2,6 @@
 """Every machine sees the same: the module with its vectors, and a build without them, agree to the last bit."""
 
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,26 +9,10 @@ import pytest
 
 from camera_node import _core
 from tests.camera_node.rendering import Disc, expose, render
+from tests.native import build
 
 NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
-FLAGS = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
 CPU = Path("/proc/cpuinfo")
-
-
-def build(folder: Path) -> Path:
-    """The core without clones, and `scalar.cpp`."""
-    sources = [path for path in NATIVE.glob("*.cpp") if path.name != "bindings.cpp"]
-    sources.append(Path(__file__).with_name("scalar.cpp"))
-
-    def compile_one(source: Path) -> Path:
-        made = folder / f"{source.stem}.o"
-        subprocess.run(["c++", *FLAGS, "-c", source, "-o", made], check=True, timeout=300)
-        return made
-
-    with ThreadPoolExecutor(2) as pool:
-        objects = list(pool.map(compile_one, sources))
-    subprocess.run(["c++", *objects, "-o", folder / "scalar"], check=True, timeout=300)
-    return folder / "scalar"
 
 
 def chooses_when_loaded(binary: Path | str) -> bool:
@@ -55,7 +38,8 @@ def frames() -> list[np.ndarray]:
     not CPU.exists() or " avx2 " not in CPU.read_text(), reason="this machine has one variant only"
 )
 def test_vectors_and_none_agree_to_the_last_bit(tmp_path: Path):
-    scalar, images = build(tmp_path), frames()
+    scalar = build(NATIVE, Path(__file__).with_name("scalar.cpp"), tmp_path)
+    images = frames()
     assert chooses_when_loaded(_core.__file__)
     assert not chooses_when_loaded(scalar)
     fed = b"".join(b"%d %d\n" % image.shape[::-1] + image.tobytes() for image in images)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera_node.detector import Detector
-from tests.sanitizers import fuzz
+from tests.native import fuzz
 
 NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.native import build
+
 NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
-SOURCES = [NATIVE / f"{name}.cpp" for name in ("edge_pixels", "normal_equations", "ellipse")]
+SOURCES = "edge_pixels", "normal_equations", "ellipse"
 
 
 def test_edges_apart_and_together_give_the_same_normal_equations(tmp_path: Path):
@@ -18,9 +20,8 @@ def test_edges_apart_and_together_give_the_same_normal_equations(tmp_path: Path)
     column that is even across the edge and one that is odd.
     """
     driver = Path(__file__).with_name("edges.cpp")
-    flags = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{NATIVE}"]
-    subprocess.run(["c++", *flags, driver, *SOURCES, "-o", tmp_path / "edges"], check=True, timeout=300)
-    done = subprocess.run([tmp_path / "edges"], capture_output=True, check=True, timeout=60)
+    edges = build(NATIVE, driver, tmp_path, SOURCES)
+    done = subprocess.run([edges], capture_output=True, check=True, timeout=60)
     diameter, _, parts, off = np.loadtxt(done.stdout.decode().splitlines()).T
     assert np.all(parts[diameter == 20] == 1)
     assert np.all(off[diameter == 20] == 0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusion import _core
-from tests.sanitizers import fuzz
+from tests.native import fuzz
 
 NATIVE = Path(__file__).resolve().parents[2] / "fusion" / "native"
 

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A native core with a driver of ours: built without Python and without vectors, and fuzzed under sanitizers."""
+
+import subprocess
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+FLAGS = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off"]
+
+
+def build(
+    native: Path, driver: Path, folder: Path, only: Sequence[str] = ("*",), flags: Sequence[str] = ()
+) -> Path:
+    """The program of a driver and the sources of `native`, all or those called `only`; bindings are left out."""
+
+    def compile_one(source: Path) -> Path:
+        made = folder / f"{source.stem}.o"
+        command = ["c++", *FLAGS, f"-I{native}", *flags, "-c", source, "-o", made]
+        subprocess.run(command, check=True, timeout=300)
+        return made
+
+    sources = [path for name in only for path in native.glob(f"{name}.cpp")]
+    sources = [path for path in sources if not path.name.startswith("bind")]
+    with ThreadPoolExecutor(2) as pool:
+        objects = list(pool.map(compile_one, [*sources, driver]))
+    program = folder / driver.stem
+    subprocess.run(["c++", *flags, *objects, "-o", program], check=True, timeout=300)
+    return program
+
+
+def fuzz(
+    native: Path, driver: Path, rounds: int, folder: Path, checks: Iterable[str] = ("address", "undefined")
+) -> tuple[int, str]:
+    """Run so many rounds of a driver that tries to break a core; exit code and stderr."""
+    sanitizers = ["-g", f"-fsanitize={','.join(checks)}", "-fno-sanitize-recover=all"]
+    program = build(native, driver, folder, flags=sanitizers)
+    done = subprocess.run([program, str(rounds)], capture_output=True, text=True, timeout=300)
+    return done.returncode, done.stderr
