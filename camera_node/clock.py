@@ -1,90 +1,52 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Capture time in the server's time: round trips over Zenoh, as NTP does over UDP."""
+"""Capture time in the server's time: round trips over Zenoh, as NTP does over UDP, or the clock that both share."""
 
 import logging
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import zenoh
 
 from camera_node.messages import ClockReply, Keys, MessageError, decode
+from camera_node.offset import READING_NS, OffsetEstimator, RoundTrip
 
 log = logging.getLogger("camera_node.clock")
 
-WINDOW_NS = 60_000_000_000  # how long a round trip is remembered
-DRIFT = 100e-6  # two clocks of 50 ppm each, running apart
-SLEW = 500e-6  # how fast an estimate may move; NTP's own limit
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 PERIOD_S = 1.0
-BURST = 3  # round trips a period; the quickest counts
+FIRST_PERIOD_S = 0.125  # while the server does not answer; then it doubles until it is PERIOD_S
+BURST = 3  # round trips a period
 TIMEOUT_S = 0.5
+READINGS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class RoundTrip:
-    """One question to the server: this machine's times around the server's."""
-
-    sent_ns: int
-    server_ns: int
-    received_ns: int
-
-    @property
-    def offset_ns(self) -> float:
-        """The server's clock less this machine's, were both ways equally long."""
-        return (2 * self.server_ns - self.sent_ns - self.received_ns) / 2
-
-    def error_ns(self, now_ns: int) -> float:
-        """How far the truth may be from `offset_ns`: all delay was on one way, and the clocks drifted since."""
-        return (self.received_ns - self.sent_ns) / 2 + DRIFT * max(0, now_ns - self.sent_ns)
+@cache
+def clock_id() -> str:
+    """The name of this machine's clock, which programs in containers share; empty where it has none."""
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
 
 
-class OffsetEstimator:
-    """The server's clock less this machine's, with a bound that holds while clocks drift less than `DRIFT`.
+def unix_ahead_ns() -> int:
+    """Unix time less the monotonic clock.
 
-    The round trip with the least error bound in the window decides (Mills, RFC 5905, section 10: the minimum-delay
-    sample). The estimate slews there. Only when a new round trip contradicts it, because somebody set a clock, is
-    the past forgotten and the estimate jumps.
+    Each reading stands between two of the monotonic clock, and the quickest of a few counts: a thread that has to wait
+    between the two clocks would be wrong by as long.
     """
-
-    def __init__(self) -> None:
-        self._trips: deque[RoundTrip] = deque()
-        self._start: tuple[int, float] | None = None  # where the slewing began: this machine's time, offset
-
-    def add(self, trip: RoundTrip) -> None:
-        """Learn from a round trip; one that goes backwards in time is ignored."""
-        if trip.received_ns < trip.sent_ns:
-            return
-        now = trip.received_ns
-        start = self.at(now)
-        if self._trips and self._contradicts(trip, now):
-            self._trips.clear()
-            start = None
-        while self._trips and not 0 <= now - self._trips[0].received_ns <= WINDOW_NS:
-            self._trips.popleft()
-        self._trips.append(trip)
-        self._start = (now, start[0] if start else trip.offset_ns)
-
-    def at(self, now_ns: int) -> tuple[float, float] | None:
-        """The offset and its error bound, nanoseconds, at this machine's time; None before the first round trip."""
-        if self._start is None:
-            return None
-        best = self._best(now_ns)
-        begun, offset = self._start
-        reach = SLEW * max(0, now_ns - begun)
-        offset += min(max(best.offset_ns - offset, -reach), reach)
-        return offset, best.error_ns(now_ns) + abs(best.offset_ns - offset)
-
-    def _best(self, now_ns: int) -> RoundTrip:
-        return min(self._trips, key=lambda trip: trip.error_ns(now_ns))
-
-    def _contradicts(self, trip: RoundTrip, now_ns: int) -> bool:
-        best = self._best(now_ns)
-        return abs(best.offset_ns - trip.offset_ns) > best.error_ns(now_ns) + trip.error_ns(now_ns)
+    readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(READINGS)]
+    before, unix, after = min(readings, key=lambda reading: reading[2] - reading[0])
+    return unix - (before + after) // 2
 
 
 class Clock:
-    """Keeps an estimate of the server's clock fresh, in a thread of its own, from `start` to `close`."""
+    """Keeps an estimate of the server's clock fresh, in a thread of its own, from `start` to `close`.
+
+    The server's clock is compared with the monotonic one, so that setting this machine's clock changes no stamp.
+    """
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
         self._querier = session.declare_querier(
@@ -95,6 +57,7 @@ class Clock:
             express=True,
         )
         self._estimator = OffsetEstimator()
+        self._shared = False  # whether the server's clock is this machine's
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
@@ -107,35 +70,59 @@ class Clock:
         self._closed.set()
         self._thread.join(2 * BURST * TIMEOUT_S)
 
-    def estimate(self) -> tuple[float, float] | None:
-        """The server's clock less this machine's, and its error bound, nanoseconds; None until the server answered."""
+    def estimate(self, t_ns: int | None = None) -> tuple[int, float] | None:
+        """The server's clock less this machine's, and its error bound, nanoseconds; None until the server answered.
+
+        Args:
+            t_ns: when, in this machine's Unix time; now unless given.
+        """
+        ahead_ns = unix_ahead_ns()
+        monotonic_ns = time.monotonic_ns() if t_ns is None else t_ns - ahead_ns
         with self._lock:
-            return self._estimator.at(time.time_ns())
+            if self._shared:
+                return 0, 0.0
+            told = self._estimator.at(monotonic_ns)
+        return told and (told[0] - ahead_ns, told[1])
 
     def to_server(self, t_ns: int) -> int:
         """A time of this machine's in the server's; as it is until the server answered."""
-        estimate = self.estimate()
-        return t_ns + round(estimate[0]) if estimate else t_ns
+        estimate = self.estimate(t_ns)
+        return t_ns + estimate[0] if estimate else t_ns
 
     def _run(self) -> None:
-        while not self._closed.wait(PERIOD_S if self._refresh() else PERIOD_S / 4):
-            pass
+        pause_s = FIRST_PERIOD_S
+        while not self._closed.is_set():
+            pause_s = min(2 * pause_s, PERIOD_S) if self._refresh() else FIRST_PERIOD_S
+            self._closed.wait(pause_s)
 
     def _refresh(self) -> bool:
-        """Ask the server a few times; whether it answered."""
-        trips = [trip for _ in range(BURST) if not self._closed.is_set() and (trip := self._ask())]
-        with self._lock:
-            for trip in trips:
-                self._estimator.add(trip)
+        """Ask the server a few times, or once where it has this machine's clock; whether it answered."""
+        trips, shared = [], False
+        while len(trips) < BURST and not shared and not self._closed.is_set() and (told := self._ask()):
+            trips.append(told[0])
+            shared = told[1]
+        if trips:
+            with self._lock:
+                self._shared = shared
+                self._estimator.add(*trips)
         return bool(trips)
 
-    def _ask(self) -> RoundTrip | None:
-        sent = time.time_ns()
+    def _ask(self) -> tuple[RoundTrip, bool] | None:
+        """A round trip, by the monotonic clock, and whether the server's clock is this machine's."""
+        sent = time.monotonic_ns()
         try:
             for reply in self._querier.get():
-                received = time.time_ns()
+                received = time.monotonic_ns()
                 if reply.ok:
-                    return RoundTrip(sent, decode(reply.ok.payload.to_bytes(), ClockReply).t_ns, received)
+                    told = decode(reply.ok.payload.to_bytes(), ClockReply)
+                    return RoundTrip(sent, told.t_ns, received), _is_shared(told, sent, received)
         except (zenoh.ZError, MessageError) as error:
             log.debug("no server time: %s", error)
         return None
+
+
+def _is_shared(told: ClockReply, sent_ns: int, received_ns: int) -> bool:
+    """Whether it is this machine's clock, by its name and by what it shows: copies of a virtual machine share names."""
+    if not told.clock or told.clock != clock_id():
+        return False
+    return sent_ns - READING_NS <= told.t_ns - unix_ahead_ns() <= received_ns + READING_NS

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import cv2
 
+from camera_node.clock import unix_ahead_ns
 from camera_node.errors import CameraError
 from camera_node.frame import Frame, SourceSettings
 from camera_node.pixels import RAW, grey
@@ -229,7 +230,8 @@ class DeviceSource:
             return False
         exposure_us = self.settings.exposure_us or 0.0
         stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-        t_ns = capture_time(stamp, time.monotonic_ns(), time.time_ns(), exposure_us)
+        now_ns = time.monotonic_ns()
+        t_ns = capture_time(stamp, now_ns, now_ns + unix_ahead_ns(), exposure_us)
         self._keep(Frame(grey(image, self.settings.fourcc), t_ns, exposure_us))
         return True
 

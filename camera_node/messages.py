@@ -178,9 +178,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class ClockReply(msgspec.Struct, frozen=True):
-    """The server's time, in answer to a query on `<arena>/clock`."""
+    """The server's time, in answer to a query on `<arena>/clock`, and its clock's name: who shares it is done."""
 
     t_ns: int
+    clock: str = ""  # empty where the server can't tell
 
 
 def encode(message: msgspec.Struct) -> bytes:

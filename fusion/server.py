@@ -19,6 +19,7 @@ import zenoh
 from calib.camera import Camera
 from calib.messages import RigMessage
 from calib.rig import load_rig, save_rig
+from camera_node.clock import clock_id
 from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.requests import encode_reply, parse_request, payload_of
 from fusion.calibration import Calibration
@@ -188,7 +189,7 @@ class Server:
     # What is answered.
 
     def _answer_clock(self, query: zenoh.Query) -> None:
-        query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns())))
+        query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns(), clock=clock_id())))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
         if self.calibration.rig is not None:
