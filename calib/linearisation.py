@@ -125,11 +125,15 @@ class Linearisation:
         return out
 
     def weigh(self, state: State) -> None:
-        """Set what whitens residuals: the detector's covariance, and what is not known of the motion between knots."""
+        """Set what whitens residuals: the detector's covariance, and what is not known of the motion between knots and
+        of when each frame was taken."""
         passage = self._pass(state)
         spread = self.problem.density * passage.place.spread
         J = self._by_point(state, passage.points)
+        along = self.observations.stamp_sigma_s[:, None] * passage.velocity(self.problem.knot_s)
+        late = J @ along[:, :, None]
         cov = self.observations.cov + spread[:, None, None] * J @ np.swapaxes(J, 1, 2)
+        cov += late @ np.swapaxes(late, 1, 2)
         self.root = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), float)
 
     def _by_point(self, state: State, points: Array) -> Array:

@@ -32,7 +32,7 @@ class Observations:
         camera: (n,) index of the camera.
         knot: (n,) the instant they belong to.
         label: (n,) marker of the wand.
-        t_s: (n,) stamp, seconds.
+        t_s, stamp_sigma_s: (n,) stamp, seconds, and what it is off by beside its camera's clock.
         uv: (n, 2) raw pixels, where the disc's own centre is seen.
         cov: (n, 2, 2) covariance of `uv`.
         axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
@@ -42,6 +42,7 @@ class Observations:
     knot: Index
     label: Index
     t_s: Array
+    stamp_sigma_s: Array
     uv: Array
     cov: Array
     axes_px: Array

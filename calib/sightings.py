@@ -15,7 +15,8 @@ from camera_node.messages import Detections
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-HEADER = ("camera", "t_ns")
+UNKNOWN_S = 1.0  # more than cameras' clocks may be apart
+HEADER = ("camera", "t_ns", "clock_error_us")
 # Of a message: what its columns hold, and how many of them a roundel has (`Detections`).
 COLUMNS = {
     "uv": ("<f8", 2),
@@ -66,6 +67,7 @@ class Sightings:
     Attributes:
         camera, frame: (n,) where a detection is from.
         t_s: (n,) stamp of its frame, seconds.
+        stamp_sigma_s: (n,) standard deviation of that, beside the offset that a camera's stamps share.
         label: (n,) marker of the wand; -1 where it is not known.
         uv: (n, 2) centre of the ellipse, raw pixels.
         cov: (n, 2, 2) its covariance, square pixels.
@@ -76,6 +78,7 @@ class Sightings:
     camera: Index
     frame: Index
     t_s: Array
+    stamp_sigma_s: Array
     label: Index
     uv: Array
     cov: Array
@@ -106,7 +109,7 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
-    camera_of, t_ns, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
+    camera_of, t_ns, bound_us, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
     origin_ns = min(t_ns)
     camera = np.array([index[name] for name in camera_of], np.intp)
     t_s = (np.array(t_ns) - origin_ns) * 1e-9
@@ -121,6 +124,7 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
         camera[frame],
         frame,
         t_s[frame],
+        stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
         number[:, 0].astype(np.intp),
         uv,
         cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
@@ -129,6 +133,18 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
         xy,
     )
     return Frames(camera, t_s, origin_ns), every.select(np.flatnonzero(np.isfinite(xy).all(axis=1)))
+
+
+def stamp_sigmas(camera: Index, bound_s: Array) -> Array:
+    """Standard deviations (F,) of frames' stamps, seconds, beside the offset that is sought for each camera.
+
+    What the least bound of a camera leaves open may be the same in all its frames, and is the offset's. Within what
+    another is wider by, all is equally likely. A frame of before the server's first answer has a stamp of any clock.
+    """
+    bound_s = np.nan_to_num(bound_s, nan=UNKNOWN_S)
+    least = np.full(camera.max() + 1, np.inf)
+    np.minimum.at(least, camera, bound_s)
+    return (bound_s - least[camera]) / np.sqrt(3)
 
 
 def _table(data: Sequence[bytes], dtype: str, width: int) -> Array:

@@ -102,7 +102,7 @@ class Wave:
     def _observe(self, rows: Index, knot: Index) -> Observations:
         seen = self.seen.select(rows)
         cov = seen.cov + MIN_SIGMA_PX**2 * np.eye(2)
-        columns = (seen.t_s, seen.uv, cov, seen.axes_px, seen.angle_rad)
+        columns = (seen.t_s, seen.stamp_sigma_s, seen.uv, cov, seen.axes_px, seen.angle_rad)
         return Observations(seen.camera, knot, seen.label, *columns)
 
 

@@ -64,6 +64,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     exposure_us: float = 0.0
     detect_us: float = 0.0  # from the frame in memory to the roundels
     sent_ns: int = 0  # when the message was handed to Zenoh, server's time
+    clock_error_us: float = 0.0  # that clocks put `t_ns` off, at most; NaN before a server answered
     width: int
     height: int
     uv: bytes
@@ -120,6 +121,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("no camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible time")
+        if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
+            raise MessageError("an impossible bound of a time")
         uu, uv, vv = _column(self.cov, "<f4", 3).T  # what is no number is in no range
         known = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
         if not (known.all() and (np.abs(np.frombuffer(self.uv, "<f8")) < 1e5).all()):

@@ -3,6 +3,7 @@
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -95,18 +96,27 @@ class Node:
 
     def _message(self, seq: int, frame: Frame, roundels: Roundels, detect_us: float) -> bytes:
         height, width = frame.image.shape
+        t_ns, clock_error_us = self._stamp(frame)
         message = Detections.pack(
             roundels,
             camera=self.name,
             seq=seq,
-            t_ns=frame.t_ns if self.keep_stamps else self.clock.to_server(frame.t_ns),
+            t_ns=t_ns,
             exposure_us=frame.exposure_us,
             detect_us=detect_us,
             sent_ns=self.clock.to_server(time.time_ns()),
+            clock_error_us=clock_error_us,
             width=width,
             height=height,
         )
         return encode(message)
+
+    def _stamp(self, frame: Frame) -> tuple[int, float]:
+        """When it was taken, in the server's time, and what the clocks add to that at most, microseconds."""
+        if self.keep_stamps:
+            return frame.t_ns, 0.0
+        estimate = self.clock.estimate(frame.t_ns)
+        return (frame.t_ns + estimate[0], estimate[1] / 1000) if estimate else (frame.t_ns, math.nan)
 
     def _open(self, stack: contextlib.ExitStack) -> zenoh.Publisher:
         """Declare everything that this node says and answers; `stack` takes it back."""

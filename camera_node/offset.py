@@ -26,7 +26,7 @@ READING_NS = 1000  # how finely clocks are read, at worst
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """One question to the server: this machine's times around the server's."""
+    """One question to the server: this machine's times, monotonic, around the server's."""
 
     sent_ns: int
     server_ns: int
@@ -74,16 +74,12 @@ class OffsetEstimator:
         self._band: Band | None = None
 
     def add(self, *burst: RoundTrip) -> None:
-        """Learn from round trips that were made at once; those that go backwards in time are ignored."""
-        trips = [trip for trip in burst if trip.received_ns >= trip.sent_ns]
-        if not trips:
-            return
-        questions = [Limit(trip.sent_ns, trip.server_ns - trip.sent_ns) for trip in trips]
-        answers = [Limit(trip.received_ns, trip.server_ns - trip.received_ns) for trip in trips]
-        quickest = min(questions, key=_offset), max(answers, key=_offset)
-        self._limits.append(quickest)
-        now_ns = max(limit.t_ns for limit in answers)
-        while not 0 <= now_ns - self._limits[0][0].t_ns <= WINDOW_NS:
+        """Learn from one or more round trips that were made at once, after all others."""
+        questions = [Limit(trip.sent_ns, trip.server_ns - trip.sent_ns) for trip in burst]
+        answers = [Limit(trip.received_ns, trip.server_ns - trip.received_ns) for trip in burst]
+        self._limits.append((min(questions, key=_offset), max(answers, key=_offset)))
+        now_ns = answers[-1].t_ns
+        while now_ns - self._limits[0][0].t_ns > WINDOW_NS:
             self._limits.popleft()
         while (band := find_band(self._limits, now_ns)) is None and self._limits:
             for _ in range((len(self._limits) + 1) // 2):

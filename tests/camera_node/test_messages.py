@@ -105,6 +105,8 @@ def test_columns_of_other_lengths_are_refused(column: str):
         {"t_ns": -1},
         {"exposure_us": math.nan},
         {"detect_us": math.inf},
+        {"clock_error_us": -1.0},
+        {"clock_error_us": math.inf},
         {"camera": ""},
         {"version": 2},
     ],
