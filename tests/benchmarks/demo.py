@@ -2,7 +2,7 @@
 """The demo beside other work: by how much stamps are off, and what poses that gives.
 
 `python -m tests.benchmarks.demo [--browser] [--loops 3] [--apart] [--runs 5]`. All programs are real and share one
-clock, so that a stamp should be the middle of its exposure to the nanosecond; what it is off is the node's clock's work.
+clock, so that a stamp should be the middle of its exposure to the nanosecond; what it is off is its node's doing.
 """
 
 import contextlib
