@@ -10,7 +10,7 @@ demo: .venv/ready
 	@$(BIN)/python -m web --demo $(ARGS)
 
 test: .venv/ready
-	$(BIN)/python -m pytest $(ARGS)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
 
 check: .venv/ready
 	$(BIN)/ruff format --check .

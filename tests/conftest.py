@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What several folders of tests need."""
+"""What several folders of tests need, and in which order they run where `make test` runs them on all cores."""
 
+import os
 import re
 import shutil
 import signal
@@ -13,8 +14,31 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WAVE_S = 8.0  # enough for every camera of the demo to see the wand in most of its image
 
+LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py")
+BEHIND = 10  # the niceness of tests that only compute
+
 # A shell that runs the tests in the background has them, and the programs that they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def is_live(item: pytest.Item) -> bool:
+    """Whether a test runs programs or a browser against the clock."""
+    fixtures = getattr(item, "fixturenames", ())
+    return "endpoint" in fixtures or item.path.parent.name == "web" or item.path.name in LIVE_FILES
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Live tests go first, and one at a time; of others, those of a file share its fixtures."""
+    items.sort(key=lambda item: not is_live(item))
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("live" if is_live(item) else str(item.path)))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Beside live tests, those that only compute wait: the clock is not theirs."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not is_live(item):
+        os.nice(max(0, BEHIND - os.nice(0)))
 
 
 def free_port() -> int:

@@ -2,6 +2,7 @@
 """A whole arena without hardware: simulated cameras, a wand wave to calibrate, then robots."""
 
 import contextlib
+import os
 import shutil
 import socket
 import tempfile
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 import web
 from calib.camera import Camera, transform
@@ -30,7 +32,7 @@ from web.subscription import Subscription
 from web.usage import Usage
 
 ARENA = "demo"
-START_S = 3.0  # for the programs to come up before the wave begins
+START_S = 3.0  # for the programs to come up before the wave begins, at the least
 SOLVE_S = 90.0  # after the wave, for calibration to be done
 SETTLE_S = 0.5  # after a new calibration, for poses of the old one to be gone
 ACQUIRE_S = 5.0  # after calibration, for robots to be found; whatever is missing then counts as lost
@@ -56,6 +58,12 @@ def free_endpoint() -> str:
         with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)) as server:
             return f"tcp/127.0.0.1:{server.getsockname()[1]}"
     raise WebError("no port on 127.0.0.1 can be listened on; give an endpoint with --listen")
+
+
+def coming_up_s(programs: int) -> float:
+    """How long so many programs take to come up at once: each about the work that this one was, on all processors."""
+    alone_s = time.time() - psutil.Process().create_time()
+    return max(START_S, alone_s * programs / (os.cpu_count() or 1))
 
 
 def run_demo(
@@ -93,7 +101,8 @@ class Demo:
     def __init__(self, scene: Scene, files: Path, processes: Processes, endpoint: str) -> None:
         self.scene, self.files, self.processes, self.endpoint = scene, files, processes, endpoint
         self.session = open_client([endpoint])
-        self.epoch_ns = time.time_ns() + round(START_S * 1e9)
+        self.wave_in_s = coming_up_s(len(scene.cameras) + 3)  # server, page and calibration
+        self.epoch_ns = time.time_ns() + round(self.wave_in_s * 1e9)
         self.feed = Feed(ARENA, self._take_pose)
         self.subscription = Subscription(self.session, self.feed)
         self._score: Score | None = None
@@ -129,14 +138,14 @@ class Demo:
             "--wand",
             str(files / "wand.yaml"),
             "--seconds",
-            str(START_S + self.scene.wave_s),
+            str(self.wave_in_s + self.scene.wave_s),
         ]
         rigs = ["--rig", str(folder / "intrinsics.yaml"), "--out", str(folder / "rig.yaml")]
         start("calib", "calib", [*wave, *rigs, *connect])
 
     def _calibrate(self) -> None:
         """Wave the wand until `calib` has placed the cameras."""
-        for whole_second in self._ticks(self.scene.wave_s + SOLVE_S):
+        for whole_second in self._ticks(self.wave_in_s + self.scene.wave_s + SOLVE_S):
             if self.processes.finished("calib"):
                 return
             self._tell(self._describe_wave(self.feed.latest()), self._wave_share(), whole_second)
