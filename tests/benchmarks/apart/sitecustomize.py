@@ -6,10 +6,10 @@ from pathlib import Path
 _read_text = Path.read_text
 
 
-def read_text(path: Path, *arguments, **named) -> str:
-    if path.name == "boot_id":
-        raise FileNotFoundError(path)
-    return _read_text(path, *arguments, **named)
+def read_text(self: Path, encoding: str | None = None, errors: str | None = None) -> str:
+    if self.name == "boot_id":
+        raise FileNotFoundError(self)
+    return _read_text(self, encoding, errors)
 
 
 Path.read_text = read_text
