@@ -59,9 +59,13 @@ ROUNDEL_CLONES void compare(const uint16_t* now, const uint16_t* searched, const
     }
 }
 
+/// Takes the sums of tiles that nothing explains.
 ROUNDEL_CLONES void take_unexplained(const uint16_t* now, const uint8_t* explained, int n,
                                      uint16_t* searched) {
-    for (int x = 0; x < n; ++x) searched[x] = explained[x] ? searched[x] : now[x];
+    for (int x = 0; x < n; ++x) {
+        const int kept = -int(explained[x]);  // all ones or none
+        searched[x] = uint16_t((searched[x] & kept) | (now[x] & ~kept));
+    }
 }
 
 }  // namespace
