@@ -44,6 +44,9 @@ ROUNDEL_INLINE void exchange_within(Four& a, Four& b) {
 ROUNDEL_CLONES void transpose(uint64_t* block) {
     Four lines[kFours];
     __builtin_memcpy(lines, block, sizeof lines);
+    Four any{};
+    for (const Four& four : lines) any |= four;
+    if (!(any[0] | any[1] | any[2] | any[3])) return;  // much of a picture has nothing dark
     exchange_quarters<32>(lines, 0x00000000ffffffffu);
     exchange_quarters<16>(lines, 0x0000ffff0000ffffu);
     exchange_quarters<8>(lines, 0x00ff00ff00ff00ffu);

@@ -3,7 +3,9 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <cmath>
+#include <span>
 
 #include "cholesky.hpp"
 #include "lanes.hpp"
@@ -31,12 +33,16 @@ struct Crossings {
     alignas(4 * kLanes) float x[kMost]{}, y[kMost]{}, inner[kMost]{};  // inner is 1 or 0
     float ratio[kMost]{};  // of the ray's inner distance to its outer one; 0 where it has one only
     int ray[kMost]{}, count = 0;
+    uint16_t seen[2]{};  // a bit a ray: which cross the disc's edge, and the hole's
     double unit;
     void add(int number, float at, bool is_inner, float its_ratio) {
         const Direction direction = kDirections[size_t(number)];
         const float away = at / float(unit);
         x[count] = away * direction.x, y[count] = away * direction.y, inner[count] = is_inner;
-        ratio[count] = its_ratio, ray[count++] = number;
+        ratio[count] = its_ratio, ray[count++] = number, seen[is_inner] |= uint16_t(1 << number);
+    }
+    int count_of(uint16_t rays) const {
+        return std::popcount(uint16_t(seen[0] & rays)) + std::popcount(uint16_t(seen[1] & rays));
     }
 };
 
@@ -59,20 +65,34 @@ struct Weights {
     alignas(4 * kLanes) float at[Crossings::kMost]{};
 };
 
+/// A ray's number, and the pixels at which it leaves the disc and the ring; below 0 where it does not.
+struct Walk {
+    int number, inner, outer;
+};
+
+/// Where rays cross, between pixels; nothing where too few do, which whole pixels tell.
 Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
     const float theta = float(seed.dark + seed.bright) / 2;
+    const int below = int(std::ceil(theta));
     Crossings crossings(std::max(1.0, double(seed.reach)));
-    int missed = 0;
-    for (int k = 0; k < kRays && missed <= 2 + k / 3; ++k) {
-        const int number = kOrder[size_t(k)];
-        Ray ray(image, seed.x, seed.y, kDirections[size_t(number)]);
-        const float inner = ray.turn(true, theta, seed.reach);
-        const float outer = inner < 0 ? -1 : ray.turn(false, theta, inner / float(ratios.least) + 2);
-        const bool both = outer >= 0 && double(inner) < ratios.most * double(outer) + 1;
-        const float ratio = both ? inner / outer : 0;
-        if (inner >= 0) crossings.add(number, inner, true, ratio);
-        if (both) crossings.add(number, outer, false, ratio);
-        missed += !both;
+    std::array<Walk, kRays> walks;
+    int n = 0, missed = 0, crossed = 0;
+    for (; n < kRays && missed <= 2 + n / 3; ++n) {
+        Ray ray(image, seed.x, seed.y, kDirections[size_t(kOrder[size_t(n)])]);
+        const int inner = ray.walk<true>(below, seed.reach);
+        int outer = inner < 0 ? -1 : ray.walk<false>(below, (float(inner) - 0.5f) / float(ratios.least) + 2);
+        if (inner >= ratios.most * outer + 1) outer = -1;
+        missed += outer < 0, crossed += (inner >= 0) + (outer >= 0);
+        walks[size_t(n)] = {kOrder[size_t(n)], inner, outer};
+    }
+    if (crossed < 2 * kLeastCovered + 2) return crossings;
+    for (const auto [number, inner, outer] : std::span(walks.data(), size_t(n))) {
+        if (inner < 0) continue;
+        const Ray ray(image, seed.x, seed.y, kDirections[size_t(number)]);
+        const float near = ray.between(inner, theta), far = outer < 0 ? 0 : ray.between(outer, theta);
+        const float ratio = outer < 0 ? 0 : near / far;
+        crossings.add(number, near, true, ratio);
+        if (outer >= 0) crossings.add(number, far, false, ratio);
     }
     return crossings;
 }
@@ -223,13 +243,9 @@ std::optional<Conics> settle_covered(const Crossings& crossings) {
     int most = kLeastCovered - kReweights;  // what no less would do
     std::optional<Weights> best;
     for (const uint16_t whole : kWhole) {
+        if (crossings.count_of(whole) < kLeastOfHalf || most_apart(crossings, whole) > kUnlike) continue;
         Weights weights;
-        int n = 0;
-        for (int k = 0; k < crossings.count; ++k) {
-            const int in = whole >> crossings.ray[k] & 1;
-            weights.at[k] = float(in), n += in;
-        }
-        if (n < kLeastOfHalf || most_apart(crossings, whole) > kUnlike) continue;
+        for (int k = 0; k < crossings.count; ++k) weights.at[k] = float(whole >> crossings.ray[k] & 1);
         const auto conics = solve(crossings, weights);
         if (!conics || !Frame(*conics).is_valid()) continue;
         if (const int agree = reweigh(crossings, *conics, weights); agree > most)

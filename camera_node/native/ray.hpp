@@ -45,12 +45,32 @@ class Ray {
           y_(y),
           d_(d),
           end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
-    /// The distance at which the ray next turns dark (or bright), before `limit`; negative where it does not.
+    /// The first pixel, before `limit`, where the ray is (or is not) darker than `theta` after it was not (or
+    /// was) once; negative where it does not turn so. The next walk goes on from there.
+    template <bool dark>
+    int walk(int theta, float limit) {
+        const int last = int(std::min(limit, end_));
+        int t = t_, u = u_ + t * du_, v = v_ + t * dv_;  // in 1/65536 of a pixel
+        const auto is_there = [&] { return (image_.row(v >> 16)[u >> 16] < theta) == dark; };
+        while (t < last && is_there()) ++t, u += du_, v += dv_;
+        while (t < last && !is_there()) ++t, u += du_, v += dv_;
+        return t_ = t, t < last ? t : -1;
+    }
+    /// Where it does so between pixels; negative where it does not.
     float turn(bool dark, float theta, float limit) {
-        const int last = int(std::min(limit, end_)), below = int(std::ceil(theta));
-        while (t_ < last && (nearest(t_) < below) == dark) ++t_;
-        while (t_ < last && (nearest(t_) < below) != dark) ++t_;
-        return t_ < last ? between(theta) : -1;
+        const int below = int(std::ceil(theta)),
+                  pixel = dark ? walk<true>(below, limit) : walk<false>(below, limit);
+        return pixel < 0 ? -1 : between(pixel, theta);
+    }
+    /// Where the level is theta, near the pixel to which a walk went.
+    float between(int pixel, float theta) const {
+        float t = float(std::max(pixel - 2, 0)), before = level(t);
+        for (int k = 0; k < 3; ++k) {
+            const float after = level(t + 1);
+            if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
+            before = after, t += 1;
+        }
+        return float(pixel) - 0.5f;
     }
 
   private:
@@ -60,20 +80,7 @@ class Ray {
         const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
         return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
     }
-    int nearest(int t) const {  // in 1/65536 of a pixel: whole numbers are faster here
-        return image_.row((v_ + t * dv_) >> 16)[(u_ + t * du_) >> 16];
-    }
     float level(float t) const { return sample(image_, x_ + t * d_.x, y_ + t * d_.y); }
-    /// Where the level is theta, near the pixel at which it was passed.
-    float between(float theta) const {
-        float t = float(std::max(t_ - 2, 0)), before = level(t);
-        for (int k = 0; k < 3; ++k) {
-            const float after = level(t + 1);
-            if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
-            before = after, t += 1;
-        }
-        return float(t_) - 0.5f;
-    }
 
     const ImageView& image_;
     float x_, y_;

@@ -16,22 +16,38 @@ constexpr double kCard = 1.4, kBeyond = 12;  // outer diameters and pixels acros
 
 int in_units(int length, int unit) { return (length + unit - 1) / unit; }
 
+inline uint8_t mean(uint8_t a, uint8_t b) { return uint8_t((a + b + 1) >> 1); }
+
+/// The mean of eight rows, column by column, two by two: rounded up three times, in every frame alike.
+inline void mean_of_rows(const uint8_t* const rows[kTile], int n, uint8_t* to) {
+    const uint8_t *a = rows[0], *b = rows[1], *c = rows[2], *d = rows[3], *e = rows[4], *f = rows[5],
+                  *g = rows[6], *h = rows[7];
+    for (int x = 0; x < n; ++x)
+        to[x] = mean(mean(mean(a[x], b[x]), mean(c[x], d[x])), mean(mean(e[x], f[x]), mean(g[x], h[x])));
+}
+
 /// The sums of n pairs of neighbours.
 template <typename From>
 inline void add_pairs(const From* from, int n, uint16_t* to) {
     for (int x = 0; x < n; ++x) to[x] = uint16_t(from[2 * x] + from[2 * x + 1]);
 }
 
-/// The sums of `tiles` tiles of 8 pixels' width, and of all of the rows.
-ROUNDEL_CLONES void add_tiles(const ImageView& rows, int tiles, uint16_t* columns, uint16_t* to) {
-    for (int x = 0; x < rows.width; ++x) columns[x] = rows.data[x];
-    for (int y = 1; y < rows.height; ++y) {
-        const uint8_t* row = rows.row(y);
-        for (int x = 0; x < rows.width; ++x) columns[x] = uint16_t(columns[x] + row[x]);
-    }
-    add_pairs(columns, 4 * tiles, columns);
-    add_pairs(columns, 2 * tiles, columns);
-    add_pairs(columns, tiles, to);
+/// Room for the mean of some rows, as wide as whole tiles, and for the sums of two and of four columns.
+struct Columns {
+    std::vector<uint8_t> means;
+    std::vector<uint16_t> pairs, fours;
+    explicit Columns(int tiles)
+        : means(size_t(tiles) * kTile, 0), pairs(means.size() / 2), fours(means.size() / 4) {}
+};
+
+/// The sums of the mean's tiles; of fewer rows than eight the last one counts several times.
+ROUNDEL_CLONES void add_tiles(const ImageView& rows, int tiles, Columns& columns, uint16_t* to) {
+    const uint8_t* eight[kTile];
+    for (int k = 0; k < kTile; ++k) eight[k] = rows.row(std::min(k, rows.height - 1));
+    mean_of_rows(eight, rows.width, columns.means.data());
+    add_pairs(columns.means.data(), 4 * tiles, columns.pairs.data());
+    add_pairs(columns.pairs.data(), 2 * tiles, columns.fours.data());
+    add_pairs(columns.fours.data(), tiles, to);
 }
 
 /// Whether each of n sums is off another by more than `limit` where nothing explains it; added to `changed`.
@@ -40,6 +56,15 @@ ROUNDEL_CLONES void compare(const uint16_t* now, const uint16_t* searched, const
     for (int x = 0; x < n; ++x) {
         const int off = now[x] - searched[x];
         changed[x] = uint8_t(changed[x] | (((off > limit) | (off < -limit)) & !explained[x]));
+    }
+}
+
+/// Takes the sums of tiles that nothing explains.
+ROUNDEL_CLONES void take_unexplained(const uint16_t* now, const uint8_t* explained, int n,
+                                     uint16_t* searched) {
+    for (int x = 0; x < n; ++x) {
+        const int kept = -int(explained[x]);  // all ones or none
+        searched[x] = uint16_t((searched[x] & kept) | (now[x] & ~kept));
     }
 }
 
@@ -62,13 +87,10 @@ void Watch::look(const ImageView& image) {
         forget();
     }
     explained_.assign(now_.size(), 0);
-    std::vector<uint16_t> columns(size_t(columns_) * kTile, 0);
-    for (int y = 0; y < rows_; ++y) {
-        const int height = std::min(kTile, height_ - y * kTile);
-        std::fill(columns.begin() + width_, columns.end(), 0);
-        add_tiles(image.window(0, y * kTile, width_, height), columns_, columns.data(),
+    Columns columns(columns_);
+    for (int y = 0; y < rows_; ++y)
+        add_tiles(image.window(0, y * kTile, width_, std::min(kTile, height_ - y * kTile)), columns_, columns,
                   &now_[size_t(y) * size_t(columns_)]);
-    }
 }
 
 void Watch::forget() { std::fill(searched_.begin(), searched_.end(), kNever); }
@@ -116,7 +138,7 @@ std::vector<uint8_t> Watch::changed_cells(int limit) const {
 std::vector<Box> Watch::changed(double limit, double share) const {
     constexpr int kSide = kCell * kTile;
     const Box frame{0, 0, width_, height_};
-    const auto cells = changed_cells(int(limit * kTile * kTile));
+    const auto cells = changed_cells(int(limit * kTile));
     const int across = in_units(columns_, kCell);
     std::vector<Box> boxes;
     double area = 0;
@@ -141,11 +163,11 @@ std::vector<Box> Watch::changed(double limit, double share) const {
 }
 
 void Watch::settle(const Box& box) {
-    for (int y = in_units(box.top, kTile); y < in_units(box.bottom, kTile); ++y)
-        for (int x = in_units(box.left, kTile); x < in_units(box.right, kTile); ++x) {
-            const size_t at = size_t(y) * size_t(columns_) + size_t(x);
-            if (!explained_[at]) searched_[at] = now_[at];
-        }
+    const int left = in_units(box.left, kTile), n = in_units(box.right, kTile) - left;
+    for (int y = in_units(box.top, kTile); y < in_units(box.bottom, kTile); ++y) {
+        const size_t at = size_t(y) * size_t(columns_) + size_t(left);
+        take_unexplained(&now_[at], &explained_[at], n, &searched_[at]);
+    }
 }
 
 }  // namespace roundel

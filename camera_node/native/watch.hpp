@@ -42,7 +42,7 @@ class Watch {
     std::vector<uint8_t> changed_cells(int limit) const;
 
     int width_ = 0, height_ = 0, columns_ = 0, rows_ = 0;  // pixels; tiles
-    std::vector<uint16_t> now_, searched_;                 // sums of tiles
+    std::vector<uint16_t> now_, searched_;                 // sums of tiles' columns' means
     std::vector<uint8_t> explained_;
 };
 
