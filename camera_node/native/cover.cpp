@@ -2,10 +2,10 @@
 #include "cover.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
-#include <iterator>
+#include <numeric>
 
-#include "bar.hpp"
 #include "sector_view.hpp"
 #include "settings.hpp"
 
@@ -15,17 +15,22 @@ namespace {
 
 constexpr double kPlain = 0.01;   // of the contrast, RMS on the ring's edges, where nothing covers them
 constexpr double kMisfit = 0.02;  // likewise, where what is covered is left out
-constexpr double kSlacks[] = {0.12, 0.06, 0.03, 0.03};  // of the contrast: a biased fit spreads its misfit
+constexpr double kSlacks[] = {0.48, 0.12, 0.03};  // of the contrast: a biased fit spreads its misfit
 constexpr double kShows = 0.06;  // likewise: where a cover would show on a fit that passes all other gates
 constexpr int kMostHidden = 26, kMostOfBoth = 44;  // sectors of 32, of an edge and of both
 constexpr double kPrintOff = 0.01;  // ratio measured off a print's, by which a bias of the rest shows
 constexpr double kLeastKnown = 12, kLeastNew = 16;  // pixels: smaller ones tell too little
-constexpr double kInk = 0.05, kSure = 3.5;  // of the contrast and of the noise: a level is another one
-constexpr double kInked = 0.12;             // likewise, of a thin stroke
-constexpr double kRim = 1.06;               // outer radii: ink there goes on from the ring
-constexpr double kBright = 0.3;             // likewise, of a place in the ring that is no ink, and
-constexpr int kMostOpen = 2;                // as many sectors where nothing seems to cover it
-constexpr int kBlurred = 4;                 // sectors of a run that a cover's blurred edge alone may hide
+constexpr double kInk = 0.05, kSure = 3.5;    // of the contrast and of the noise: a level is another one
+constexpr double kInked = 0.12;               // likewise, of a thin stroke
+constexpr double kRim = 1.06;                 // outer radii: ink there goes on from the ring
+constexpr double kBright = 0.3;               // likewise, of a place in the ring that is no ink, and
+constexpr int kMostOpen = 2;                  // as many sectors where nothing seems to cover it
+constexpr int kBlurred = 4;                   // sectors of a run that a cover's blurred edge alone may hide
+constexpr double kNoPaper = 0.3;              // of the contrast: what differs by more from paper is none
+constexpr double kNear = 1.08, kStep = 0.03;  // outer radii at which paper is looked for, from the ring on
+constexpr int kSteps = 13, kFirst = 3;        // to 1.44; a card ends beyond the first of them,
+constexpr int kBlurredSteps = 5;              // within so many,
+constexpr int kLeastSectors = 12;             // in so many sectors
 
 /// Whether the noise and so much of the contrast explain what is left on the ring's edges.
 bool is_below(const Fit& fit, double noise, double misfit) {
@@ -45,14 +50,25 @@ Sectors find_foreign(const SectorView& view, const Fit& fit, double noise) {
     return foreign;
 }
 
+/// Whether the paper around the ring ends at one distance all around, but for where something covers it: no
+/// letter stands on a round card of its own.
+bool has_round_card(const SectorView& view) {
+    Sectors paper = ~Sectors(0);
+    std::array<int, kSteps> ends{};
+    for (int k = 0; k < kSteps; ++k) {
+        const Sectors beyond =
+            paper & view.find(kNear + k * kStep, [](double level) { return std::abs(level - 1) > kNoPaper; });
+        ends[size_t(k)] = count_sectors(beyond), paper &= ~beyond;
+    }
+    for (auto from = ends.begin() + kFirst; from + kBlurredSteps <= ends.end(); ++from)
+        if (std::accumulate(from, from + kBlurredSteps, 0) >= kLeastSectors) return true;
+    return false;
+}
+
 /// Whether nothing but ink and paper meets the eye in a place where the ring is covered: so do letters look,
-/// which have ink in the hole or just outside where their ring is whole. A dark bar from end to end is none.
-bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, double noise) {
-    const SectorView view(image, fit);
-    const Sectors covered = hidden.outer | hidden.inner;
-    Sectors foreign = find_foreign(view, fit, noise);
-    const auto bar = find_bar(image, fit, noise);
-    if (bar) foreign |= bar->hides(1) | bar->hides(fit.ratio);
+/// which have ink in the hole or just outside where their ring is whole.
+bool is_letter(const SectorView& view, const Fit& fit, const Hidden& hidden, double noise) {
+    const Sectors covered = hidden.outer | hidden.inner, foreign = find_foreign(view, fit, noise);
     Sectors bright = 0;
     for (const double share : {0.25, 0.5, 0.75})
         bright |=
@@ -61,7 +77,7 @@ bool is_letter(const ImageView& image, const Fit& fit, const Hidden& hidden, dou
     Sectors inked = 0;
     for (const double radius : {0.8 * fit.ratio, kRim, 1.12, 1.2})
         inked |= view.find(radius, [](double level) { return std::abs(level) < kInked; });
-    if (!bar && inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
+    if (inked & ~(foreign | std::rotl(foreign, 1) | std::rotr(foreign, 1))) return true;
     for (Sectors left = covered; left;) {
         const Sectors run = any_run(left);
         if (2 * count_sectors(run & foreign) < count_sectors(run) - kBlurred) return true;
@@ -83,9 +99,10 @@ bool is_of_print(const Fit& fit, std::span<const double> prints) {
 
 }  // namespace
 
+bool is_noise(const Fit& fit, double noise) { return is_below(fit, noise, kPlain); }
+
 bool shows_cover(const ImageView& image, const Fit& fit, double noise) {
-    return !is_below(fit, noise, kPlain) &&
-           find_hidden(image, fit.p, noise, kShows * (fit.bright - fit.dark)).any();
+    return !is_noise(fit, noise) && find_hidden(image, fit.p, noise, kShows * (fit.bright - fit.dark)).any();
 }
 
 std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known) {
@@ -101,9 +118,11 @@ std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whol
         fit = *rest;
     }
     if (!is_below(fit, noise, kMisfit)) return std::nullopt;
-    if (!known && (!is_of_print(fit, start.prints) || is_letter(image, fit, start.hidden, noise)))
-        return std::nullopt;
-    return fit;
+    if (known) return fit;
+    const SectorView view(image, fit);
+    if (!is_of_print(fit, start.prints)) return std::nullopt;
+    return has_round_card(view) || !is_letter(view, fit, start.hidden, noise) ? std::optional(fit)
+                                                                              : std::nullopt;
 }
 
 }  // namespace roundel

@@ -7,6 +7,9 @@
 
 namespace roundel {
 
+/// Whether noise, and a hundredth of the contrast, explain all that a fit leaves on the ring's edges.
+bool is_noise(const Fit& fit, double noise);
+
 /// Whether what a fit leaves over gathers in some sectors, as where something covers a part; print, paper and
 /// lens spread it.
 bool shows_cover(const ImageView& image, const Fit& fit, double noise);

@@ -15,6 +15,10 @@ namespace {
 constexpr double kBeyond = 30;           // grey levels by which a blurred ring's may seem beyond the scale
 constexpr double kMisfit = 0.045;        // of the contrast, RMS on the ring's edges
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
+constexpr double kOff = 0.15;            // pixels by which an edge may be off all around, of most sizes, and
+constexpr double kOffRadius = 0.04;      // of its radius, of the smallest
+constexpr double kChance = 2;            // times what noise alone puts it off
+constexpr double kHard = 0.35;           // pixels of blur: what is sharper was drawn to whole pixels
 constexpr double kMost = 2.5;            // times as much of the largest ones, and
 constexpr double kMostRagged = 1.5;      // where softening took most of it already
 constexpr double kRaggedSupport = 0.8;   // of the edges that agree: ragged ones are alike all around
@@ -44,6 +48,21 @@ bool has_card(const Fit& fit) {
     return fit.p[kCard] > kLeastCard || off < kSameLevel * (fit.bright - fit.dark);
 }
 
+/// Whether both edges are where the fit has them: a letter's stroke is thicker here and thinner there, that
+/// of a print or a drawing, however ragged, is not.
+bool has_edges_in_place(const ImageView& image, const Fit& fit, double noise) {
+    if (is_noise(fit, noise)) return true;
+    const auto [outer, inner] = find_displacements(image, fit.p, noise);
+    const double radius = (fit.outer.major + fit.outer.minor) / 4;
+    const double most = kOff * std::clamp(fit.outer.major / 30, 1.0, kMost);
+    const auto is_in_place = [&](const Displacement& edge, double r) {
+        const double drawn =
+            fit.blur < kHard ? std::sqrt(1 / (12 * r)) : 0;  // a sixth of the turn has r pixels
+        return edge.rms < std::hypot(kChance * edge.chance, kChance * drawn, std::min(kOffRadius * r, most));
+    };
+    return is_in_place(outer, radius) && is_in_place(inner, fit.ratio * radius);
+}
+
 /// The gates that end false positives.
 bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, double noise, double misfit,
               double most) {
@@ -71,13 +90,14 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     start.prints = settings.inner_ratios;
     auto fit = refine(image, start);
     if (!fit) return std::nullopt;
-    const bool whole = is_whole(image, *fit, settings, noise, kMisfit, kMost);
+    const bool whole =
+        is_whole(image, *fit, settings, noise, kMisfit, kMost) && has_edges_in_place(image, *fit, noise);
     fit->plain = whole && !shows_cover(image, *fit, noise);
     if (fit->plain || start.model) return fit->plain ? fit : std::nullopt;
     const auto rest = fit_rest(image, start, *fit, noise, known || whole);
     if (rest && has_limits(*rest, settings)) return rest;
     if (whole) return fit;
-    if (!may_be_ragged(*fit, settings)) return std::nullopt;
+    if (!may_be_ragged(*fit, settings) || !has_edges_in_place(image, *fit, noise)) return std::nullopt;
     const auto soft = refine_softened(image, start);
     const double ragged = start.outer.major < kTellable ? kMisfit : kRaggedMisfit;
     return soft && is_whole(image, *soft, settings, noise * 6 / 16, ragged, kMostRagged) ? soft

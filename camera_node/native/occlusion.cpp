@@ -5,6 +5,7 @@
 #include <array>
 #include <cmath>
 #include <numbers>
+#include <numeric>
 
 #include "simd.hpp"
 
@@ -16,6 +17,8 @@ constexpr double kBand = 2;    // pixels on either side of an edge
 constexpr int kPixels = 1500;  // that are looked at, about
 constexpr double kChance = 4;  // standard deviations
 constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
+constexpr int kAround = 2;     // sectors on either side that a mean is over
+constexpr double kSeen = 0.2;  // of what they would tell if all of the edge were seen
 
 /// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse.
 ROUNDEL_INLINE Lanes direction(const Lanes& x, const Lanes& y) {
@@ -48,12 +51,14 @@ class Compass {
     float x_, y_, between_, xx_, xy_, yy_;
 };
 
-/// Squared residuals on an edge of the ring by sector, each with the squared slope as its weight.
+/// Residuals on an edge of the ring by sector: squared ones, each with its slope as the weight, and their
+/// regression on the slope, which is how far the edge is off.
 struct Misfit {
-    std::array<double, kSectors> rr{}, weight{}, squared{};
-    void add(int sector, double w, double r) {
+    std::array<double, kSectors> rr{}, weight{}, squared{}, moved{};
+    void add(int sector, double slope, double r) {
         const auto s = size_t(sector);
-        rr[s] += w * r * r, weight[s] += w, squared[s] += w * w;
+        const double w = std::abs(slope);
+        rr[s] += w * r * r, weight[s] += w, squared[s] += w * w, moved[s] += slope * r;
     }
     /// The sectors whose mean is more than `noise` and `slack` explain, but for a chance of four sigmas.
     Sectors beyond(double noise, double slack) const {
@@ -64,6 +69,23 @@ struct Misfit {
             off |= Sectors(rr[s] > limit) << s;
         }
         return off;
+    }
+    Displacement displacement(double noise) const {
+        constexpr int span = 2 * kAround + 1;
+        const double least = kSeen * span / kSectors * std::accumulate(squared.begin(), squared.end(), 0.0);
+        double sum = 0, chance = 0;
+        int seen = 0;
+        for (int s = 0; s < kSectors; ++s) {
+            double across = 0, along = 0;
+            for (int k = s - kAround; k <= s + kAround; ++k) {
+                const auto at = size_t(k + kSectors) % kSectors;
+                across += moved[at], along += squared[at];
+            }
+            if (along <= least) continue;
+            sum += across * across / (along * along), chance += noise * noise / along, ++seen;
+        }
+        const double n = std::max(seen, 1);
+        return {std::sqrt(sum / n), std::sqrt(chance / n)};
     }
 };
 
@@ -77,10 +99,10 @@ ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, con
         model.evaluate(x, y, pixels.level + begin, lanes, at);
         for (int n = 0; n < lanes; ++n) {
             const Bits place = compass.locate(load(x + n * kLanes), load(y + n * kLanes));
-            const Lanes weight = magnitude(at.ring[n]), residual = at.residual[n];
+            const Lanes slope = at.ring[n], residual = at.residual[n];
             for (int k = 0; k < kLanes; ++k)
                 if (std::abs(residual[k]) < 256)  // others are clipped, or none
-                    misfit[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(weight[k]),
+                    misfit[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(slope[k]),
                                                             double(residual[k]));
         }
     }
@@ -125,7 +147,10 @@ ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePix
     pixels.keep(kept);
 }
 
-Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack) {
+namespace {
+
+/// Of the outer edge and of the inner one, by the model `p` in the image's frame.
+std::array<Misfit, 2> find_misfit(const ImageView& image, const Parameters& p) {
     EdgePixels pixels;
     pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
@@ -133,9 +158,20 @@ Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, do
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
     std::array<Misfit, 2> misfit;
     add_misfit(pixels, Model(local), Compass(local), misfit);
-    const auto& [outer, inner] = misfit;
-    return {widen(outer.beyond(noise, slack), circle_image(local, 1)),
-            widen(inner.beyond(noise, slack), circle_image(local, local[kRatio]))};
+    return misfit;
+}
+
+}  // namespace
+
+Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack) {
+    const auto [outer, inner] = find_misfit(image, p);
+    return {widen(outer.beyond(noise, slack), circle_image(p, 1)),
+            widen(inner.beyond(noise, slack), circle_image(p, p[kRatio]))};
+}
+
+std::array<Displacement, 2> find_displacements(const ImageView& image, const Parameters& p, double noise) {
+    const auto [outer, inner] = find_misfit(image, p);
+    return {outer.displacement(noise), inner.displacement(noise)};
 }
 
 }  // namespace roundel

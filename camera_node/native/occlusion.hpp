@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <array>
 #include <bit>
 #include <cstdint>
 
@@ -36,5 +37,15 @@ void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels);
 /// The sectors in which an edge is off the model `p` (in the image's frame) by more than the noise explains
 /// and `slack`, both in grey levels RMS; and those so near to them that what covers them may reach there too.
 Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack);
+
+/// How far an edge lies off the model, RMS around it of means over a sixth of the turn, and how much of that
+/// the noise alone makes; pixels.
+struct Displacement {
+    double rms, chance;
+};
+
+/// Of the outer edge and of the inner one. What is drawn, printed or sharpened is ragged about the right
+/// place, and its means hardly show it.
+std::array<Displacement, 2> find_displacements(const ImageView& image, const Parameters& p, double noise);
 
 }  // namespace roundel

@@ -186,6 +186,7 @@ class Fitter {
     Leftover left_;
     std::optional<Cholesky<kCount>> factor_;
     Vector<kPoseCount> known_{};  // known_ known_^T is what the print took off the covariance
+    double print_ = 0;            // the ratio that the rest of `p` goes with; 0 where no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
     bool resumed_;
 };
@@ -205,6 +206,7 @@ bool Fitter::try_print(double ratio) {
     for (int i = 0; i < kCount; ++i)
         if (i != kRatio) p[i] += with[i] * off / variance;  // what was measured stays to be judged
     for (int i = 0; i < kPoseCount; ++i) known_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
+    print_ = ratio;
     return true;
 }
 
@@ -234,6 +236,7 @@ std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {
 
 Fit Fitter::fit() const {
     Fit fit = fit_of(p, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
+    if (print_ > 0) fit.p[kRatio] = print_;
     fit.edge_residual = std::sqrt(left_.ring_rr / left_.ring);
     fit.noise = scale_;
     fit.support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected;

@@ -34,7 +34,7 @@ struct Fit {
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
     double support;        // share of the ring's edges that is in the image and agrees
-    Parameters p;          // as the model has them, in the image's frame
+    Parameters p;          // as the model has them, in the image's frame; the ratio is a known print's
     bool plain = false;    // fitted to the picture as it is, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
     double noise = 0;                   // that the fit leaves, grey levels

@@ -88,7 +88,7 @@ def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
 
 @pytest.mark.parametrize(
     ("share", "from_rim", "least"),
-    [(0.2, True, 0.88), (0.2, False, 0.71), (0.3, True, 0.59), (0.3, False, 0.51)],
+    [(0.2, True, 0.98), (0.2, False, 0.88), (0.3, True, 0.71), (0.3, False, 0.62)],
 )
 def test_a_covered_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
     """What the benchmark measures, less four sigmas of 90."""
@@ -121,13 +121,35 @@ def test_letters_and_other_rings_are_no_covered_roundels():
     assert sum(len(Detector().detect(page)) for page in pages) == 0
 
 
-@pytest.mark.parametrize(("level", "least", "most"), [(40.0, 0, 0), (20.0, 6, 12)])
-def test_a_dark_bar_is_a_cover_where_its_level_is_its_own(level: float, least: int, most: int):
-    """A Phi is a ring of the print's own ratio with a bar across, of the same ink; of others half are found at once."""
+@pytest.mark.parametrize(("ground", "least", "most"), [(190.0, 0, 0), (120.0, 6, 12)])
+def test_ink_over_a_new_one_is_a_cover_where_its_card_ends_around_it(ground: float, least: int, most: int):
+    """A Phi is a ring of the print's own ratio with a bar across, of the same ink; none stands on a round card.
+
+    Of twelve covered by a fifth 88 in a hundred are found, less four sigmas.
+    """
     rng = np.random.default_rng(3)
     cards = [Card(uv, 32.0) for uv in grid(12, (240, 320), rng)]
-    image = paste(flat((240, 320), 120.0), cards, dark=40.0)
+    image = paste(flat((240, 320), ground), cards, dark=40.0)
     for card in cards:
-        image[:, round(card.uv[0]) + 3 : round(card.uv[0]) + 10] = level
+        image[:, round(card.uv[0]) + 3 : round(card.uv[0]) + 10] = 40.0
     frame = expose(cv2.GaussianBlur(image, (0, 0), 0.5), NOISE, rng)
     assert least <= len(Detector().detect(frame)) <= most
+
+
+@pytest.mark.parametrize("thin", [0.55, 0.65])
+def test_a_stroke_of_two_widths_is_no_ring(thin: float):
+    """A hole narrower than it is high by a tenth of the outer radius and more is a letter's, at any blur."""
+    rng = np.random.default_rng(5)
+    for blur in (0.6, 0.9, 1.2):
+        for radius in (7, 8, 10, 14):
+            page = np.full((240, 320), 220, np.uint8)
+            for y in range(30, 220, 45):
+                for x in range(30, 300, 45):
+                    for axes, level in (
+                        ((radius, radius), 30),
+                        ((thin * radius, (thin + 0.15) * radius), 220),
+                    ):
+                        size = tuple(round(16 * a) for a in axes)
+                        cv2.ellipse(page, (16 * x, 16 * y), size, 0, 0, 360, level, -1, cv2.LINE_AA, 4)
+            seen = np.asarray(cv2.GaussianBlur(page.astype(float), (0, 0), blur), float)
+            assert len(Detector().detect(expose(seen, NOISE, rng))) == 0
