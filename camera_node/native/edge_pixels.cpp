@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstring>
 #include <numbers>
+#include <span>
 
 #include "simd.hpp"
 #include "strips.hpp"
@@ -192,6 +193,18 @@ ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& car
 }
 
 }  // namespace
+
+void EdgePixels::sample(int n, EdgePixels& to) const {
+    to.clear();
+    for (const Part& part : std::span(parts.data(), size_t(part_count))) {
+        for (int k = part.begin; k < part.begin + part.count; k += n * kLanes, to.used += kLanes) {
+            std::copy_n(x + k, kLanes, to.x + to.used);
+            std::copy_n(y + k, kLanes, to.y + to.used);
+            std::copy_n(level + k, kLanes, to.level + to.used);
+        }
+        to.end_part(part.edge);
+    }
+}
 
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
     Mean mean{};

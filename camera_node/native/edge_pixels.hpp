@@ -23,6 +23,8 @@ struct EdgePixels : PixelColumns<6144> {
         expected -= used - n, used = n, count = part_count = padding_ = 0;
         end_part(kAnyEdge);
     }
+    /// Every `n`-th lane of each part.
+    void sample(int n, EdgePixels& to) const;
     int end() const { return used + padding_; }
     /// Makes a part of what was added since the last one.
     void end_part(Edge edge) {

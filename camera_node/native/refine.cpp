@@ -26,6 +26,8 @@ constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
 constexpr double kConverged = 1;           // standard deviations that may be left to go
 constexpr double kShows = 2.5;             // times the noise: an edge's slope is 0.4 of contrast over blur
+constexpr int kResumedPixels = 128;        // first, if there are
+constexpr int kWorthSampling = 3;          // times as many
 constexpr int kResumed = 3;                // steps at most from the model of the frame before, and
 constexpr double kLost = 0.25;             // the contrast's share in the residuals of edges half a blur off
 constexpr int kEdgeUnknowns = kCount - 3;  // all but the levels
@@ -62,14 +64,14 @@ class Fitter {
         const double wide = kWide + 0.01 * (start_[kAxx] + start_[kAyy]);
         if (!select({wide, wide, true, wide}, kCoarsePixels)) return false;
         p[kGround] = start_[kGround] = level_beyond_card(pixels_, p);
-        return iterate(2);
+        return iterate(pixels_, 2);
     }
 
     bool finish() {
         const bool card = std::abs(p[kGround] - p[kBright]) > kCardTells * (p[kBright] - p[kDark]);
         const Band band{std::max(kNarrow, kNarrowBlurs * p[kBlur]), std::max(kWide, kWideBlurs * p[kBlur]),
                         card, std::max(kWide, kApartBlurs * p[kBlur])};
-        return select(band, EdgePixels::kMax) && iterate(1);
+        return select(band, EdgePixels::kMax) && (!resumed_ || resume()) && iterate(pixels_, 1);
     }
 
     void learn_print(double ratio);
@@ -88,13 +90,23 @@ class Fitter {
         return pixels_.used >= 2 * kCount;
     }
 
+    /// From the model of the frame before to near the solution, on few of many pixels.
+    bool resume() {
+        const int one_in = pixels_.count / kResumedPixels;
+        if (one_in < kWorthSampling) return true;
+        pixels_.sample(one_in, few_);
+        return iterate(few_, 2);
+    }
+
     /// Steps until what is left, of the order of one's square over the blur, is small against the standard
     /// deviation, or, a step ahead of that, will be and shows less than the noise. The model of the frame
-    /// before has to be near enough for a step or a few.
-    bool iterate(int ahead) {
+    /// before has to be near enough for a step or a few; ahead, none where what is seen differs from it by no
+    /// more than noise.
+    bool iterate(const EdgePixels& pixels, int ahead) {
         for (int k = 0; k < kMaxSteps; ++k) {
-            model_.evaluate(pixels_, p);
+            model_.evaluate(pixels, p);
             const double seen = edge_scale();
+            if (resumed_ && ahead > 1 && seen < kSlack * scale_) return true;
             if (resumed_ && (k == kResumed || seen > kLost * (p[kBright] - p[kDark]))) return false;
             const double used = ahead > 1 ? std::min(scale_, kStrict * seen)
                                           : std::clamp(scale_, kStrict * seen, kSlack * seen);
@@ -179,7 +191,7 @@ class Fitter {
 
     const ImageView& image_;
     Hidden hidden_;
-    EdgePixels pixels_;
+    EdgePixels pixels_, few_;
     Parameters start_, prior_;
     Linearisation model_;
     NormalEquations equations_;
