@@ -88,7 +88,7 @@ def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
 
 @pytest.mark.parametrize(
     ("share", "from_rim", "least"),
-    [(0.2, True, 0.98), (0.2, False, 0.88), (0.3, True, 0.71), (0.3, False, 0.62)],
+    [(0.2, True, 0.97), (0.2, False, 0.86), (0.3, True, 0.71), (0.3, False, 0.62)],
 )
 def test_a_covered_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
     """What the benchmark measures, less four sigmas of 90."""
@@ -125,7 +125,7 @@ def test_letters_and_other_rings_are_no_covered_roundels():
 def test_ink_over_a_new_one_is_a_cover_where_its_card_ends_around_it(ground: float, least: int, most: int):
     """A Phi is a ring of the print's own ratio with a bar across, of the same ink; none stands on a round card.
 
-    Of twelve covered by a fifth 88 in a hundred are found, less four sigmas.
+    Of twelve covered by a fifth 86 in a hundred are found, less four sigmas.
     """
     rng = np.random.default_rng(3)
     cards = [Card(uv, 32.0) for uv in grid(12, (240, 320), rng)]
