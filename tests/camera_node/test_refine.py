@@ -150,7 +150,7 @@ def test_a_roundel_that_moves_unevenly_is_fitted_as_from_scratch(diameter: float
     the same minimum, to half a standard deviation."""
     tracker, rng = Detector(), np.random.default_rng(11)
     for k in range(10):
-        u, v = (70.2 + 1.3 * k, 62.1 - 0.6 * k) + rng.uniform(-0.05, 0.05, 2)
+        u, v = np.array([70.2 + 1.3 * k, 62.1 - 0.6 * k]) + rng.uniform(-0.05, 0.05, 2)
         image = expose(render([Disc((u, v), diameter, 0.5, 0.4)], ground=90), 3, rng)
         (tracked,), (cold,) = tracker.detect(image), Detector().detect(image)
         off = tracked.uv - cold.uv
