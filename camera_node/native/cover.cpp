@@ -101,21 +101,23 @@ bool is_of_print(const Fit& fit, std::span<const double> prints) {
 
 bool is_noise(const Fit& fit, double noise) { return is_below(fit, noise, kPlain); }
 
-bool shows_cover(const ImageView& image, const Fit& fit, double noise) {
-    return !is_noise(fit, noise) && find_hidden(image, fit.p, noise, kShows * (fit.bright - fit.dark)).any();
+bool shows_cover(const EdgeMisfit& misfit, const Fit& fit, double noise) {
+    return misfit.hidden(noise, kShows * (fit.bright - fit.dark)).any();
 }
 
-std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known) {
+std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole,
+                            std::optional<EdgeMisfit> misfit, double noise, bool known) {
     if (whole.outer.major < (known ? kLeastKnown : kLeastNew)) return std::nullopt;
     Fit fit = whole;
     for (const double slack : kSlacks) {
-        const Hidden hidden = find_hidden(image, fit.p, noise, slack * (fit.bright - fit.dark));
+        if (!misfit) misfit.emplace(image, fit.p);
+        const Hidden hidden = misfit->hidden(noise, slack * (fit.bright - fit.dark));
         if (is_hidden_too_much(hidden)) return std::nullopt;
         if (hidden == start.hidden) continue;
         start = {fit.outer, fit.ratio, fit.dark, fit.bright, start.prints, hidden};
         const auto rest = refine(image, start);
         if (!rest) return std::nullopt;
-        fit = *rest;
+        fit = *rest, misfit.reset();
     }
     if (!is_below(fit, noise, kMisfit)) return std::nullopt;
     if (known) return fit;

@@ -3,6 +3,7 @@
 #include <optional>
 
 #include "image.hpp"
+#include "occlusion.hpp"
 #include "refine.hpp"
 
 namespace roundel {
@@ -12,14 +13,16 @@ bool is_noise(const Fit& fit, double noise);
 
 /// Whether what a fit leaves over gathers in some sectors, as where something covers a part; print, paper and
 /// lens spread it.
-bool shows_cover(const ImageView& image, const Fit& fit, double noise);
+bool shows_cover(const EdgeMisfit& misfit, const Fit& fit, double noise);
 
 /// The fit to what is left of a roundel that something covers in part. Sectors of either edge that are off
 /// the fit `whole` are left out and the rest is fitted anew, ever more strictly, until what is left is as the
-/// model says; a biased fit does not come through, and the covariance is that of the rest.
+/// model says; a biased fit does not come through, and the covariance is that of the rest. `misfit` is that
+/// of `whole`, where it is known already.
 ///
 /// A roundel that is `known` may look like a letter, and have a ratio a little off its print's; a new one may
 /// not.
-std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole, double noise, bool known);
+std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole,
+                            std::optional<EdgeMisfit> misfit, double noise, bool known);
 
 }  // namespace roundel

@@ -50,9 +50,8 @@ bool has_card(const Fit& fit) {
 
 /// Whether both edges are where the fit has them: a letter's stroke is thicker here and thinner there, that
 /// of a print or a drawing, however ragged, is not.
-bool has_edges_in_place(const ImageView& image, const Fit& fit, double noise) {
-    if (is_noise(fit, noise)) return true;
-    const auto [outer, inner] = find_displacements(image, fit.p, noise);
+bool has_edges_in_place(const EdgeMisfit& misfit, const Fit& fit, double noise) {
+    const auto [outer, inner] = misfit.displacements(noise);
     const double radius = (fit.outer.major + fit.outer.minor) / 4;
     const double most = kOff * std::clamp(fit.outer.major / 30, 1.0, kMost);
     const auto is_in_place = [&](const Displacement& edge, double r) {
@@ -90,14 +89,16 @@ std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settin
     start.prints = settings.inner_ratios;
     auto fit = refine(image, start);
     if (!fit) return std::nullopt;
-    const bool whole =
-        is_whole(image, *fit, settings, noise, kMisfit, kMost) && has_edges_in_place(image, *fit, noise);
-    fit->plain = whole && !shows_cover(image, *fit, noise);
+    std::optional<EdgeMisfit> misfit;
+    if (!is_noise(*fit, noise)) misfit.emplace(image, fit->p);
+    const bool in_place = !misfit || has_edges_in_place(*misfit, *fit, noise);
+    const bool whole = in_place && is_whole(image, *fit, settings, noise, kMisfit, kMost);
+    fit->plain = whole && !(misfit && shows_cover(*misfit, *fit, noise));
     if (fit->plain || start.model) return fit->plain ? fit : std::nullopt;
-    const auto rest = fit_rest(image, start, *fit, noise, known || whole);
+    const auto rest = fit_rest(image, start, *fit, misfit, noise, known || whole);
     if (rest && has_limits(*rest, settings)) return rest;
     if (whole) return fit;
-    if (!may_be_ragged(*fit, settings) || !has_edges_in_place(image, *fit, noise)) return std::nullopt;
+    if (!in_place || !may_be_ragged(*fit, settings)) return std::nullopt;
     const auto soft = refine_softened(image, start);
     const double ragged = start.outer.major < kTellable ? kMisfit : kRaggedMisfit;
     return soft && is_whole(image, *soft, settings, noise * 6 / 16, ragged, kMostRagged) ? soft

@@ -51,47 +51,9 @@ class Compass {
     float x_, y_, between_, xx_, xy_, yy_;
 };
 
-/// Residuals on an edge of the ring by sector: squared ones, each with its slope as the weight, and their
-/// regression on the slope, which is how far the edge is off.
-struct Misfit {
-    std::array<double, kSectors> rr{}, weight{}, squared{}, moved{};
-    void add(int sector, double slope, double r) {
-        const auto s = size_t(sector);
-        const double w = std::abs(slope);
-        rr[s] += w * r * r, weight[s] += w, squared[s] += w * w, moved[s] += slope * r;
-    }
-    /// The sectors whose mean is more than `noise` and `slack` explain, but for a chance of four sigmas.
-    Sectors beyond(double noise, double slack) const {
-        Sectors off = 0;
-        for (size_t s = 0; s < kSectors; ++s) {
-            const double chance = kChance * std::sqrt(2 * squared[s]);
-            const double limit = noise * noise * (weight[s] + chance) + slack * slack * weight[s];
-            off |= Sectors(rr[s] > limit) << s;
-        }
-        return off;
-    }
-    Displacement displacement(double noise) const {
-        constexpr int span = 2 * kAround + 1;
-        const double least = kSeen * span / kSectors * std::accumulate(squared.begin(), squared.end(), 0.0);
-        double sum = 0, chance = 0;
-        int seen = 0;
-        for (int s = 0; s < kSectors; ++s) {
-            double across = 0, along = 0;
-            for (int k = s - kAround; k <= s + kAround; ++k) {
-                const auto at = size_t(k + kSectors) % kSectors;
-                across += moved[at], along += squared[at];
-            }
-            if (along <= least) continue;
-            sum += across * across / (along * along), chance += noise * noise / along, ++seen;
-        }
-        const double n = std::max(seen, 1);
-        return {std::sqrt(sum / n), std::sqrt(chance / n)};
-    }
-};
-
 /// Of the outer edge and of the inner one.
 ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, const Compass& compass,
-                               std::array<Misfit, 2>& misfit) {
+                               std::array<SectorSums, 2>& edges) {
     Gradient at;
     for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
         const int lanes = std::min(kChunk, (pixels.count - begin) / kLanes);
@@ -102,8 +64,8 @@ ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, con
             const Lanes slope = at.ring[n], residual = at.residual[n];
             for (int k = 0; k < kLanes; ++k)
                 if (std::abs(residual[k]) < 256)  // others are clipped, or none
-                    misfit[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(slope[k]),
-                                                            double(residual[k]));
+                    edges[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(slope[k]),
+                                                           double(residual[k]));
         }
     }
 }
@@ -147,31 +109,57 @@ ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePix
     pixels.keep(kept);
 }
 
-namespace {
+void SectorSums::add(int sector, double slope, double residual) {
+    const auto s = size_t(sector);
+    const double w = std::abs(slope);
+    rr_[s] += w * residual * residual, weight_[s] += w, squared_[s] += w * w, moved_[s] += slope * residual;
+}
 
-/// Of the outer edge and of the inner one, by the model `p` in the image's frame.
-std::array<Misfit, 2> find_misfit(const ImageView& image, const Parameters& p) {
+Sectors SectorSums::beyond(double noise, double slack) const {
+    Sectors off = 0;
+    for (size_t s = 0; s < kSectors; ++s) {
+        const double chance = kChance * std::sqrt(2 * squared_[s]);
+        const double limit = noise * noise * (weight_[s] + chance) + slack * slack * weight_[s];
+        off |= Sectors(rr_[s] > limit) << s;
+    }
+    return off;
+}
+
+Displacement SectorSums::displacement(double noise) const {
+    constexpr int span = 2 * kAround + 1;
+    const double least = kSeen * span / kSectors * std::accumulate(squared_.begin(), squared_.end(), 0.0);
+    double sum = 0, chance = 0;
+    int seen = 0;
+    for (int s = 0; s < kSectors; ++s) {
+        double across = 0, along = 0;
+        for (int k = s - kAround; k <= s + kAround; ++k) {
+            const auto at = size_t(k + kSectors) % kSectors;
+            across += moved_[at], along += squared_[at];
+        }
+        if (along <= least) continue;
+        sum += across * across / (along * along), chance += noise * noise / along, ++seen;
+    }
+    const double n = std::max(seen, 1);
+    return {std::sqrt(sum / n), std::sqrt(chance / n)};
+}
+
+EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
+    : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
     EdgePixels pixels;
     pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
-    std::array<Misfit, 2> misfit;
-    add_misfit(pixels, Model(local), Compass(local), misfit);
-    return misfit;
+    add_misfit(pixels, Model(local), Compass(local), edges_);
 }
 
-}  // namespace
-
-Hidden find_hidden(const ImageView& image, const Parameters& p, double noise, double slack) {
-    const auto [outer, inner] = find_misfit(image, p);
-    return {widen(outer.beyond(noise, slack), circle_image(p, 1)),
-            widen(inner.beyond(noise, slack), circle_image(p, p[kRatio]))};
+Hidden EdgeMisfit::hidden(double noise, double slack) const {
+    return {widen(edges_[0].beyond(noise, slack), circles_[0]),
+            widen(edges_[1].beyond(noise, slack), circles_[1])};
 }
 
-std::array<Displacement, 2> find_displacements(const ImageView& image, const Parameters& p, double noise) {
-    const auto [outer, inner] = find_misfit(image, p);
-    return {outer.displacement(noise), inner.displacement(noise)};
+std::array<Displacement, 2> EdgeMisfit::displacements(double noise) const {
+    return {edges_[0].displacement(noise), edges_[1].displacement(noise)};
 }
 
 }  // namespace roundel
