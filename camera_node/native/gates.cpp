@@ -12,8 +12,10 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBeyond = 30;           // grey levels by which a blurred ring's may seem beyond the scale
-constexpr double kMisfit = 0.045;        // of the contrast, RMS on the ring's edges
+constexpr double kTiny = 11;       // pixels: of smaller ones blur and ratio trade places,
+constexpr double kUnsure = 0.04;   // so twice a ratio's standard deviation is granted, of so much at most
+constexpr double kBeyond = 30;     // grey levels by which a blurred ring's may seem beyond the scale
+constexpr double kMisfit = 0.045;  // of the contrast, RMS on the ring's edges
 constexpr double kRaggedMisfit = 0.062;  // of softened edges that were drawn as hard steps
 constexpr double kOff = 0.15;            // pixels by which an edge may be off all around, of most sizes, and
 constexpr double kOffRadius = 0.04;      // of its radius, of the smallest
@@ -69,18 +71,23 @@ bool is_whole(const ImageView& image, const Fit& fit, const Settings& settings, 
            has_surface(image, fit);
 }
 
+/// Whether the ratio is a print's, but for the tolerance and for what noise makes of the smallest.
+bool has_ratio(const Fit& fit, const Settings& settings) {
+    const double chance = fit.outer.major < kTiny ? 2 * std::min(fit.ratio_sigma, kUnsure) : 0;
+    return settings.ratio_error(fit.ratio) <= std::hypot(settings.ratio_tolerance, chance);
+}
+
 /// Whether a fit that failed looks as if only its edges were ragged.
 bool may_be_ragged(const Fit& fit, const Settings& settings) {
-    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
-           fit.bright - fit.dark >= settings.min_contrast / 2 && fit.support >= kRaggedSupport;
+    return has_ratio(fit, settings) && fit.bright - fit.dark >= settings.min_contrast / 2 &&
+           fit.support >= kRaggedSupport;
 }
 
 }  // namespace
 
 bool has_limits(const Fit& fit, const Settings& settings) {
-    return settings.ratio_error(fit.ratio) <= settings.ratio_tolerance &&
-           fit.bright - fit.dark >= settings.min_contrast && fit.dark > -kBeyond &&
-           fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
+    return has_ratio(fit, settings) && fit.bright - fit.dark >= settings.min_contrast &&
+           fit.dark > -kBeyond && fit.bright < 255 + kBeyond && fit.outer.major >= settings.min_diameter &&
            fit.outer.major <= settings.max_diameter;
 }
 

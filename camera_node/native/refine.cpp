@@ -249,6 +249,7 @@ std::array<Vector<kPoseCount>, kPoseCount> Fitter::pose_covariance() const {
 Fit Fitter::fit() const {
     Fit fit = fit_of(p, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
     if (print_ > 0) fit.p[kRatio] = print_;
+    fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(left_.ring_rr / left_.ring);
     fit.noise = scale_;
     fit.support = left_.agreeing / left_.ring * pixels_.used / pixels_.expected;

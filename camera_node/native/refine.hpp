@@ -30,6 +30,7 @@ struct Fit {
     double offset_x, offset_y;  // from the ellipse's centre to where the disc's own centre projects, pixels
     PoseCovariance C;
     double ratio;          // inner over outer diameter, as measured without the print
+    double ratio_sigma;    // its standard deviation
     double dark, bright;   // grey levels
     double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
     double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
