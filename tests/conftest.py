@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,6 +46,17 @@ def free_port() -> int:
     """A TCP port that nobody listens on now."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return probe.getsockname()[1]
+
+
+def wait_for_port(port: int, deadline_s: float = 120.0) -> None:
+    """Return as soon as somebody listens on a TCP port here; fail loudly when nobody does."""
+    end = time.monotonic() + deadline_s
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=1).close()
+        except OSError:
+            assert time.monotonic() < end, "nobody listens"
+            time.sleep(0.05)
 
 
 @pytest.fixture

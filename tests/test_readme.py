@@ -5,10 +5,8 @@ import os
 import re
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +14,7 @@ import cv2
 import pytest
 
 from tests.calib.test_intrinsics import SPEC, board_poses, render
-from tests.conftest import free_port
+from tests.conftest import free_port, wait_for_port
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -150,17 +148,6 @@ def test_the_live_programs(server: tuple[Path, str]):
     finally:
         process.terminate()
         assert process.wait(20) == 0
-
-
-def wait_for_port(port: int) -> None:
-    end = time.monotonic() + DEADLINE_S
-    while True:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=1).close()
-            return
-        except OSError:
-            assert time.monotonic() < end, "nobody listens"
-            time.sleep(0.05)
 
 
 def test_the_subscription_prints_poses(tmp_path: Path, scene: Path, endpoint: str):

@@ -9,13 +9,10 @@ import contextlib
 import io
 import os
 import re
-import shutil
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,23 +24,13 @@ import zenoh
 from camera_node.messages import CameraStatus, Detections, decode
 from camera_node.scene import Scene
 from camera_node.simulation import exposure_middle_s
-from tests.conftest import free_port
+from tests.conftest import free_port, wait_for_port
+from tests.web.test_view import CHROMIUM, FLAGS
 from web.demo import Demo, default_scene
 from web.processes import Processes, ended_by_signals
 
-LISTENS_S = 60.0  # until the page can be opened
 BUSY = "while True: pass"
-CHROMIUM = [
-    "chromium",
-    "--headless=new",
-    "--no-sandbox",
-    "--no-first-run",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--window-size=1000,700",
-    "--remote-debugging-port=0",  # stays until it is stopped
-]
+STAYS = "--remote-debugging-port=0"  # until it is stopped
 
 
 class Stamps:
@@ -105,6 +92,8 @@ def main(
         runs: of the demo.
         seconds: that robots are followed in each.
     """
+    if browser and CHROMIUM is None:
+        sys.exit("chromium is not installed")
     if apart:
         os.environ["PYTHONPATH"] = str(Path(__file__).parent / "apart")
     errors: list[float] = []
@@ -156,11 +145,13 @@ def browsing(port: int) -> Iterator[None]:
     """A browser on the page, as soon as it is served."""
     programs: list[subprocess.Popen] = []
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        command = [*CHROMIUM, f"--user-data-dir={profile}", f"http://127.0.0.1:{port}"]
+        assert CHROMIUM is not None
+        options = ["--headless=new", "--no-first-run", "--window-size=1000,700", STAYS]
+        command = [CHROMIUM, *FLAGS, *options, f"--user-data-dir={profile}", f"http://127.0.0.1:{port}"]
 
         def open_page() -> None:
-            if listens(port):
-                programs.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
+            wait_for_port(port)
+            programs.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
 
         opener = threading.Thread(target=open_page)
         opener.start()
@@ -171,16 +162,6 @@ def browsing(port: int) -> Iterator[None]:
             end(programs)
 
 
-def listens(port: int) -> bool:
-    """Whether somebody listens on the port in time."""
-    end_s = time.monotonic() + LISTENS_S
-    while time.monotonic() < end_s:
-        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
-            return True
-        time.sleep(0.1)
-    return False
-
-
 def end(programs: list[subprocess.Popen]) -> None:
     """Stop programs and wait for them."""
     for program in programs:
@@ -189,6 +170,4 @@ def end(programs: list[subprocess.Popen]) -> None:
 
 
 if __name__ == "__main__":
-    if shutil.which("chromium") is None and "--browser" in sys.argv:
-        sys.exit("chromium is not installed")
     tyro.cli(main)
