@@ -2,7 +2,7 @@
 # `make demo` and `make test` set themselves up: a virtual environment in the checkout, and nothing outside it.
 PYTHON ?= python3
 BIN := .venv/bin
-NATIVE := $(wildcard camera_node/native/* fusion/native/*)
+NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
 
 .PHONY: demo test check setup format clean
 
@@ -15,14 +15,14 @@ test: .venv/ready
 check: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/clang-format --dry-run --Werror $(filter %.cpp %.hpp,$(NATIVE))
+	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
 
 format: .venv/ready
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
-	$(BIN)/clang-format -i $(filter %.cpp %.hpp,$(NATIVE))
+	$(BIN)/clang-format -i $(NATIVE)
 
 setup: .venv/ready
 

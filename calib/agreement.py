@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.alignment import rigid_motions
 from calib.errors import CalibrationError
 from calib.rig import Rig
-from camera_node.pose import adjoint, invert
+from camera_node.geometry.pose import adjoint, invert
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from calib.coverage import Coverage, enumerate_words
 from calib.errors import CalibrationError
 from calib.intrinsics import MIN_VIEWS, BoardViews, CalibratedLens, Model
 from calib.lens_adjustment import BoardView
-from camera_node.pixels import Grey
+from camera_node.sources.grey import Grey
 
 NEW = 0.04  # of the image's width, that a view must differ from every one before
 EVERY = 5  # views, between two trial calibrations

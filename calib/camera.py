@@ -6,8 +6,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.lens import Lens
-from camera_node.pose import Pose, invert, skew
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import Pose, invert, skew
 
 Array = NDArray[np.float64]
 AnyLens = TypeVar("AnyLens", bound=Lens)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.problem import Observations
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -22,9 +22,9 @@ from calib.pairwise import INTERPOLATED, SLOWEST_S, Pairs, sampson
 from calib.sightings import Frames, Sightings
 from calib.start import Start, find_start
 from calib.trajectory import finite_velocities, hermite
-from camera_node.body import Body
-from camera_node.lens import Lens
-from camera_node.pose import invert, skew
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import invert, skew
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_array

@@ -10,9 +10,9 @@ import numpy as np
 import zenoh
 
 from camera_node.errors import CameraError
-from camera_node.messages import Keys
-from camera_node.pixels import Grey, grey
-from camera_node.replay import IMAGES, read_grey
+from camera_node.protocol.messages import Keys
+from camera_node.sources.grey import Grey, grey
+from camera_node.sources.replay import IMAGES, read_grey
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
 MAX_FRAMES = 600  # of a video that are looked at, evenly spread: a lens needs 60 good ones

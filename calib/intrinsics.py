@@ -15,8 +15,8 @@ from calib.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.errors import CalibrationError
 from calib.lens_adjustment import AdjustedLens, BoardView, adjust_lens, locate, start_lens
 from calib.rig import Rig
-from camera_node.lens import Lens
-from camera_node.pixels import Grey
+from camera_node.geometry.lens import Lens
+from camera_node.sources.grey import Grey
 
 Array = NDArray[np.float64]
 Model = Literal["pinhole", "fisheye"]

@@ -19,8 +19,8 @@ from calib.ends import label_ends
 from calib.errors import CalibrationError
 from calib.sightings import Frames, Sightings, ranges
 from calib.tracks import follow
-from camera_node.body import Body
-from camera_node.lens import Lens
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -16,7 +16,7 @@ from calib.alignment import rigid_motions
 from calib.camera import Camera, transform
 from calib.errors import CalibrationError
 from calib.triangulation import triangulate_point
-from camera_node.messages import Detections
+from camera_node.protocol.messages import Detections
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The least squares problem of one lens and the poses in which a board stood before it (Zhang 2000, section 3).
 
-Works for every model that `camera_node.lens` knows: it asks the lens for its derivatives. Poses are eliminated view by
+Works for every model that `camera_node.geometry.lens` knows: it asks the lens for its derivatives. Poses are eliminated view by
 view (the Schur complement of bundle adjustment), so the cost grows with the number of views, not with its cube.
 """
 
@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.lens import Lens
-from camera_node.pose import rotation_from_vector
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import rotation_from_vector
 
 Array = NDArray[np.float64]
 

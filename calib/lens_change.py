@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib.adjustment import Adjusted
 from calib.problem import LENS
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 CLEAR = 2.0  # sigmas, root mean square of the four parameters: below, a lens is as it was given
 

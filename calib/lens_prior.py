@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.adjustment import Adjusted
 from calib.camera import Camera
 from calib.problem import LENS, Problem
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 

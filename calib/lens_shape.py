@@ -16,7 +16,7 @@ from calib.adjustment import Adjusted
 from calib.linearisation import Linearisation
 from calib.marginal import marginalise
 from calib.problem import SHAPE, Observations
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from calib.coverage import Coverage
 from calib.errors import CalibrationError
 from calib.messages import RigMessage
 from calib.rig import Rig
-from camera_node.messages import Detections, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
 LOOK_EVERY_S = 0.2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What calibration says over Zenoh, in the encoding of `camera_node.messages`; the key is `Keys.rig`."""
+"""What calibration says over Zenoh, in the encoding of `camera_node.protocol.messages`; the key is `Keys.rig`."""
 
 import time
 
@@ -7,7 +7,7 @@ import msgspec
 import yaml
 
 from calib.rig import Rig, dump_rig
-from camera_node.messages import VERSION, MessageError
+from camera_node.protocol.messages import VERSION, MessageError
 
 
 class RigMessage(msgspec.Struct, frozen=True, kw_only=True):

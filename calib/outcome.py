@@ -20,7 +20,7 @@ from calib.rig import Rig
 from calib.scale import Distance, compare, loosen
 from calib.solution import Solution
 from calib.world import move, upright
-from camera_node.pose import Pose
+from camera_node.geometry.pose import Pose
 
 Array = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from calib.camera import transform
 from calib.shifts import EVIDENCE, FITTED, Common, common_sightings, find_shift
 from calib.sightings import Sightings, ranges
 from calib.tracks import Track, tracks_of
-from camera_node.body import Body
-from camera_node.lens import Lens
-from camera_node.pose import invert
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import invert
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.camera import Camera
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
-from camera_node.pose import Pose, look_at
+from camera_node.geometry.pose import Pose, look_at
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]

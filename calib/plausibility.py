@@ -15,8 +15,8 @@ from calib.lens_prior import usual_sigma
 from calib.linearisation import Linearisation
 from calib.problem import LENS, Observations
 from calib.sightings import Sightings, ranges
-from camera_node.body import Body
-from camera_node.lens import Lens
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from calib.camera import with_distortion
 from calib.trajectory import AffineWand
-from camera_node.lens import Lens
-from camera_node.pose import adjoint, invert, rotation_from_vector
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -19,9 +19,9 @@ from calib.problem import LENS, OFFSET, POSE, Observations
 from calib.rig import Rig
 from calib.solution import with_disc_centres
 from calib.wand import check_recording, gather_wave, read
-from camera_node.body import Body
-from camera_node.messages import Detections
-from camera_node.pose import Pose, invert
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import Pose, invert
+from camera_node.protocol.messages import Detections
 
 Array = NDArray[np.float64]
 

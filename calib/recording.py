@@ -18,7 +18,7 @@ from mcap.writer import Writer
 
 from calib.history import keep
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 MAGIC = 8  # bytes that every MCAP begins with
 CHUNK = 1 << 16  # bytes, compressed together: what is lost of a recording that is cut off

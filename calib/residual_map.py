@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.errors import ConfigError
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 

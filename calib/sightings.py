@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.lens import Lens
-from camera_node.messages import Detections
+from camera_node.geometry.lens import Lens
+from camera_node.protocol.messages import Detections
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

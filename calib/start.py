@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.pairwise import MIN_INSTANTS, MIN_SHARE, Pairs, TwoView
 from calib.tracks import Track
-from camera_node.pose import invert
+from camera_node.geometry.pose import invert
 
 Array = NDArray[np.float64]
 

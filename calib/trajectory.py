@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.body import Body
+from camera_node.geometry.body import Body
 
 Array = NDArray[np.float64]
 

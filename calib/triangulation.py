@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from calib.camera import Camera, pixel_jacobians, transform
 from calib.errors import CalibrationError
 from calib.problem import POSE
-from camera_node.lens import Lens
-from camera_node.pose import invert
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import invert
 
 Array = NDArray[np.float64]
 Sees = Callable[[Camera, Array], NDArray[np.bool_]]

@@ -18,8 +18,8 @@ from calib.outcome import Calibration
 from calib.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.report import CameraReport
 from calib.triangulation import Joint
-from camera_node.body import Body
-from camera_node.pose import invert
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import invert
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ from calib.sightings import Frames, Sightings, frame_counts, gather
 from calib.solution import Solution, solve
 from calib.start import Start, explain_unplaced, find_start
 from calib.wave import Wave
-from camera_node.body import Body
-from camera_node.lens import Lens
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+from camera_node.protocol.messages import Detections
 
 Array = NDArray[np.float64]
 

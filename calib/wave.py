@@ -14,8 +14,8 @@ from calib.sightings import Sightings
 from calib.start import triangulate
 from calib.tracks import Track
 from calib.trajectory import AffineWand, acceleration_density, finite_velocities
-from camera_node.body import Body
-from camera_node.lens import Lens
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

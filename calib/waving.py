@@ -26,8 +26,8 @@ from calib.rig import Rig
 from calib.scale import Distance
 from calib.trust import assess
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 
 MOST_S = 180.0  # that a wave may last when it ends by itself
 TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions

@@ -15,7 +15,7 @@ from calib.errors import CalibrationError
 from calib.rig import Rig
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
-from camera_node.pose import Pose
+from camera_node.geometry.pose import Pose
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ import zenoh
 from calib.messages import RigMessage
 from calib.rig import Rig
 from camera_node.errors import NetworkError
-from camera_node.messages import Keys, MessageError, decode
-from camera_node.network import open_client
+from camera_node.protocol.messages import Keys, MessageError, decode
+from camera_node.protocol.session import open_client
 from fusion.messages import FusionStatus, Markers, RobotPose, RobotsRequest
 from fusion.requests import AGAIN_S, change_robots, undo_correction
 from fusion.robots import Robot as RobotBody

@@ -10,7 +10,7 @@ import tyro
 
 from camera_node.config import is_name
 from camera_node.errors import ConfigError
-from camera_node.network import open_client
+from camera_node.protocol.session import open_client
 from fusion.measuring import find_standing, robot_of, watch
 from fusion.messages import RobotsRequest
 from fusion.requests import change_robots

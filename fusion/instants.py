@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera
-from camera_node.lens import Lens
-from camera_node.messages import Detections
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.lens import Lens
+from camera_node.protocol.messages import Detections
 from fusion.undistortion import undistort
 
 Array = NDArray[np.float64]

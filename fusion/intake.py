@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.camera import Camera
-from camera_node.messages import Detections, Keys, MessageError, decode
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.health import Health
 from fusion.instants import Frame
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import zenoh
 
-from camera_node.messages import encode
-from camera_node.network import open_client, open_router
-from camera_node.requests import respond
+from camera_node.protocol.messages import encode
+from camera_node.protocol.requests import respond
+from camera_node.protocol.session import open_client, open_router
 from fusion.config import ArenaConfig
 from fusion.shards import Shard
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from camera_node.messages import Keys, MessageError, decode
+from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.messages import Markers
 from fusion.robots import Motion, Robot

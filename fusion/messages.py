@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the server says over Zenoh, in the encoding of `camera_node.messages`."""
+"""What the server says over Zenoh, in the encoding of `camera_node.protocol.messages`."""
 
 import math
 from typing import Literal
@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.messages import VERSION, MessageError
+from camera_node.protocol.messages import VERSION, MessageError
 from fusion.robots import Robot
 
 Array = NDArray[np.float64]

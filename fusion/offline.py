@@ -16,8 +16,8 @@ from calib.recording import RecordingWriter, iterate
 from calib.rig import load_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections, Keys, encode
-from camera_node.observations import detect_frames, read_observations
+from camera_node.protocol.messages import Detections, Keys, encode
+from camera_node.sources.observations import detect_frames, read_observations
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose
 from fusion.recording import read_recording

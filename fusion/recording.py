@@ -21,8 +21,8 @@ from calib.messages import RigMessage
 from calib.recording import RecordingWriter, iterate
 from calib.rig import Rig
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections, Keys, MessageError, decode
-from camera_node.network import open_client
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.session import open_client
 from fusion.messages import RobotPose, Robots, robots_key
 from fusion.robots import Robot
 

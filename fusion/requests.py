@@ -8,7 +8,7 @@ import zenoh
 from calib.messages import RigMessage
 from calib.rig import Rig
 from camera_node.errors import NetworkError
-from camera_node.messages import MessageError, decode, encode
+from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.errors import FusionError
 from fusion.messages import Robots, RobotsRequest, robots_key, undo_key
 from fusion.robots import Robot

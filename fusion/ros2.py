@@ -21,7 +21,7 @@ import tyro
 import zenoh
 
 from camera_node.errors import ConfigError
-from camera_node.network import open_client
+from camera_node.protocol.session import open_client
 from fusion.client import Arena
 from fusion.messages import RobotPose
 from fusion.ros2_messages import TYPE_HASHES, odometry, pose_stamped, transform

@@ -10,7 +10,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose import rotation_from_wxyz, skew
+from camera_node.geometry.pose import rotation_from_wxyz, skew
 from fusion.messages import RobotPose
 
 Array = NDArray[np.float64]

@@ -19,9 +19,9 @@ import zenoh
 from calib.camera import Camera
 from calib.messages import RigMessage
 from calib.rig import load_rig, save_rig
-from camera_node.clock import clock_id
-from camera_node.messages import ClockReply, Keys, MessageError, decode, encode
-from camera_node.requests import encode_reply, parse_request, payload_of
+from camera_node.protocol.host_clock import clock_id
+from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
+from camera_node.protocol.requests import encode_reply, parse_request, payload_of
 from fusion.calibration import Calibration
 from fusion.config import ArenaConfig
 from fusion.health import Health

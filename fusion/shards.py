@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.errors import ConfigError
-from camera_node.pose import rotation_from_wxyz
+from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.messages import ShardPoses, State
 from fusion.state import States, exp_so3, wxyz_of
 

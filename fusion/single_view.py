@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.disc import decompose
+from camera_node.detection.disc_pose import decompose
 from fusion.estimator import AXIS_SIGMA_PX
 from fusion.grouping import SPEED_M_S, Marker
 from fusion.loose import Free

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 from fusion import _core
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import Camera, pixel_jacobians
-from camera_node.pose import Pose, rotation_from_vector
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.instants import Frame
 
 Array = NDArray[np.float64]

@@ -15,12 +15,12 @@ def build(
     """The program of a driver and the sources of `native`, all or those called `only`; bindings are left out."""
 
     def compile_one(source: Path) -> Path:
-        made = folder / f"{source.stem}.o"
+        made = folder / f"{source.parent.name}_{source.stem}.o"
         command = ["c++", *FLAGS, f"-I{native}", *flags, "-c", source, "-o", made]
         subprocess.run(command, check=True, timeout=300)
         return made
 
-    sources = [path for name in only for path in native.glob(f"{name}.cpp")]
+    sources = [path for name in only for path in native.rglob(f"{name}.cpp")]
     sources = [path for path in sources if not path.name.startswith("bind")]
     with ThreadPoolExecutor(2) as pool:
         objects = list(pool.map(compile_one, [*sources, driver]))

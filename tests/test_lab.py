@@ -23,8 +23,8 @@ import fusion.__main__ as fusion_program
 import web.__main__ as web_program
 from calib.live import publish
 from calib.rig import Rig
-from camera_node.messages import Detections, Keys, Roundels, decode, encode
-from camera_node.network import open_client
+from camera_node.protocol.messages import Detections, Keys, Roundels, decode, encode
+from camera_node.protocol.session import open_client
 from fusion.client import Arena
 from fusion.messages import FusionStatus
 from tests.camera_node.conftest import DEADLINE_S, Inbox, eventually

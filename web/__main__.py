@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from camera_node.errors import run
-from camera_node.network import open_client
+from camera_node.protocol.session import open_client
 from web.feed import Feed
 from web.replay import Replay
 from web.subscription import Subscription

@@ -14,9 +14,9 @@ from calib.live import publish
 from calib.recording import save_wave, wave_beside
 from calib.rig import load_rig
 from calib.waving import MOST_S, Progress, wave
-from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
+from camera_node.geometry.body import Body
 from web.errors import WebError
 from web.panel import plain, write
 from web.subscription import Subscription

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.messages import Detections
+from camera_node.protocol.messages import Detections
 
 WIDTH = 160  # pixels of the small picture
 CELLS = 8  # of the grid that the share counts, in each direction

@@ -19,9 +19,9 @@ from calib.live import publish
 from calib.rig import Rig, load_rig, save_rig
 from calib.world import align
 from camera_node.errors import ConfigError
-from camera_node.messages import encode
-from camera_node.network import open_client
-from camera_node.scene import Scene
+from camera_node.protocol.messages import encode
+from camera_node.protocol.session import open_client
+from camera_node.simulation.scene import Scene
 from fusion.messages import RobotPose
 from web.errors import WebError
 from web.feed import Feed, Latest

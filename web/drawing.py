@@ -9,7 +9,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from calib.camera import Camera
-from camera_node.pose import wxyz_from_rotation
+from camera_node.geometry.pose import wxyz_from_rotation
 from web.feed import FAR_M, Latest
 from web.tables import robot_state
 from web.trails import Trails, fade

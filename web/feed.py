@@ -13,7 +13,7 @@ import msgspec
 
 from calib.messages import RigMessage
 from calib.rig import Rig
-from camera_node.messages import CameraStatus, Detections, Keys, MessageError, decode
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from fusion.messages import FusionStatus, Markers, RobotPose
 from web.coverage import Coverage
 from web.messages import Progress, progress_key

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the demo says over Zenoh, in the encoding of `camera_node.messages`: how far it is, and what is true."""
+"""What the demo says over Zenoh, in the encoding of `camera_node.protocol.messages`: how far it is, and what is true."""
 
 import math
 
 import msgspec
 
-from camera_node.messages import VERSION, MessageError
+from camera_node.protocol.messages import VERSION, MessageError
 
 Vector = tuple[float, float, float]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose import rotation_from_wxyz
+from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.messages import RobotPose
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from zenoh import Session
 from calib.commands.output import say
 from calib.live import publish
 from calib.rig import Rig
-from camera_node.network import open_client
+from camera_node.protocol.session import open_client
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,10 +24,10 @@ from calib.scale import SIGMA_M, Distance
 from calib.trust import assess
 from calib.wand import calibrate
 from calib.waving import MOST_S, wave
-from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 
 
 @dataclass(frozen=True, kw_only=True)

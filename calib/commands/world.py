@@ -20,10 +20,10 @@ from calib.landmarks import is_line, locate_places, still_roundels
 from calib.live import collect
 from calib.rig import Rig, load_rig
 from calib.world import align, align_places, read_positions, require_above, stand
-from camera_node.body import Body
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 
 UPSIDE_DOWN = 0.3  # of the images' downward axes, that points up, on average
 Places = Mapping[str, NDArray[np.float64]]

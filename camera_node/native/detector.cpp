@@ -5,10 +5,10 @@
 #include <cmath>
 #include <optional>
 
-#include "circles.hpp"
-#include "gates.hpp"
-#include "moving.hpp"
-#include "surface.hpp"
+#include "search/ray_fit.hpp"
+#include "verify/acceptance.hpp"
+#include "blur/moving.hpp"
+#include "verify/level_check.hpp"
 
 namespace roundel {
 

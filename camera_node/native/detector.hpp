@@ -3,13 +3,13 @@
 #include <mutex>
 #include <vector>
 
-#include "chords.hpp"
-#include "claims.hpp"
-#include "image.hpp"
-#include "paper.hpp"
-#include "threshold.hpp"
+#include "search/chords.hpp"
+#include "search/suppression.hpp"
+#include "numeric/image.hpp"
+#include "reference/faigl2013.hpp"
+#include "search/threshold.hpp"
 #include "tracks.hpp"
-#include "watch.hpp"
+#include "search/change_mask.hpp"
 
 namespace roundel {
 

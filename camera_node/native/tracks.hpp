@@ -2,8 +2,8 @@
 #pragma once
 #include <vector>
 
-#include "chords.hpp"
-#include "refine.hpp"
+#include "search/chords.hpp"
+#include "fit/photometric_fit.hpp"
 
 namespace roundel {
 

@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "../../camera_node/native/simd.hpp"
+#include "../../camera_node/native/numeric/simd.hpp"
 
 namespace roundel::fusion {
 namespace {

@@ -5,7 +5,7 @@
 #include <stdexcept>
 
 #include "../../camera_node/native/cholesky.hpp"
-#include "../../camera_node/native/simd.hpp"
+#include "../../camera_node/native/numeric/simd.hpp"
 
 namespace roundel::fusion {
 namespace {

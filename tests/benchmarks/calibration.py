@@ -21,9 +21,9 @@ from calib.camera import Camera
 from calib.outcome import Calibration
 from calib.rig import Rig, load_rig
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
-from camera_node.observations import read_observations
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+from camera_node.sources.observations import read_observations
 from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 

@@ -21,9 +21,9 @@ import numpy as np
 import tyro
 import zenoh
 
-from camera_node.messages import CameraStatus, Detections, decode
-from camera_node.scene import Scene
-from camera_node.simulation import exposure_middle_s
+from camera_node.protocol.messages import CameraStatus, Detections, decode
+from camera_node.simulation.camera import exposure_middle_s
+from camera_node.simulation.scene import Scene
 from tests.conftest import free_port, wait_for_port
 from tests.web.test_view import CHROMIUM, FLAGS
 from web.demo import Demo, default_scene

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.messages import Detections, decode, encode
+from camera_node.protocol.messages import Detections, decode, encode
 from fusion.instants import Frame, Instants
 from fusion.messages import Latency, RobotPose, ShardPoses
 from fusion.server import collecting_between_instants

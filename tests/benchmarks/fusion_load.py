@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from calib.camera import Camera
-from camera_node.messages import Detections
-from camera_node.pose import Pose, look_at
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import Pose, look_at
+from camera_node.protocol.messages import Detections
 from fusion.errors import FusionError
 from fusion.instants import Frame
 from fusion.optics import Exposures, Optics

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import tyro
 
-from camera_node.messages import encode
+from camera_node.protocol.messages import encode
 from fusion.health import memory_mb
 from fusion.server import collecting_between_instants
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series

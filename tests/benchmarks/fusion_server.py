@@ -20,8 +20,8 @@ import tyro
 import zenoh
 
 from calib.rig import Rig, save_rig
-from camera_node.messages import Detections, Keys, encode
-from camera_node.network import open_client
+from camera_node.protocol.messages import Detections, Keys, encode
+from camera_node.protocol.session import open_client
 from fusion.client import Arena, Stream
 from fusion.messages import FusionStatus
 from tests.benchmarks.fusion_load import START_NS, Load

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.rendering import Renderer
-from camera_node.scene import Scene
+from camera_node.simulation.renderer import Renderer
+from camera_node.simulation.scene import Scene
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml"
 FRAMES = 200

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 
 from calib.rig import Rig
-from camera_node.messages import Detections
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections
 
 Change = Callable[[Roundels, Detections], Roundels]
 

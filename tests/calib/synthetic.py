@@ -12,10 +12,10 @@ from calib.agreement import Placed, compare
 from calib.camera import Camera, transform
 from calib.outcome import Calibration
 from calib.rig import Rig
-from camera_node.body import Body
-from camera_node.messages import Detections
-from camera_node.pose import Pose, invert, look_at, rotation_from_vector
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector
+from camera_node.protocol.messages import Detections
 
 Array = NDArray[np.float64]
 

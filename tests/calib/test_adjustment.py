@@ -18,9 +18,9 @@ from calib.rig import Rig
 from calib.sightings import gather
 from calib.trajectory import hermite_rate, interpolate, locate
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
-from camera_node.pose import skew
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import skew
+from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import altered, repack
 from tests.calib.synthetic import camera_errors, outlines, record, ring
 from tests.calib.wave import Recorded, Wave

@@ -12,7 +12,7 @@ from calib.commands.check import placed, split
 from calib.errors import CalibrationError
 from calib.rig import Rig
 from calib.wand import calibrate
-from camera_node.pose import Pose, rotation_from_vector
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from tests.calib.synthetic import CAREFUL, Arena, record, ring, roughly
 
 Array = NDArray[np.float64]

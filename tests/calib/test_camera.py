@@ -6,7 +6,7 @@ import pytest
 
 from calib.camera import pixel_jacobians, with_distortion
 from calib.problem import LENS, PER_CAMERA, POSE, State
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 SIZE = {"width": 1280, "height": 800, "fx": 810.0, "fy": 805.0, "cx": 633.0, "cy": 404.0}
 LENSES = {

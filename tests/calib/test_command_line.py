@@ -16,8 +16,8 @@ import pytest
 
 from calib.camera import Camera
 from calib.rig import Rig, load_rig, save_rig
-from camera_node.observations import write_observations
-from camera_node.pose import Pose, invert
+from camera_node.geometry.pose import Pose, invert
+from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.test_world import L_FRAME, elsewhere, lie_still
 

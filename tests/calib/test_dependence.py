@@ -11,8 +11,8 @@ from calib.agreement import Agreement, compare
 from calib.commands.check import placed, split
 from calib.outcome import Calibration
 from calib.wand import calibrate
-from camera_node.messages import Detections
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import Arena, record, ring
 
 SEEDS = range(4)

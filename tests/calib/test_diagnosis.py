@@ -9,8 +9,8 @@ import pytest
 
 from calib.errors import CalibrationError
 from calib.wand import calibrate
-from camera_node.messages import Detections
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import WAND, Arena, record, ring
 
 HOUR_NS, TWO_S_NS = 3_600_000_000_000, 2_000_000_000

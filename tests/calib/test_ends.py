@@ -13,8 +13,8 @@ from calib.errors import CalibrationError
 from calib.outcome import Calibration
 from calib.sightings import gather
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 

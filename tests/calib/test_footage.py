@@ -11,9 +11,9 @@ import pytest
 
 from calib.footage import find_cameras, read_frames, take_snapshots
 from camera_node.errors import CameraError
-from camera_node.messages import Keys
-from camera_node.network import open_client, open_router
-from camera_node.requests import encode_jpeg, parse_quality, respond
+from camera_node.protocol.messages import Keys
+from camera_node.protocol.requests import encode_jpeg, parse_quality, respond
+from camera_node.protocol.session import open_client, open_router
 
 IMAGE = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
 

@@ -23,8 +23,8 @@ from calib.lens_adjustment import BoardView, adjust_lens
 from calib.residual_map import draw_residuals
 from calib.rig import Rig, load_rig
 from camera_node.errors import ConfigError
-from camera_node.lens import Lens
-from camera_node.pose import rotation_from_vector
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import rotation_from_vector
 
 LENS = Lens(
     width=640, height=480, fx=520.0, fy=523.0, cx=325.0, cy=236.0, distortion=(-0.12, 0.04, 0.0, 0.0, 0.0)

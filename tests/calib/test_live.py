@@ -9,8 +9,8 @@ from calib.errors import CalibrationError
 from calib.live import collect, publish
 from calib.messages import RigMessage
 from calib.rig import dump_rig
-from camera_node.messages import Keys, decode, encode
-from camera_node.network import open_client, open_router
+from camera_node.protocol.messages import Keys, decode, encode
+from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import record, ring
 
 

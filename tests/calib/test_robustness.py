@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import chi2
 
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import anywhere, in_a_mirror, in_runs, nothing, onto_a_feature, swap_ends
 from tests.calib.synthetic import joint_error
 from tests.calib.wave import Recorded, Wave, record

@@ -17,9 +17,9 @@ from calib.rig import load_rig, save_rig
 from calib.scale import Distance, compare
 from calib.wand import calibrate
 from calib.waving import try_part
-from camera_node.body import Body
 from camera_node.errors import ConfigError
-from camera_node.observations import write_observations
+from camera_node.geometry.body import Body
+from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly
 from tests.calib.wave import Wave
 from tests.calib.wave import record as record_wave

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.sightings import UNKNOWN_S, stamp_sigmas
 from calib.wand import calibrate
-from camera_node.messages import Detections
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import camera_errors
 from tests.calib.wave import EPOCH_S, Wave, record
 

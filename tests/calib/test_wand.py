@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.rig import Rig
 from calib.wand import calibrate
-from camera_node.body import Body
-from camera_node.messages import Detections
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, WAND, Arena, assert_near, joint_error, record, ring, roughly
 
 

@@ -21,8 +21,8 @@ from calib.live import Heard
 from calib.recording import read_wave
 from calib.rig import load_rig, save_rig
 from calib.waving import IDLE_S, Progress, Rule, Trial, progress, thin, wave
-from camera_node.messages import Detections, Keys, encode
-from camera_node.network import open_client, open_router
+from camera_node.protocol.messages import Detections, Keys, encode
+from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 

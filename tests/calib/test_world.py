@@ -11,12 +11,12 @@ from calib.errors import CalibrationError
 from calib.landmarks import locate_places, still_roundels
 from calib.rig import Rig
 from calib.world import align, align_places, move, read_positions, require_above, rescale, stand
-from camera_node.body import Body
 from camera_node.config import load_yaml
+from camera_node.detection.roundels import Roundels
 from camera_node.errors import ConfigError
-from camera_node.messages import Detections
-from camera_node.pose import rotation_from_vector
-from camera_node.roundels import Roundels
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import rotation_from_vector
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import Arena, errors, ring
 
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from calib.camera import Camera
 from calib.rig import Rig
-from camera_node.body import Body
-from camera_node.messages import Detections
-from camera_node.pose import Pose, invert, look_at
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import Pose, invert, look_at
+from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import WAND, outlines
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import NetworkError
-from camera_node.network import open_client, open_router
+from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port
 
 DEADLINE_S = 15.0  # generous: a loaded machine; nothing waits for it unless a test fails

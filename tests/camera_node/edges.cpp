@@ -7,8 +7,8 @@
 #include <cstdio>
 #include <vector>
 
-#include "edge_pixels.hpp"
-#include "normal_equations.hpp"
+#include "fit/edge_pixels.hpp"
+#include "fit/normal_equations.hpp"
 
 using namespace roundel;
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from camera_node.scene import Scene
+from camera_node.simulation.scene import Scene
 
 LENS = {"width": 320, "height": 240, "fx": 300.0, "fy": 301.0, "cx": 158.3, "cy": 121.7}
 CAMERA = LENS | {"position_m": [0.0, -0.6, 2.0], "look_at_m": [0.0, 0.0, 0.0], "noise": 0.0}

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from camera_node.clock import Clock, clock_id, unix_ahead_ns
-from camera_node.messages import ClockReply, Keys, encode
+from camera_node.node.clock_sync import Clock
+from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
+from camera_node.protocol.messages import ClockReply, Keys, encode
 
 KEYS = Keys("test")
 HOUR_NS = 3600 * 10**9

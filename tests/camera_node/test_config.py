@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from camera_node.body import Body
 from camera_node.config import load_yaml, write_atomically
 from camera_node.errors import ConfigError
+from camera_node.geometry.body import Body
 
 
 @pytest.mark.parametrize(

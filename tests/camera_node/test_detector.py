@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node import _core
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 

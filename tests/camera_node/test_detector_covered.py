@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
-from camera_node.roundels import Roundel
+from camera_node.detection.detector import Detector
+from camera_node.detection.roundels import Roundel
 from tests.benchmarks.detector.negatives import print_letters, rings
 from tests.benchmarks.detector.pictures import Card, flat, grid, paste
 from tests.benchmarks.detector.recall import covered, recall

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.detect import Detect
+from camera_node.commands.detect import Detect
 from camera_node.errors import CameraError, ConfigError
 from tests.camera_node.rendering import Disc, expose, render
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
-from camera_node.disc import distance_by_principal_axis, locate, locate_all
-from camera_node.lens import Lens
-from camera_node.roundels import Roundel, Roundels
+from camera_node.detection.detector import Detector
+from camera_node.detection.disc_pose import distance_by_principal_axis, locate, locate_all
+from camera_node.detection.roundels import Roundel, Roundels
+from camera_node.geometry.lens import Lens
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 from tests.camera_node.tracing import Sight, pixels_across, trace
 

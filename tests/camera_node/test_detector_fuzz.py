@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from tests.native import fuzz
 
 NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.detector import Detector
-from camera_node.lens import Lens
+from camera_node.detection.detector import Detector
+from camera_node.geometry.lens import Lens
 from tests.benchmarks.detector.accuracy import Errors, measure_cell
 from tests.benchmarks.detector.bound import bound
 from tests.benchmarks.detector.cells import Cell

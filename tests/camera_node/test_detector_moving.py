@@ -7,7 +7,7 @@ The pictures are means of many sharp ones (`rendering.render`), so nothing is sh
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 SIZE = (72, 88)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
-from camera_node.replay import read_grey
+from camera_node.detection.detector import Detector
+from camera_node.sources.replay import read_grey
 
 
 def test_a_lab_full_of_roundels(shared_data: Callable[[str], Path]):

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from tests.benchmarks.detector.pictures import Card, Grey, dead_leaves, expose, flat, missed, paste
 from tests.camera_node.tracing import Array
 

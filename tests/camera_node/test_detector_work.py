@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
 from tests.camera_node.rendering import Disc, expose, render
 

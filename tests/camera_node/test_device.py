@@ -11,10 +11,17 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.device import DeviceSource, camera_names, capture_time, find_device, open_capture, properties
+from camera_node.commands.source_selection import open_source
 from camera_node.errors import CameraError
-from camera_node.frame import SourceSettings
-from camera_node.source import open_source
+from camera_node.sources.frame import SourceSettings
+from camera_node.sources.v4l2 import (
+    DeviceSource,
+    camera_names,
+    capture_time,
+    find_device,
+    open_capture,
+    properties,
+)
 
 
 @pytest.fixture
@@ -107,7 +114,7 @@ def video(tmp_path: Path) -> Path:
 
 def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
     """Every opening fails every other time, as a camera that is plugged in again; frames come all the same."""
-    caplog.set_level(logging.WARNING, "camera_node.device")
+    caplog.set_level(logging.WARNING, "camera_node.sources.v4l2")
     openings = iter(range(1000))
 
     def open_video(path: Path, settings: SourceSettings) -> cv2.VideoCapture:

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
-from camera_node.disc import locate
-from camera_node.disc_adjustment import adjust, covariance_through, shape_of
-from camera_node.lens import Lens
+from camera_node.detection.detector import Detector
+from camera_node.detection.disc_adjustment import adjust, covariance_through, shape_of
+from camera_node.detection.disc_pose import locate
+from camera_node.geometry.lens import Lens
 from tests.camera_node.rendering import Disc, expose, render
 
 LENS = Lens(width=160, height=120, fx=600, fy=600, cx=79.5, cy=59.5)

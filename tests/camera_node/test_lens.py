@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 SHAPE = {"width": 800, "height": 600, "fx": 620.0, "fy": 615.0, "cx": 402.3, "cy": 297.1}
 LENSES = {

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import calib.messages
-import camera_node.messages
+import camera_node.protocol.messages
 import fusion.messages
-from camera_node.messages import (
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import (
     MAX_ROUNDELS,
     CameraStatus,
     ClockReply,
@@ -25,7 +26,6 @@ from camera_node.messages import (
     decode,
     encode,
 )
-from camera_node.roundels import Roundels
 from fusion.messages import FusionStatus, Markers, RobotPose
 
 KINDS = (Detections, CameraStatus, ClockReply, Settings, Markers, RobotPose, FusionStatus)
@@ -132,7 +132,7 @@ def test_a_newer_sender_may_add_fields():
 def test_every_field_is_documented():
     """docs/messages.md names every message of the three packages and every field of it in its own section."""
     sections = (Path(__file__).parents[2] / "docs" / "messages.md").read_text().split("\n## ")
-    for module in (camera_node.messages, calib.messages, fusion.messages):
+    for module in (camera_node.protocol.messages, calib.messages, fusion.messages):
         for name, kind in vars(module).items():
             if (
                 isinstance(kind, type)

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
-from camera_node.network import ServerWatch, open_client, open_router
+from camera_node.protocol.session import ServerWatch, open_client, open_router
 
 
 class Ticker:
@@ -107,7 +107,7 @@ def test_puts_while_the_router_is_away_are_not_kept(network, inbox, eventually):
 
 def test_the_servers_coming_and_going_is_told_once_each(network, eventually, caplog):
     """However often the absence is looked at; a server that was never seen is away as well."""
-    caplog.set_level(logging.WARNING, "camera_node.network")
+    caplog.set_level(logging.WARNING, "camera_node.protocol.session")
     watch = ServerWatch(network.client(), "a/alive", patience_s=0.0)
 
     def told() -> list[str]:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from camera_node.detector import Detector
-from camera_node.frame import SourceSettings
-from camera_node.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
-from camera_node.node import Node
-from camera_node.source import open_source
+from camera_node.commands.source_selection import open_source
+from camera_node.detection.detector import Detector
+from camera_node.node.node import Node
+from camera_node.protocol.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
+from camera_node.sources.frame import SourceSettings
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000

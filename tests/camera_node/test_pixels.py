@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera_node.detector import Detector
-from camera_node.pixels import BAYER, grey, narrow
-from camera_node.replay import FolderSource
+from camera_node.detection.detector import Detector
+from camera_node.sources.grey import BAYER, grey, narrow
+from camera_node.sources.replay import FolderSource
 from tests.camera_node.rendering import Disc, outer_conic, render
 
 LEVELS = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10

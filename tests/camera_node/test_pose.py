@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from camera_node.pose import (
+from camera_node.geometry.pose import (
     Pose,
     adjoint,
     invert,

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.detector import Detector
+from camera_node.commands.print import Sheet, draw
+from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
-from camera_node.replay import read_grey
-from camera_node.sheet import Sheet, draw
+from camera_node.sources.replay import read_grey
 
 PX_PER_MM = 96 / 25.4  # CSS
 

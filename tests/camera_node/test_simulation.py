@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.pose import Pose
-from camera_node.rendering import Renderer
-from camera_node.replay import FolderSource, read_grey
-from camera_node.scene import Scene
-from camera_node.simulation import SimulatedCamera, list_exposures, render_recording
+from camera_node.geometry.pose import Pose
+from camera_node.simulation.camera import SimulatedCamera
+from camera_node.simulation.recording import list_exposures, render_recording
+from camera_node.simulation.renderer import Renderer
+from camera_node.simulation.scene import Scene
+from camera_node.sources.replay import FolderSource, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.backdrop import FLOOR
-from camera_node.pose import invert
-from camera_node.rendering import BLACK, WHITE, Disc, Renderer, cover, discs_of, vignette
-from camera_node.scene import Scene
+from camera_node.geometry.pose import invert
+from camera_node.simulation.background import FLOOR
+from camera_node.simulation.renderer import BLACK, WHITE, Disc, Renderer, cover, discs_of, vignette
+from camera_node.simulation.scene import Scene
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 
 ROUNDING = 0.29  # standard deviation of a rounded grey level, sqrt(1/12)

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node.commands.source_selection import open_source
 from camera_node.errors import CameraError, ConfigError
-from camera_node.frame import Source, SourceSettings
-from camera_node.replay import FolderSource, VideoSource, read_grey
-from camera_node.source import open_source
+from camera_node.sources.frame import Source, SourceSettings
+from camera_node.sources.replay import FolderSource, VideoSource, read_grey
 
 MS = 1_000_000
 FAST = SourceSettings(pace="fast")

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 
 Array = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ def poses_of(fused: list[Fused], robot: str) -> list[RobotPose]:
 
 def errors(arena: Arena, poses: list[RobotPose]) -> np.ndarray:
     """(N, 6) rotation (body) and position errors of poses."""
-    from camera_node.pose import rotation_from_wxyz
+    from camera_node.geometry.pose import rotation_from_wxyz
 
     rows = []
     for pose in poses:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.camera import Camera
-from camera_node.messages import Detections
-from camera_node.pose import Pose, look_at, rotation_from_vector
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
+from camera_node.protocol.messages import Detections
 from fusion.instants import Frame
 from fusion.optics import Optics
 from fusion.robots import Robot

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
 from fusion._core import ExpectedMarkers
 from fusion.association import Association
 from fusion.instants import Frame, Instant

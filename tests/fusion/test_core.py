@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
 from fusion import _core
 from fusion.association import assign
 from fusion.instants import Frame, Instant

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
 from fusion.grouping import Marker, group
 from fusion.instants import Frame, Instant

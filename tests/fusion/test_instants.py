@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
 from fusion.instants import GONE_NS, Frame, Instant, Instants
 from fusion.tracker import Limits
 

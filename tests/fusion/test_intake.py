@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.messages import MAX_ROUNDELS, Detections, Keys, encode
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from fusion.health import MAX_STRANGERS, Health
 from fusion.instants import Frame, Instants
 from fusion.intake import Intake

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.pose import rotation_from_wxyz
+from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.client import Arena as Client
 from fusion.errors import FusionError
 from fusion.measuring import Standing, find_standing, robot_of

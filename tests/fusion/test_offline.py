@@ -12,8 +12,8 @@ import pytest
 
 from calib.camera import Camera
 from calib.rig import Rig, save_rig
-from camera_node.observations import write_observations
-from camera_node.pose import Pose, invert
+from camera_node.geometry.pose import Pose, invert
+from camera_node.sources.observations import write_observations
 from fusion.__main__ import main
 from fusion.offline import COLUMNS, run
 from fusion.robots import Robot

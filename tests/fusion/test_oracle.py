@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from calib.camera import Camera
-from camera_node.pose import rotation_from_vector
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import CAUCHY, NOMINAL_WEIGHT
 from fusion.estimator import Estimator, Prediction
 from fusion.instants import Frame, Instant

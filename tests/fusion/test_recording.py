@@ -13,7 +13,7 @@ from calib.messages import RigMessage
 from calib.recording import RecordingWriter
 from calib.rig import Rig
 from camera_node.errors import ConfigError
-from camera_node.messages import encode
+from camera_node.protocol.messages import encode
 from fusion.messages import Robots
 from fusion.offline import fuse_recording, replay
 from fusion.recording import read_recording, record

@@ -11,8 +11,8 @@ import pytest
 
 from calib.messages import RigMessage
 from calib.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.messages import decode, encode
-from camera_node.pose import Pose
+from camera_node.geometry.pose import Pose
+from camera_node.protocol.messages import decode, encode
 from fusion.calibration import Calibration
 from fusion.errors import FusionError
 from fusion.kept import Kept

@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
 from camera_node.errors import ConfigError
-from camera_node.messages import Keys, encode
-from camera_node.network import open_router
-from camera_node.pose import rotation_from_vector, rotation_from_wxyz
+from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
+from camera_node.protocol.messages import Keys, encode
+from camera_node.protocol.session import open_router
 from fusion.client import Arena
 from fusion.messages import RobotPose
 from fusion.ros2 import Node, ros2, ros_name

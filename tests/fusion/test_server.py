@@ -17,7 +17,7 @@ import pytest
 from calib.messages import RigMessage
 from calib.rig import Rig, save_rig
 from camera_node.errors import NetworkError
-from camera_node.messages import ClockReply, Detections, Keys, decode, encode
+from camera_node.protocol.messages import ClockReply, Detections, Keys, decode, encode
 from fusion.client import Arena as Client
 from fusion.config import ArenaConfig
 from fusion.server import Server

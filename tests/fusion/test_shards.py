@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera_node.errors import ConfigError, NetworkError
-from camera_node.messages import MessageError, decode, encode
+from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.instants import Frame, Instant, Instants
 from fusion.messages import RobotPose, ShardPoses
 from fusion.robots import Robot

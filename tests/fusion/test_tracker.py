@@ -154,7 +154,7 @@ def test_a_single_marker_has_a_place_and_a_normal_and_says_that_its_turn_is_unkn
     _, poses = run_arena(arena)
     late = poses("c")[10:]
     assert np.abs(errors(arena, late)[:, 3:]).max() < 3e-3
-    from camera_node.pose import rotation_from_wxyz
+    from camera_node.geometry.pose import rotation_from_wxyz
 
     for pose in late:
         true, got = arena.truth("c", pose.t_ns)[0][:, 2], rotation_from_wxyz(pose.quaternion_wxyz)[:, 2]

@@ -5,7 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.pose import Pose, rotation_from_vector
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.instants import Instants
 from fusion.tracker import Tracker
 from tests.fusion.conftest import errors

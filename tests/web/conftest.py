@@ -11,10 +11,10 @@ import zenoh
 from calib.camera import Camera
 from calib.messages import RigMessage
 from calib.rig import Rig
-from camera_node.messages import CameraStatus, Detections, Keys, encode
-from camera_node.network import open_client, open_router
-from camera_node.pose import Pose, look_at
-from camera_node.roundels import Roundels
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import Pose, look_at
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode
+from camera_node.protocol.session import open_client, open_router
 from fusion.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, State
 from tests.conftest import free_port
 from web.feed import Feed

@@ -12,8 +12,8 @@ from calib.recording import read_wave, save_wave
 from calib.rig import load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.errors import ConfigError
-from camera_node.messages import encode
-from camera_node.network import open_client
+from camera_node.protocol.messages import encode
+from camera_node.protocol.session import open_client
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 from tests.web.conftest import Played, wait_for

@@ -3,7 +3,7 @@
 
 import pytest
 
-from camera_node.messages import encode
+from camera_node.protocol.messages import encode
 from tests.web.conftest import Played, wait_for
 from web.feed import MAX_REASONS, Feed
 from web.messages import Progress, progress_key

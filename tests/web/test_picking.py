@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, TimeoutError
 
-from camera_node.network import open_client
+from camera_node.protocol.session import open_client
 from fusion.client import Arena as Client
 from tests.conftest import free_port
 from tests.fusion.synthetic import WIDE

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.pose import rotation_from_vector, wxyz_from_rotation
+from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from fusion.messages import RobotPose, State
 from web.score import Score, angle_deg, longest_gap_s, summarise
 

@@ -6,8 +6,8 @@ import zenoh
 
 from calib.messages import RigMessage
 from calib.rig import Rig
-from camera_node.messages import encode
-from camera_node.network import open_client
+from camera_node.protocol.messages import encode
+from camera_node.protocol.session import open_client
 from fusion.messages import undo_key
 from tests.web.conftest import Played, four_cameras, wait_for
 from web.feed import Feed

@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from camera_node.messages import CameraStatus
+from camera_node.protocol.messages import CameraStatus
 from fusion.messages import CameraHealth, FusionStatus
 from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage

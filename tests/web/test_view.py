@@ -169,7 +169,7 @@ def test_drawing_survives_what_an_arena_may_say(played: Played, feed: Feed):
 
 def test_progress_and_ghosts_come_and_go(played: Played, feed: Feed):
     """The demo's wand stands in the scene as long as it is told."""
-    from camera_node.messages import encode
+    from camera_node.protocol.messages import encode
 
     view = View(feed, port=free_port())
     for ghosts in ({"wand": ((0.0, 0.0, 1.0), (0.2, 0.0, 1.0))}, {}):

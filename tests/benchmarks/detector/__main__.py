@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
 from tests.benchmarks.detector import accuracy, motion, negatives, pose, recall, speed
 from tests.benchmarks.detector.table import Run, print_verdicts

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.console import Console
 
-from camera_node.disc import DiscPose, locate
+from camera_node.detection.disc_pose import DiscPose, locate
 from tests.benchmarks.detector.bound import Bound, bound
 from tests.benchmarks.detector.cells import Cell, cells, views
 from tests.benchmarks.detector.pictures import expose

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 from tests.benchmarks.detector.pictures import F
 from tests.camera_node.tracing import Sight, pixels_across
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.lens import Lens
+from camera_node.geometry.lens import Lens
 from tests.camera_node.tracing import Array, Sight, ellipse_of, pixels_across, trace
 
 Grey = NDArray[np.uint8]

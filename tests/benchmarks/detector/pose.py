@@ -4,7 +4,7 @@
 import numpy as np
 from rich.console import Console
 
-from camera_node.disc import locate
+from camera_node.detection.disc_pose import locate
 from tests.benchmarks.detector.cells import Cell, views
 from tests.benchmarks.detector.pictures import expose
 from tests.benchmarks.detector.table import Run, Verdict, table

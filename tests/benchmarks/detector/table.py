@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from camera_node.detector import Detector
+from camera_node.detection.detector import Detector
 
 MakeDetector = Callable[[], Detector]
 

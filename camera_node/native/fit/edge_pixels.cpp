@@ -1,0 +1,231 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "fit/edge_pixels.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <numbers>
+#include <span>
+
+#include "numeric/simd.hpp"
+#include "fit/strips.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr int kMinRows = 10;     // fewer do not tell an ellipse
+constexpr int kWideRows = 3;     // one in so many
+constexpr double kUnseen = 0.5;  // grey levels by which another edge may show
+
+double square(double x) { return x * x; }
+
+/// The images of the edges, as far as they are the band's.
+struct EdgeImages {
+    CircleImage of[kEdges];
+    bool card;
+    EdgeImages(const Parameters& p, const Band& band) : card(band.card) {
+        for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge})
+            of[edge] = circle_image(p, radius_of(edge, p));
+    }
+    /// The least distance of two edges.
+    double gap(Edge outside, Edge inside) const {
+        const CircleImage &a = of[outside], &b = of[inside];
+        return minor_half_axis(a) - minor_half_axis(b) - std::hypot(a.x - b.x, a.y - b.y);
+    }
+
+  private:
+    static double minor_half_axis(const CircleImage& e) {
+        const double twice = 2 * std::sqrt(std::max(e.shape.det(), 0.0)), trace = e.shape.xx + e.shape.yy;
+        return (std::sqrt(trace + twice) - std::sqrt(std::max(trace - twice, 0.0))) / 2;
+    }
+};
+
+/// How far from each edge no other one shows. An edge of contrast C does so by at most
+/// C exp(-(distance / blur)^2 / 2) / 2.
+struct Clearance {
+    double of[kEdges];
+    Clearance(const EdgeImages& images, const Parameters& p) {
+        const auto shown_within = [&](double contrast) {
+            return p[kBlur] * std::sqrt(2 * std::log(std::max(1.0, std::abs(contrast) / (2 * kUnseen))));
+        };
+        const double ring = shown_within(p[kBright] - p[kDark]);
+        const double card = images.card ? ring : shown_within(p[kGround] - p[kBright]);
+        const double within = images.gap(kOuterEdge, kInnerEdge), beyond = images.gap(kCardEdge, kOuterEdge);
+        of[kInnerEdge] = within - ring, of[kCardEdge] = beyond - ring;
+        of[kOuterEdge] = std::min(within - ring, beyond - card);
+    }
+};
+
+/// What lies within a distance of the edges, as ellipses to be cut by rows: lanes 0 to 2 are those around the
+/// edges, from the card's inwards, lanes 4 to 6 the holes within them. Other lanes are empty.
+class Strips {
+  public:
+    Strips(const EdgeImages& edges, double distance) {
+        for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
+            if (edge == kCardEdge && !edges.card) continue;
+            const CircleImage& e = edges.of[edge];
+            const int k = edge == kCardEdge ? 0 : 1 + edge;
+            const Oval around(e, distance);
+            ovals_.set(k, around), ovals_.set(4 + k, Oval(e, -distance));
+            top_ = std::min(top_, around.top), bottom_ = std::max(bottom_, around.bottom);
+            area_ += 2 * distance * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
+            const double whole = std::numbers::pi * square(std::sqrt(e.shape.xx + e.shape.yy) + distance);
+            most_ = std::max(most_, whole);
+        }
+    }
+    double area() const { return std::min(area_, most_); }  // about
+    double top() const { return top_; }
+    double bottom() const { return bottom_; }
+    ROUNDEL_INLINE Spans cut(float row) const { return ovals_.cut(all(row)); }
+
+  private:
+    Ovals ovals_{};
+    double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
+};
+
+/// Eight grey levels, of which `left` are in the image. (Wider by two steps: compilers take bytes to words of
+/// four times their size one by one.)
+ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
+    typedef uint8_t Bytes __attribute__((vector_size(2 * kLanes)));
+    typedef int16_t Wide __attribute__((vector_size(4 * kLanes)));
+    typedef uint64_t Pair __attribute__((vector_size(2 * kLanes)));
+    uint64_t seen = 0;
+    if (left >= kLanes)
+        std::memcpy(&seen, from, kLanes);
+    else
+        for (int i = 0; i < left; ++i) seen |= uint64_t(from[i]) << (8 * i);
+    const Wide wide = __builtin_convertvector(Bytes(Pair{seen, 0}), Wide);
+    return __builtin_convertvector(
+        __builtin_convertvector(__builtin_shufflevector(wide, wide, 0, 1, 2, 3, 4, 5, 6, 7), Bits), Lanes);
+}
+
+/// Appends columns [begin, end) of row y, as far as they are inside the image; eight at a time, where what is
+/// written beyond the end is overwritten by what comes next.
+ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
+    to.expected += std::max(0, end - begin);
+    if (y < 0 || y >= image.height) return;
+    begin = std::max(begin, 0), end = std::min({end, image.width, begin + EdgePixels::kMax - to.end()});
+    const uint8_t* row = image.row(y);
+    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
+    for (int u = begin; u < end; u += kLanes) {
+        const int at = to.end() + u - begin;
+        store(to.x + at, float(u - to.origin_x) + kSteps);
+        store(to.y + at, all(float(y - to.origin_y)));
+        store(to.level + at, load_levels(row + u, image.width - u));
+    }
+    to.used += std::max(0, end - begin);
+}
+
+/// Appends what row y has of the strips, left to right and each pixel once.
+ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& strips, EdgePixels& to) {
+    const Spans spans = strips.cut(float(y - to.origin_y));
+    int begin[2 * kEdges], end[2 * kEdges];  // left of the middle, then right
+    for (int k = 0; k < kEdges; ++k) {
+        const bool hole = spans.has(4 + k);
+        begin[k] = spans.begin[k], end[k] = hole ? spans.begin[4 + k] : spans.end[k];
+        begin[2 * kEdges - 1 - k] = hole ? spans.end[4 + k] : kNowhere;
+        end[2 * kEdges - 1 - k] = spans.end[k];
+    }
+    int done = kNowhere;
+    for (int k = 0; k < 2 * kEdges; ++k) {
+        const int from = std::max(begin[k], done);
+        if (from < end[k]) append(image, y, from + to.origin_x, end[k] + to.origin_x, to), done = end[k];
+    }
+}
+
+/// Every `step`-th row.
+ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, const Strips& wide, int step,
+                                EdgePixels& to) {
+    const int top = int(std::ceil(wide.top())), bottom = int(std::floor(wide.bottom()));
+    for (int y = top, k = 0; y <= bottom; y += step, ++k)
+        append_row(image, y + to.origin_y, k % kWideRows ? narrow : wide, to);
+}
+
+/// Appends what every `step`-th row from `first` on has of one edge's strip.
+ROUNDEL_INLINE void append_strip(const ImageView& image, const CircleImage& edge, double distance, int first,
+                                 int step, EdgePixels& to) {
+    const Oval around(edge, distance), hole(edge, -distance);
+    const Ovals outside = Ovals::all_of(around), inside = Ovals::all_of(hole);
+    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
+    const int bottom = int(std::floor(around.bottom));
+    for (int y = first; y <= bottom; y += kLanes * step) {
+        const Lanes rows = float(y) + float(step) * kSteps;
+        const Spans strip = outside.cut(rows), open = inside.cut(rows);
+        for (int k = 0; k < kLanes; ++k) {
+            const int row = y + k * step + to.origin_y;
+            if (!strip.has(k)) continue;
+            append(image, row, strip.begin[k] + to.origin_x,
+                   (open.has(k) ? open.begin[k] : strip.end[k]) + to.origin_x, to);
+            if (open.has(k)) append(image, row, open.end[k] + to.origin_x, strip.end[k] + to.origin_x, to);
+        }
+    }
+}
+
+/// Edge by edge: every `step`-th row of the narrow strip, the wide one in every third of these.
+ROUNDEL_CLONES void append_edges(const ImageView& image, const EdgeImages& edges, const Clearance& clearance,
+                                 const Band& band, int step, EdgePixels& to) {
+    for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
+        if (edge == kCardEdge && !edges.card) continue;
+        const CircleImage& e = edges.of[edge];
+        const double wide = std::min(band.apart, clearance.of[edge]);
+        const int top = int(std::ceil(Oval(e, wide).top));
+        for (int k = 0; k < kWideRows; ++k)
+            append_strip(image, e, k ? band.narrow : wide, top + k * step, kWideRows * step, to);
+        to.end_part(edge);
+    }
+}
+
+struct Mean {
+    Lanes sum, n;
+};
+
+ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& card, Mean& mean) {
+    const double det = card.shape.det();
+    const float xx = float(card.shape.yy / det), xy = float(-2 * card.shape.xy / det);
+    const float yy = float(card.shape.xx / det), x0 = float(card.x), y0 = float(card.y);
+    for (int k = 0; k < pixels.count; k += kLanes) {
+        const Lanes dx = load(pixels.x + k) - x0, dy = load(pixels.y + k) - y0,
+                    level = load(pixels.level + k);
+        const Bits outside = (dx * (xx * dx + xy * dy) + yy * dy * dy > 1.0f) & (level >= 0.0f);
+        mean.sum += outside ? level : all(0), mean.n += outside ? all(1) : all(0);
+    }
+}
+
+}  // namespace
+
+void EdgePixels::sample(int n, EdgePixels& to) const {
+    to.clear();
+    for (const Part& part : std::span(parts.data(), size_t(part_count))) {
+        for (int k = part.begin; k < part.begin + part.count; k += n * kLanes, to.used += kLanes) {
+            std::copy_n(x + k, kLanes, to.x + to.used);
+            std::copy_n(y + k, kLanes, to.y + to.used);
+            std::copy_n(level + k, kLanes, to.level + to.used);
+        }
+        to.end_part(part.edge);
+    }
+}
+
+double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
+    Mean mean{};
+    add_outside(pixels, circle_image(p, p[kCard]), mean);
+    const double n = double(sum(mean.n));
+    return n > 0 ? double(sum(mean.sum)) / n : p[kBright];
+}
+
+void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+                   EdgePixels& pixels) {
+    const EdgeImages edges(p, band);
+    const Clearance clearance(edges, p);
+    const bool apart = band.apart > 0 && clearance.of[kOuterEdge] >= band.narrow;
+    const Strips narrow(edges, band.narrow), wide(edges, apart ? band.apart : band.wide);
+    const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
+    const int rows = int(wide.bottom() - wide.top());
+    const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
+    pixels.clear();
+    if (apart) return append_edges(image, edges, clearance, band, step, pixels);
+    append_rows(image, narrow, wide, step, pixels);
+    pixels.end_part(kAnyEdge);
+}
+
+}  // namespace roundel

@@ -1,0 +1,274 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "fit/normal_equations.hpp"
+
+#include <algorithm>
+#include <type_traits>
+
+#include "fit/gram.hpp"
+#include "numeric/simd.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr int kSample = 24;    // lanes, about
+constexpr int kHalvings = 10;  // of 256 grey levels
+constexpr int kLevels = 3;     // columns of a single edge that are not its ellipse's
+
+/// The parameters by which a part's gradient is set: all, or those of a single edge, its ellipse's last.
+template <Edge edge>
+constexpr auto kBy = [] {
+    if constexpr (edge == kAnyEdge)
+        return std::array{kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy};
+    else
+        return std::array{kSidesOf[edge].inside, kSidesOf[edge].outside, kBlur, kX, kY, kAxx, kAxy, kAyy};
+}();
+template <Edge edge>
+constexpr int kUnknowns = int(kBy<edge>.size());
+template <Edge edge>
+using GramOf = Gram<kUnknowns<edge> + 1>;  // and the residual
+
+/// Calls `work` with a part's edge as a constant. What it calls has to be inlined, as all of a clone has.
+template <typename Work>
+ROUNDEL_INLINE void with_edge(Edge edge, const Work& work) {
+    switch (edge) {
+        case kOuterEdge:
+            return work(std::integral_constant<Edge, kOuterEdge>());
+        case kInnerEdge:
+            return work(std::integral_constant<Edge, kInnerEdge>());
+        case kCardEdge:
+            return work(std::integral_constant<Edge, kCardEdge>());
+        case kAnyEdge:
+            return work(std::integral_constant<Edge, kAnyEdge>());
+    }
+}
+
+/// The root of Tukey's weight of residuals that are `t` cuts.
+ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
+    const Lanes left = 1.0f - t * t;
+    return left > 0.0f ? left : all(0);
+}
+
+template <Edge edge>
+ROUNDEL_INLINE void evaluate_part(const EdgePixels& pixels, const EdgePixels::Part& part,
+                                  const ModelOf<edge>& model, Gradient* chunks) {
+    for (int done = 0; done < part.count; done += kChunk * kLanes) {
+        const int begin = part.begin + done;
+        model.evaluate(pixels.x + begin, pixels.y + begin, pixels.level + begin,
+                       std::min(kChunk, (part.count - done) / kLanes), *chunks++);
+    }
+}
+
+ROUNDEL_CLONES void evaluate(const EdgePixels& pixels, const EdgePixels::Part& part, const Parameters& pose,
+                             Gradient* chunks) {
+    with_edge(part.edge, [&](auto edge) __attribute__((always_inline)) {
+        evaluate_part<edge>(pixels, part, ModelOf<edge>(pose), chunks);
+    });
+}
+
+template <Edge edge>
+ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, float per_cut, GramOf<edge>& gram) {
+    constexpr int n = kUnknowns<edge>;
+    Columns<n + 1> columns;
+    for (; lanes > 0; lanes -= kChunk, ++chunks) {
+        const int count = std::min(kChunk, lanes);
+        for (int k = 0; k < count; ++k) {
+            const Lanes root = root_weight(chunks->residual[k] * per_cut);
+            for (int i = 0; i < n; ++i) columns[i][k] = root * chunks->by[kBy<edge>[size_t(i)]][k];
+            columns[n][k] = root * chunks->residual[k];
+        }
+        multiply_all<n + 1>(columns, count, gram);
+    }
+}
+
+ROUNDEL_INLINE void add_sums(const GramOf<kAnyEdge>& gram, NormalEquations& to) {
+    for (int i = 0; i < kCount; ++i) {
+        for (int j = 0; j <= i; ++j) to.H[i][j] += double(sum(gram[j][i]));
+        to.g[i] += double(sum(gram[i][kCount]));
+    }
+}
+
+/// Products with a single edge's columns as products with all that its levels, blur and ellipse depend on.
+template <Edge edge>
+ROUNDEL_INLINE void add_moved(const GramOf<edge>& gram, const EdgeEllipse::Moves& moves,
+                              NormalEquations& to) {
+    constexpr int n = kUnknowns<edge>, shape = EdgeEllipse::kShape, kRadius = kPoseCount;
+    constexpr Parameter radius = edge == kCardEdge ? kCard : kRatio;
+    const auto product = [&](int i, int j) { return double(sum(gram[std::min(i, j)][std::max(i, j)])); };
+    std::array<EdgeEllipse::Move, n + 1> once{};  // the columns times those of pose and radius
+    for (int i = 0; i <= n; ++i)
+        for (int j = 0; j < shape; ++j) {
+            const double each = product(i, kLevels + j);
+            for (int m = 0; m <= kRadius; ++m) once[i][m] += each * moves[j][m];
+        }
+    std::array<EdgeEllipse::Move, kRadius + 1> twice{};
+    for (int m = 0; m <= kRadius; ++m)
+        for (int j = 0; j < shape; ++j)
+            for (int k = 0; k <= kRadius; ++k) twice[m][k] += moves[j][m] * once[kLevels + j][k];
+    for (int i = 0; i < kLevels; ++i) {
+        const Parameter level = kBy<edge>[size_t(i)];
+        for (int j = i; j < kLevels; ++j) {
+            const Parameter other = kBy<edge>[size_t(j)];
+            to.H[std::max(level, other)][std::min(level, other)] += product(i, j);
+        }
+        for (int m = 0; m < kPoseCount; ++m) to.H[kX + m][level] += once[i][m];
+        to.H[radius][level] += once[i][kRadius];
+        to.g[level] += product(i, n);
+    }
+    for (int m = 0; m < kPoseCount; ++m) {
+        for (int k = 0; k <= m; ++k) to.H[kX + m][kX + k] += twice[m][k];
+        to.H[kX + m][radius] += twice[m][kRadius];
+        to.g[kX + m] += once[n][m];
+    }
+    to.H[radius][radius] += twice[kRadius][kRadius];
+    to.g[radius] += once[n][kRadius];
+}
+
+ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const EdgeEllipse::Moves& moves,
+                             float per_cut, NormalEquations& to) {
+    with_edge(edge, [&](auto e) __attribute__((always_inline)) {
+        GramOf<e> gram{};
+        add_products<e>(chunks, lanes, per_cut, gram);
+        if constexpr (e == kAnyEdge)
+            add_sums(gram, to);
+        else
+            add_moved<e>(gram, moves, to);
+    });
+}
+
+struct Sums {
+    Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
+};
+
+ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut, Sums& sums) {
+    const Lanes t = r * per_cut, root = root_weight(t), w = root * root, rr = r * r;
+    const Lanes squared = at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k];
+    const Lanes ring = at.residual[k] < kAbsent ? at.ring[k] * at.ring[k] : all(0), m = w * squared;
+    sums.ring += ring;
+    sums.agreeing += w * ring;
+    sums.ring_rr += ring * rr;
+    sums.m += m;
+    sums.mm += m * squared;
+    sums.mrr += m * rr;
+    sums.mwrr += m * w * rr;
+    sums.mpsi += squared * root * (1.0f - 5.0f * t * t);
+}
+
+/// `delta` is a step in what the part's gradient is by.
+ROUNDEL_CLONES void add_leftover(const Gradient* chunks, int lanes, Edge edge, const float* delta,
+                                 float per_cut, Sums& sums) {
+    with_edge(edge, [&](auto e) __attribute__((always_inline)) {
+        for (; lanes > 0; lanes -= kChunk, ++chunks)
+            for (int k = 0; k < std::min(kChunk, lanes); ++k) {
+                Lanes r = chunks->residual[k];
+                for (const int i : kBy<e>) r -= delta[i] * chunks->by[i][k];
+                add_residuals(r, *chunks, k, per_cut, sums);
+            }
+    });
+}
+
+ROUNDEL_INLINE int count_below(const Lanes* values, int n, float limit) {
+    Bits below{};
+    for (int k = 0; k < n; ++k) below -= values[k] < limit;
+    int count = 0;
+    for (int i = 0; i < kLanes; ++i) count += below[i];
+    return count;
+}
+
+/// Residuals and slopes of the ring's edges, of some lanes.
+struct Sample {
+    Lanes residuals[kSample + kEdges], slopes[kSample + kEdges], most{};
+    int n = 0;
+};
+
+ROUNDEL_INLINE void add_every(int step, const Gradient* chunks, int lanes, Sample& to) {
+    for (int k = 0; k < lanes; k += step, ++to.n) {
+        const Gradient& at = chunks[k / kChunk];
+        const Lanes residual = magnitude(at.residual[k % kChunk]), slope = magnitude(at.ring[k % kChunk]);
+        to.residuals[to.n] = residual, to.slopes[to.n] = slope;
+        const Lanes seen = residual < kAbsent ? slope : all(0);
+        to.most = seen > to.most ? seen : to.most;
+    }
+}
+
+/// As Linearisation::median_residual, by halving an interval.
+ROUNDEL_CLONES float median_of(Sample& sample) {
+    auto& [residuals, slopes, most, n] = sample;
+    float steep = 1e-3f;
+    for (int i = 0; i < kLanes; ++i) steep = std::max(steep, most[i] / 2);
+    for (int k = 0; k < n; ++k) residuals[k] = slopes[k] > steep ? residuals[k] : all(kAbsent);
+    const int count = count_below(residuals, n, kAbsent);
+    if (count < kLanes) return -1;
+    float low = 0, high = 256;
+    for (int k = 0; k < kHalvings; ++k) {
+        const float middle = (low + high) / 2;
+        (2 * count_below(residuals, n, middle) > count ? high : low) = middle;
+    }
+    return high;
+}
+
+/// A step of the parameters as one of what a part's gradient is by.
+std::array<float, kCount> step_of(const Parameters& delta, Edge edge, const EdgeEllipse::Moves& moves) {
+    std::array<float, kCount> step{};
+    for (size_t i = 0; i < kCount; ++i) step[i] = float(delta[i]);
+    if (edge == kAnyEdge) return step;
+    for (int i = 0; i < EdgeEllipse::kShape; ++i) {
+        double shape = moves[i][kPoseCount] * delta[edge == kInnerEdge ? kRatio : kCard];  // or 0
+        for (int m = 0; m < kPoseCount; ++m) shape += moves[i][m] * delta[kX + m];
+        step[size_t(kX + i)] = float(shape);
+    }
+    return step;
+}
+
+}  // namespace
+
+void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
+    part_count_ = pixels.part_count;
+    Gradient* chunks = chunks_;
+    for (int k = 0; k < part_count_; ++k) {
+        const EdgePixels::Part& from = pixels.parts[size_t(k)];
+        Part& part = parts_[size_t(k)];
+        part.edge = from.edge, part.lanes = from.count / kLanes, part.chunks = chunks;
+        if (part.edge == kAnyEdge) {
+            roundel::evaluate(pixels, from, p, chunks);
+        } else {
+            const EdgeEllipse ellipse(p, part.edge);
+            roundel::evaluate(pixels, from, ellipse.as_pose(), chunks);
+            part.moves = ellipse.moves();
+        }
+        chunks += (part.lanes + kChunk - 1) / kChunk;
+    }
+}
+
+double Linearisation::median_residual() const {
+    int lanes = 0;
+    for (const Part& part : parts()) lanes += part.lanes;
+    Sample sample;
+    for (const Part& part : parts())
+        add_every((lanes + kSample - 1) / kSample, part.chunks, part.lanes, sample);
+    return double(median_of(sample));
+}
+
+NormalEquations Linearisation::accumulate(double scale) const {
+    NormalEquations e{};
+    for (const Part& part : parts())
+        add_part(part.chunks, part.lanes, part.edge, part.moves, float(1 / (kTukey * scale)), e);
+    return e;
+}
+
+Leftover Linearisation::after(const Parameters& delta, double scale) const {
+    Sums s{};
+    for (const Part& part : parts())
+        add_leftover(part.chunks, part.lanes, part.edge, step_of(delta, part.edge, part.moves).data(),
+                     float(1 / (kTukey * scale)), s);
+    return {.ring = double(sum(s.ring)),
+            .agreeing = double(sum(s.agreeing)),
+            .ring_rr = double(sum(s.ring_rr)),
+            .m = double(sum(s.m)),
+            .mm = double(sum(s.mm)),
+            .mrr = double(sum(s.mrr)),
+            .mwrr = double(sum(s.mwrr)),
+            .mpsi = double(sum(s.mpsi))};
+}
+
+}  // namespace roundel

@@ -1,0 +1,165 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "fit/occlusion.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numbers>
+#include <numeric>
+
+#include "numeric/simd.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr double kBand = 2;    // pixels on either side of an edge
+constexpr int kPixels = 1500;  // that are looked at, about
+constexpr double kChance = 4;  // standard deviations
+constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
+constexpr int kAround = 2;     // sectors on either side that a mean is over
+constexpr double kSeen = 0.2;  // of what they would tell if all of the edge were seen
+
+/// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse.
+ROUNDEL_INLINE Lanes direction(const Lanes& x, const Lanes& y) {
+    const Lanes across = magnitude(x), up = magnitude(y), least = across < up ? across : up;
+    const Lanes most = (across < up ? up : across) + 1e-9f, t = least / most, tt = t * t;
+    Lanes angle = t + t * tt * (-0.327622764f + tt * (0.15931422f - tt * 0.0464964749f));
+    angle = up > across ? float(std::numbers::pi / 2) - angle : angle;
+    angle = x < 0.0f ? float(std::numbers::pi) - angle : angle;
+    return y < 0.0f ? -angle : angle;
+}
+
+/// Which edge a pixel belongs to, and which sector of it.
+class Compass {
+  public:
+    explicit Compass(const Parameters& p)
+        : x_(float(p[kX])), y_(float(p[kY])), between_(float(square((1 + p[kRatio]) / 2))) {
+        const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
+        xx_ = float(p[kAyy] / det), xy_ = float(-p[kAxy] / det), yy_ = float(p[kAxx] / det);
+    }
+    /// The sector of the outer edge, or kSectors more of the inner one.
+    ROUNDEL_INLINE Bits locate(const Lanes& x, const Lanes& y) const {
+        const Lanes dx = x - x_, dy = y - y_, qx = xx_ * dx + xy_ * dy, qy = xy_ * dx + yy_ * dy;
+        const Lanes turn = direction(qx, qy) * float(kSectors / (2 * std::numbers::pi)) + float(kSectors);
+        const Bits inner = qx * qx + qy * qy < between_;  // -1 where it is true
+        return (__builtin_convertvector(turn, Bits) & (kSectors - 1)) + (inner & kSectors);
+    }
+
+  private:
+    static double square(double x) { return x * x; }
+    float x_, y_, between_, xx_, xy_, yy_;
+};
+
+/// Of the outer edge and of the inner one.
+ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, const Compass& compass,
+                               std::array<SectorSums, 2>& edges) {
+    Gradient at;
+    for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
+        const int lanes = std::min(kChunk, (pixels.count - begin) / kLanes);
+        const float *x = pixels.x + begin, *y = pixels.y + begin;
+        model.evaluate(x, y, pixels.level + begin, lanes, at);
+        for (int n = 0; n < lanes; ++n) {
+            const Bits place = compass.locate(load(x + n * kLanes), load(y + n * kLanes));
+            const Lanes slope = at.ring[n], residual = at.residual[n];
+            for (int k = 0; k < kLanes; ++k)
+                if (std::abs(residual[k]) < 256)  // others are clipped, or none
+                    edges[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(slope[k]),
+                                                           double(residual[k]));
+        }
+    }
+}
+
+/// The set with all sectors that lie within kReach of it on the image of a circle.
+Sectors widen(Sectors sectors, const CircleImage& circle) {
+    const double side = 2 * std::numbers::pi * std::sqrt(eigen(circle.shape).second) / kSectors;
+    for (double reach = 0; reach < kReach; reach += side)
+        sectors |= std::rotl(sectors, 1) | std::rotr(sectors, 1);
+    return sectors;
+}
+
+}  // namespace
+
+Sectors any_run(Sectors sectors) {
+    if (!~sectors) return sectors;
+    Sectors run = sectors & ~std::rotl(sectors, 1);  // where runs begin
+    run &= ~run + 1;
+    while (const Sectors next = std::rotl(run, 1) & sectors & ~run) run |= next;
+    return run;
+}
+
+Pixel point_in_sector(const Parameters& p, int sector, double r) {
+    const double angle = (sector + 0.5) * 2 * std::numbers::pi / kSectors;
+    const double x = r * std::cos(angle), y = r * std::sin(angle);
+    return {float(p[kX] + p[kAxx] * x + p[kAxy] * y), float(p[kY] + p[kAxy] * x + p[kAyy] * y)};
+}
+
+ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels) {
+    const Compass compass(p);
+    int kept = 0;
+    for (int begin = 0; begin < pixels.used; begin += kLanes) {
+        const Lanes x = load(pixels.x + begin), y = load(pixels.y + begin),
+                    level = load(pixels.level + begin);
+        const Bits place = compass.locate(x, y);
+        for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
+            if ((place[k] < kSectors ? hidden.outer : hidden.inner) >> (place[k] % kSectors) & 1) continue;
+            pixels.x[kept] = x[k], pixels.y[kept] = y[k], pixels.level[kept++] = level[k];
+        }
+    }
+    pixels.keep(kept);
+}
+
+void SectorSums::add(int sector, double slope, double residual) {
+    const auto s = size_t(sector);
+    const double w = std::abs(slope);
+    rr_[s] += w * residual * residual, weight_[s] += w, squared_[s] += w * w, moved_[s] += slope * residual;
+}
+
+Sectors SectorSums::beyond(double noise, double slack) const {
+    Sectors off = 0;
+    for (size_t s = 0; s < kSectors; ++s) {
+        const double chance = kChance * std::sqrt(2 * squared_[s]);
+        const double limit = noise * noise * (weight_[s] + chance) + slack * slack * weight_[s];
+        off |= Sectors(rr_[s] > limit) << s;
+    }
+    return off;
+}
+
+Displacement SectorSums::displacement(double noise) const {
+    constexpr int span = 2 * kAround + 1;
+    const double least = kSeen * span / kSectors * std::accumulate(squared_.begin(), squared_.end(), 0.0);
+    double sum = 0, chance = 0;
+    int seen = 0;
+    for (int s = 0; s < kSectors; ++s) {
+        double across = 0, along = 0;
+        for (int k = s - kAround; k <= s + kAround; ++k) {
+            const auto at = size_t(k + kSectors) % kSectors;
+            across += moved_[at], along += squared_[at];
+        }
+        if (along <= least) continue;
+        sum += across * across / (along * along), chance += noise * noise / along, ++seen;
+    }
+    const double n = std::max(seen, 1);
+    return {std::sqrt(sum / n), std::sqrt(chance / n)};
+}
+
+EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
+    : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
+    EdgePixels pixels;
+    pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
+    Parameters local = p;
+    local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
+    select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
+    add_misfit(pixels, Model(local), Compass(local), edges_);
+}
+
+Hidden EdgeMisfit::hidden(double noise, double slack) const {
+    return {widen(edges_[0].beyond(noise, slack), circles_[0]),
+            widen(edges_[1].beyond(noise, slack), circles_[1])};
+}
+
+std::array<Displacement, 2> EdgeMisfit::displacements(double noise) const {
+    return {edges_[0].displacement(noise), edges_[1].displacement(noise)};
+}
+
+}  // namespace roundel

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numbers>
+
+#include "numeric/ellipse.hpp"
+#include "numeric/image.hpp"
+
+namespace roundel {
+
+constexpr int kRays = 16;
+
+struct Direction {
+    float x, y;
+};
+
+inline const std::array<Direction, kRays> kDirections = [] {
+    std::array<Direction, kRays> directions;
+    for (int k = 0; k < kRays; ++k) {
+        const double angle = 2 * std::numbers::pi * k / kRays;
+        directions[size_t(k)] = {float(std::cos(angle)), float(std::sin(angle))};
+    }
+    return directions;
+}();
+
+/// Grey level between pixels; below 0 outside the image.
+inline float sample(const ImageView& image, float x, float y) {
+    const int u = int(x), v = int(y);
+    if (!(x >= 0 && y >= 0 && u < image.width - 1 && v < image.height - 1)) return -1;
+    const uint8_t *upper = image.row(v) + u, *lower = upper + image.stride;
+    const float a = x - float(u), b = y - float(v);
+    const float above = float(upper[0]) + a * (float(upper[1]) - float(upper[0]));
+    const float below = float(lower[0]) + a * (float(lower[1]) - float(lower[0]));
+    return above + b * (below - above);
+}
+
+/// A ray that walks outwards from (x, y) pixel by pixel, as far as the image goes.
+class Ray {
+  public:
+    Ray(const ImageView& image, float x, float y, Direction d)
+        : image_(image),
+          x_(x),
+          y_(y),
+          d_(d),
+          end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
+    /// The first pixel, before `limit`, where the ray is (or is not) darker than `theta` after it was not (or
+    /// was) once; negative where it does not turn so. The next walk goes on from there.
+    template <bool dark>
+    int walk(int theta, float limit) {
+        const int last = int(std::min(limit, end_));
+        int t = t_, u = u_ + t * du_, v = v_ + t * dv_;  // in 1/65536 of a pixel
+        const auto is_there = [&] { return (image_.row(v >> 16)[u >> 16] < theta) == dark; };
+        while (t < last && is_there()) ++t, u += du_, v += dv_;
+        while (t < last && !is_there()) ++t, u += du_, v += dv_;
+        return t_ = t, t < last ? t : -1;
+    }
+    /// Where it does so between pixels; negative where it does not.
+    float turn(bool dark, float theta, float limit) {
+        const int below = int(std::ceil(theta)),
+                  pixel = dark ? walk<true>(below, limit) : walk<false>(below, limit);
+        return pixel < 0 ? -1 : between(pixel, theta);
+    }
+    /// Where the level is theta, near the pixel to which a walk went.
+    float between(int pixel, float theta) const {
+        float t = float(std::max(pixel - 2, 0)), before = level(t);
+        for (int k = 0; k < 3; ++k) {
+            const float after = level(t + 1);
+            if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
+            before = after, t += 1;
+        }
+        return float(pixel) - 0.5f;
+    }
+
+  private:
+    /// How far a ray goes until half a pixel before the image's last one; nothing is seen from outside.
+    static float room(float at, float step, int length) {
+        if (!(at >= 0 && at <= float(length - 1))) return 0;
+        const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
+        return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
+    }
+    float level(float t) const { return sample(image_, x_ + t * d_.x, y_ + t * d_.y); }
+
+    const ImageView& image_;
+    float x_, y_;
+    Direction d_;
+    float end_;
+    int u_ = int(65536 * x_) + 32768, v_ = int(65536 * y_) + 32768;
+    int du_ = int(65536 * d_.x), dv_ = int(65536 * d_.y);
+    int t_ = 0;
+};
+
+/// Grey levels on the ellipse that is `scale` times the outer one; below 0 outside the image.
+inline std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
+    std::array<float, kRays> levels;
+    const double c = std::cos(e.angle), s = std::sin(e.angle);
+    for (int k = 0; k < kRays; ++k) {
+        const Direction d = kDirections[size_t(k)];
+        const double along = scale * e.major / 2 * double(d.x), across = scale * e.minor / 2 * double(d.y);
+        levels[size_t(k)] =
+            sample(image, float(e.x + c * along - s * across), float(e.y + s * along + c * across));
+    }
+    return levels;
+}
+
+}  // namespace roundel

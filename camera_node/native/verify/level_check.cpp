@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "verify/level_check.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "numeric/ray.hpp"
+
+namespace roundel {
+
+Surface inspect(const ImageView& image, const Fit& fit) {
+    const Ellipse& e = fit.outer;
+    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // beyond it, levels are plain
+    const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
+    Surface surface;
+    const auto test = [&](double scale, bool dark) {
+        for (const float value : levels_on(image, e, scale)) {
+            if (value < 0) continue;
+            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
+            ++surface.seen, surface.off += std::abs(share - (dark ? 0 : 1)) > 0.3;
+        }
+    };
+    for (const double share : {0.25, 0.5, 0.75})
+        if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
+    for (const double share : {0.2, 0.5, 0.8})
+        if ((1 - share) * hole > edge) test(share * fit.ratio, false);
+    return surface;
+}
+
+bool is_bullseye(const ImageView& image, const Fit& fit) {
+    // Thin rings are blurred and not so dark.
+    const float theta = float(fit.bright - 0.3 * (fit.bright - fit.dark));
+    const Ellipse& e = fit.outer;
+    float least = 1e9f, most = 0;
+    for (int k = 0; k < kRays; k += 2) {
+        Ray ray(image, float(e.x), float(e.y), kDirections[size_t(k)]);
+        const auto limit = float(4 * e.major);
+        float edge = 0;
+        for (int ring = 0; ring < 3 && edge >= 0; ++ring)
+            if (ray.turn(true, theta, limit) < 0 || (edge = ray.turn(false, theta, limit)) < 0) return false;
+        const double u = double(kDirections[size_t(k)].x), v = double(kDirections[size_t(k)].y);
+        const double along = u * std::cos(e.angle) + v * std::sin(e.angle);
+        const double across = v * std::cos(e.angle) - u * std::sin(e.angle);
+        const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
+        least = std::min(least, share), most = std::max(most, share);
+    }
+    return most < 1.3f * least;
+}
+
+}  // namespace roundel

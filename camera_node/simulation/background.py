@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a simulated camera sees behind the roundels: a floor with tiles, tape, letters, dark discs and uneven light."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.geometry.pose import Array
+
+Picture = NDArray[np.float32]
+SIZE_M = 10.0  # the floor is a square around the world's origin
+PIXEL_M = 0.005
+FLOOR = 128.0
+WALL = 120.0  # grey level of all that is not floor
+SUBSAMPLES = 3
+_TO_PIXELS = np.array([1, -1], np.float32) / np.float32(PIXEL_M)
+
+
+def plain_floor() -> Picture:
+    """A floor of one grey level, (n, n)."""
+    n = round(SIZE_M / PIXEL_M)
+    return np.full((n, n), FLOOR, np.float32)
+
+
+def paint_floor(seed: int) -> Picture:
+    """Grey levels of the floor, (n, n); columns grow with the world's x, rows against its y.
+
+    None of its marks is a roundel, though discs, letters and sheets of paper come close.
+    """
+    rng = np.random.default_rng(seed)
+    floor = plain_floor().astype(np.uint8)
+    n = len(floor)
+    floor[:: round(0.5 / PIXEL_M)] = floor[:, :: round(0.5 / PIXEL_M)] = 100
+    for mark in (_paint_sheet, _paint_disc, _paint_letters, _paint_tape):
+        for _ in range(14):
+            mark(floor, rng, *rng.integers(n // 5, 4 * n // 5, 2).tolist())
+    light = cv2.resize(
+        rng.uniform(0.8, 1.15, (5, 5)).astype(np.float32), (n, n), interpolation=cv2.INTER_CUBIC
+    )
+    grain = rng.standard_normal((n, n), np.float32)
+    return np.asarray(floor * light * (1 + np.float32(0.04) * grain), np.float32)
+
+
+def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
+    """The floor (z = 0) as a camera sees it, (h, w).
+
+    Args:
+        floor: its grey levels, from `paint_floor`.
+        rays: (h, w, 2) x/z and y/z of each pixel's viewing ray.
+        T_world_cam: (4, 4) pose of the camera.
+    """
+    h, w = rays.shape[:2]
+    T = T_world_cam.astype(np.float32)
+    fine = cv2.resize(rays, (w * SUBSAMPLES, h * SUBSAMPLES), interpolation=cv2.INTER_LINEAR)
+    directions = cv2.transform(fine, T[:3, :3])  # of a point (x, y) it takes (x, y, 1)
+    down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # a ray that rises goes far out
+    xy = T[:2, 3] - directions[..., :2] * (T[2, 3] / down)
+    where = (xy * _TO_PIXELS + np.float32(SIZE_M / 2 / PIXEL_M)).clip(-10, 32000)
+    columns, rows = cv2.split(where)
+    seen = cv2.remap(floor, columns, rows, cv2.INTER_LINEAR, borderValue=WALL)
+    return np.asarray(cv2.resize(seen, (w, h), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _paint_sheet(floor: NDArray[np.uint8], rng: np.random.Generator, u: int, v: int) -> None:
+    corners = cv2.boxPoints(((u, v), (42, 60), float(rng.uniform(0, 180))))
+    cv2.fillConvexPoly(floor, corners.astype(np.int32), int(rng.integers(190, 225)))
+    cv2.circle(floor, (u, v), int(rng.integers(6, 12)), 45, -1, cv2.LINE_AA)
+
+
+def _paint_disc(floor: NDArray[np.uint8], rng: np.random.Generator, u: int, v: int) -> None:
+    cv2.circle(floor, (u, v), int(rng.integers(8, 26)), int(rng.integers(20, 70)), -1, cv2.LINE_AA)
+
+
+def _paint_letters(floor: NDArray[np.uint8], rng: np.random.Generator, u: int, v: int) -> None:
+    text = "".join(rng.choice(list("ABDGOQR0689"), 3))
+    cv2.putText(floor, text, (u, v), cv2.FONT_HERSHEY_SIMPLEX, float(rng.uniform(1, 2)), 35, 5, cv2.LINE_AA)
+
+
+def _paint_tape(floor: NDArray[np.uint8], rng: np.random.Generator, u: int, v: int) -> None:
+    du, dv = rng.integers(-150, 150, 2).tolist()
+    cv2.line(floor, (u, v), (u + du, v + dv), int(rng.choice([30, 210])), 10, cv2.LINE_AA)

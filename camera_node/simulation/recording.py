@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A simulated recording: frames of all cameras, with the true poses beside them."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import msgspec
+from rich.progress import track
+
+from camera_node.config import write_atomically
+from camera_node.errors import CameraError, ConfigError
+from camera_node.geometry.pose import invert
+from camera_node.simulation.camera import exposure_middle_s
+from camera_node.simulation.renderer import Renderer
+from camera_node.simulation.scene import WAND, Scene, SceneCamera
+
+
+def render_recording(
+    scene: Scene,
+    folder: Path,
+    start_s: float,
+    stop_s: float,
+    cameras: Sequence[str] | None = None,
+    epoch_ns: int = 0,
+) -> None:
+    """Write `<folder>/<camera>/<t_ns>.png` for every exposure from `start_s` until before `stop_s`.
+
+    Beside them go `truth.json` and `rig.yaml`, which holds the intrinsics alone: what a calibration starts from.
+
+    Raises:
+        ConfigError: the scene lacks one of the cameras, or the folder can't be written to.
+    """
+    names = list(scene.cameras) if cameras is None else list(cameras)
+    exposures = {name: list_exposures(scene.camera(name), start_s, stop_s) for name in names}
+    for name in names:
+        try:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"{folder / name} can't be made: {error.strerror}; choose another folder"
+            ) from None
+    write_atomically(folder / "truth.json", json.dumps(describe_truth(scene, exposures, epoch_ns), indent=1))
+    entries = {name: entry for name, entry in scene.rig_entries().items() if name in names}
+    write_atomically(folder / "rig.yaml", msgspec.yaml.encode({"cameras": entries}).decode())
+    for name, indices in exposures.items():
+        renderer = Renderer(scene, name)
+        for index in track(indices, f"rendering {name}", transient=True):
+            t_s = exposure_middle_s(scene.camera(name), index)
+            path = folder / name / f"{epoch_ns + round(t_s * 1e9):015d}.png"
+            if not cv2.imwrite(str(path), renderer.render(t_s, index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                raise CameraError(f"{path} can't be written: is the disk full?")
+
+
+def list_exposures(camera: SceneCamera, start_s: float, stop_s: float) -> range:
+    """Indices of a camera's exposures whose middle lies in [start_s, stop_s); none before its first."""
+    first, end = (math.ceil((t - camera.phase_ms * 1e-3) * camera.fps - 1e-9) for t in (start_s, stop_s))
+    return range(max(first, 0), max(end, 0))
+
+
+def describe_truth(scene: Scene, exposures: dict[str, range], epoch_ns: int) -> dict:
+    """What is true of a recording: cameras, bodies, and their poses at the stamps of the first camera.
+
+    Matrices are (4, 4) and times Unix seconds. `outer_diameter_m` of the robots is that of the smallest.
+    """
+    name = next(iter(exposures))
+    times = [exposure_middle_s(scene.camera(name), index) for index in exposures[name]]
+    poses: dict[str, list] = {body: [] for body in (WAND, *scene.robots)}
+    for t_s in times:
+        for body, (_, T) in scene.bodies_at(t_s).items():
+            poses[body].append([epoch_ns * 1e-9 + t_s, T.tolist()])
+    return {
+        "cameras": {name: _describe_camera(scene.camera(name)) for name in exposures},
+        "wand": {
+            "markers_m": scene.wand.markers,
+            "outer_diameter_m": scene.wand.diameter_m,
+            "poses": poses.pop(WAND),
+        },
+        "robots": {
+            "outer_diameter_m": min((body.diameter_m for body in scene.robots.values()), default=None),
+            "markers_m": {robot: body.markers for robot, body in scene.robots.items()},
+            "poses_at_stamps_of_cam0": poses,
+        },
+    }
+
+
+def _describe_camera(camera: SceneCamera) -> dict:
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "dist": camera.distortion,
+        "T_cam_world": invert(camera.T_world_cam).tolist(),
+        "fps": camera.fps,
+        "phase_ms": camera.phase_ms,
+    }

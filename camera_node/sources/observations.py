@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Recorded detections: out of folders of frames, or out of `observations.csv`, as the messages of a camera."""
+
+import csv
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from camera_node.detection.detector import Detector
+from camera_node.detection.roundels import Roundels
+from camera_node.errors import CameraError, ConfigError
+from camera_node.protocol.messages import Detections
+from camera_node.sources.replay import FolderSource
+
+SIGMA_PX = 0.3  # of a centre whose file does not say better
+Rows = dict[tuple[int, str], list[tuple[float, float, int]]]
+
+
+def detect_frames(folder: Path, **settings) -> list[Detections]:
+    """Detect roundels in `<folder>/<camera>/<t_ns>.png|jpg`, all cameras, in order of time.
+
+    Args:
+        folder: one folder a camera inside it, named like the camera.
+        settings: those of `Detector`.
+
+    Raises:
+        CameraError: the folder is missing or holds no frames, or a frame is no image.
+    """
+    if not folder.is_dir():
+        raise CameraError(
+            f"{folder} is no folder; frames are expected as {folder}/<camera>/<t_ns>.png or .jpg"
+        )
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if not names:
+        raise CameraError(
+            f"{folder} holds no folder of a camera; frames are expected as {folder}/<camera>/<t_ns>.png"
+        )
+    sources = {name: FolderSource(folder / name) for name in names}
+    frames = ((name, seq, frame) for name, source in sources.items() for seq, frame in enumerate(source))
+    detectors = {name: Detector(**settings) for name in names}
+    found = [
+        Detections.pack(
+            detectors[name].detect(frame.image),
+            camera=name,
+            seq=seq,
+            t_ns=frame.t_ns,
+            width=frame.image.shape[1],
+            height=frame.image.shape[0],
+        )
+        for name, seq, frame in track(
+            frames, f"detecting in {folder}", sum(map(len, sources.values())), transient=True
+        )
+    ]
+    return sorted(found, key=lambda message: message.t_ns)
+
+
+def read_observations(path: Path, sizes: dict[str, tuple[int, int]] | None = None) -> list[Detections]:
+    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker, one row a centre.
+
+    Args:
+        path: the file.
+        sizes: (width, height) of each camera's image, where known; else the extent of its observations.
+
+    Returns:
+        one message a camera and time, in order of time; `marker` becomes `id`.
+
+    Raises:
+        ConfigError: the file is missing, lacks a column, or a row of it holds no numbers.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = _read_rows(file, path)
+    except OSError as error:
+        raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
+    except UnicodeDecodeError:
+        raise ConfigError(
+            f"{path} is no text; it needs the columns t_ns,camera,u,v and optionally marker"
+        ) from None
+    if not rows:
+        raise ConfigError(f"{path} holds no observations")
+    extent: dict[str, tuple[int, int]] = {}
+    for (_, camera), points in rows.items():
+        w, h = extent.get(camera, (1, 1))
+        extent[camera] = (max(w, *(int(p[0]) + 1 for p in points)), max(h, *(int(p[1]) + 1 for p in points)))
+    seqs: dict[str, int] = {}
+    return [
+        _message(key, rows[key], seqs, (sizes or extent).get(key[1], extent[key[1]])) for key in sorted(rows)
+    ]
+
+
+def write_observations(path: Path, messages: Iterable[Detections]) -> None:
+    """Write detections as `observations.csv`.
+
+    Raises:
+        ConfigError: the folder can't be written to.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t_ns", "camera", "u", "v", "marker"])
+            writer.writerows(_flatten(messages))
+    except OSError as error:
+        raise ConfigError(f"{path} can't be written: {error.strerror}; is its folder there?") from None
+
+
+def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:
+    for message in messages:
+        for roundel in message.unpack():
+            number = "" if roundel.id is None else roundel.id
+            yield message.t_ns, message.camera, f"{roundel.uv[0]:.4f}", f"{roundel.uv[1]:.4f}", number
+
+
+def _read_rows(file: Iterable[str], path: Path) -> Rows:
+    reader = csv.DictReader(file)
+    if missing := {"t_ns", "camera", "u", "v"} - set(reader.fieldnames or ()):
+        raise ConfigError(f"{path} lacks the column {', '.join(sorted(missing))}; it needs t_ns,camera,u,v")
+    rows: Rows = {}
+    for row in reader:
+        try:
+            u, v, number = float(row["u"]), float(row["v"]), int(row.get("marker") or -1)
+            t_ns, in_range = int(row["t_ns"]), abs(u) < 1e5 and abs(v) < 1e5  # and no NaN
+            if not (in_range and row["camera"] and 0 <= t_ns < 2**63 and -1 <= number < 2**31):
+                raise ValueError
+            rows.setdefault((t_ns, row["camera"]), []).append((u, v, number))
+        except (TypeError, ValueError):
+            raise ConfigError(
+                f"{path}, line {reader.line_num}: not t_ns,camera,u,v in whole ns and pixels"
+            ) from None
+    return rows
+
+
+def _message(key: tuple[int, str], points: list, seqs: dict[str, int], size: tuple[int, int]) -> Detections:
+    t_ns, camera = key
+    seqs[camera] = seqs.get(camera, -1) + 1
+    columns = np.array(points)
+    roundels = Roundels.from_points(columns[:, :2], SIGMA_PX, columns[:, 2].astype(np.int32))
+    width, height = size
+    return Detections.pack(roundels, camera=camera, seq=seqs[camera], t_ns=t_ns, width=width, height=height)

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cameras on this machine, by Video4Linux."""
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+
+from camera_node.errors import CameraError
+from camera_node.protocol.host_clock import unix_ahead_ns
+from camera_node.sources.frame import Frame, SourceSettings
+from camera_node.sources.grey import RAW, grey
+
+log = logging.getLogger("camera_node.device")
+
+SYS = Path("/sys/class/video4linux")
+REOPEN_S = 1.0
+PATIENCE_S = 5.0  # how long an opened camera may take to its first frame
+MANUAL_EXPOSURE, AUTOMATIC_EXPOSURE = 1, 3  # V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY
+
+
+def find_device(text: str, sys: Path = SYS) -> Path:
+    """The device file of a camera that is given by its number, its path or its name.
+
+    Args:
+        text: `2`, `/dev/video2`, or a name as in `<sys>/video2/name`.
+        sys: where the kernel lists cameras.
+
+    Raises:
+        CameraError: no camera has this name, or several have.
+    """
+    if text.isdecimal():
+        return Path(f"/dev/video{text}")
+    if text.startswith("/dev/"):
+        return Path(text)
+    names = camera_names(sys)
+    matching = [device for device, name in names.items() if name == text]
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        raise CameraError(
+            f"several cameras are called '{text}'; give a path: {', '.join(map(str, matching))}"
+        )
+    raise CameraError(f"no folder, video or camera '{text}'; {_present(names)}")
+
+
+def camera_names(sys: Path = SYS) -> dict[Path, str]:
+    """The cameras of this machine: device file and name. A camera's metadata devices (index > 0) are left out."""
+    found = sorted(sys.glob("video*"), key=lambda entry: (len(entry.name), entry.name))
+    return {
+        Path("/dev") / entry.name: _read(entry / "name")
+        for entry in found
+        if _read(entry / "index") in ("", "0")
+    }
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _present(names: dict[Path, str]) -> str:
+    cameras = ", ".join(f"{device} ({name})" for device, name in names.items())
+    return f"cameras present: {cameras}" if cameras else "this machine has no camera"
+
+
+def exposure_properties(exposure_us: float | None, gain: float | None) -> list[tuple[int, float]]:
+    """OpenCV's (property, value) pairs for an exposure (microseconds) and a gain; V4L2 counts in 100 us."""
+    pairs: list[tuple[int, float]] = []
+    if exposure_us is not None:
+        pairs.append((cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE))
+        pairs.append((cv2.CAP_PROP_EXPOSURE, max(1, round(exposure_us / 100))))
+    if gain is not None:
+        pairs.append((cv2.CAP_PROP_GAIN, gain))
+    return pairs
+
+
+def properties(settings: SourceSettings) -> list[tuple[int, float]]:
+    """All of a camera's (property, value) pairs in the order V4L2 needs: format, size, rate, exposure."""
+    pairs: list[tuple[int, float]] = []
+    if settings.fourcc is not None:
+        pairs.append((cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc)))
+        if settings.fourcc in RAW:
+            pairs.append((cv2.CAP_PROP_CONVERT_RGB, 0))  # else OpenCV makes colours of the grey, 8 bits each
+    for name in ("width", "height", "fps"):
+        if (value := getattr(settings, name)) is not None:
+            pairs.append((PROPERTY[name], value))
+    return pairs + exposure_properties(settings.exposure_us, settings.gain)
+
+
+PROPERTY = {
+    "width": cv2.CAP_PROP_FRAME_WIDTH,
+    "height": cv2.CAP_PROP_FRAME_HEIGHT,
+    "fps": cv2.CAP_PROP_FPS,
+}
+NAMES = {
+    cv2.CAP_PROP_FOURCC: "pixel format",
+    cv2.CAP_PROP_CONVERT_RGB: "raw pixels",
+    cv2.CAP_PROP_FRAME_WIDTH: "width",
+    cv2.CAP_PROP_FRAME_HEIGHT: "height",
+    cv2.CAP_PROP_FPS: "frame rate",
+    cv2.CAP_PROP_AUTO_EXPOSURE: "manual exposure",
+    cv2.CAP_PROP_EXPOSURE: "exposure",
+    cv2.CAP_PROP_GAIN: "gain",
+}
+
+
+def capture_time(stamp_ms: float, monotonic_ns: int, unix_ns: int, exposure_us: float) -> int:
+    """The middle of an exposure in Unix nanoseconds.
+
+    Args:
+        stamp_ms: the buffer's time stamp, CLOCK_MONOTONIC; taken when it lies within the last second.
+        monotonic_ns, unix_ns: both clocks at one instant just after the frame was grabbed.
+        exposure_us: how long the exposure was; the stamp is taken to be its end.
+    """
+    age = monotonic_ns - stamp_ms * 1e6
+    end = unix_ns - age if 0 <= age < 1e9 else unix_ns
+    return round(end - exposure_us * 500)
+
+
+class Capture(Protocol):
+    """What is used of `cv2.VideoCapture`."""
+
+    def read(self) -> tuple[bool, Any]: ...
+    def get(self, propId: int, /) -> float: ...
+    def set(self, propId: int, value: float, /) -> bool: ...
+    def release(self) -> None: ...
+
+
+def open_capture(device: Path, settings: SourceSettings) -> cv2.VideoCapture:
+    """A V4L2 camera with its settings applied; what it refuses is logged.
+
+    Raises:
+        CameraError: there is no such device, or it does not open.
+    """
+    if not device.exists():
+        raise CameraError(f"{device} does not exist; {_present(camera_names())}")
+    if not os.access(device, os.R_OK | os.W_OK):
+        raise CameraError(f"{device} may not be opened; add this user to the group video and log in again")
+    os.environ.setdefault(
+        "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2"
+    )  # seconds until a silent camera is noticed
+    capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
+    if not capture.isOpened():
+        raise CameraError(f"{device} is no camera, or another program uses it")
+    apply(capture, properties(settings), device)
+    return capture
+
+
+def apply(capture: Capture, pairs: list[tuple[int, float]], device: Path) -> None:
+    """Set properties of a camera; log what it refuses."""
+    for key, value in pairs:
+        if not capture.set(key, value):
+            log.warning("%s does not take %s = %g", device, NAMES[key], value)
+
+
+class DeviceSource:
+    """A camera of which always the newest frame is taken; frames that nobody took in time are counted in `dropped`.
+
+    A thread grabs. A camera that stops delivering is reported once and reopened until it is back.
+    """
+
+    def __init__(
+        self,
+        device: Path,
+        settings: SourceSettings,
+        open: Callable[[Path, SourceSettings], Capture] = open_capture,
+        reopen_s: float = REOPEN_S,
+    ) -> None:
+        """Raises CameraError where the camera does not open."""
+        self.device, self.settings = device, settings
+        self.dropped = 0
+        self._open, self._reopen_s = open, reopen_s
+        self._lost = False
+        self._capture: Capture | None = open(device, settings)
+        self._adjust: list[tuple[int, float]] = []
+        self._latest: Frame | None = None
+        self._arrived = threading.Condition()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"grab {device}", daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Frame]:
+        while True:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._latest or self._closed.is_set(), timeout=1.0)
+                if self._closed.is_set():
+                    return
+                frame, self._latest = self._latest, None
+            if frame:
+                yield frame
+
+    def adjust(self, exposure_us: float | None = None, gain: float | None = None) -> None:
+        """Change exposure (microseconds) and gain from the next frame on; None leaves one as it is."""
+        with self._arrived:
+            given = {"exposure_us": exposure_us, "gain": gain}
+            self.settings = replace(self.settings, **{k: v for k, v in given.items() if v is not None})
+            self._adjust += exposure_properties(exposure_us, gain)
+
+    def close(self) -> None:
+        self._closed.set()
+        with self._arrived:
+            self._arrived.notify_all()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(PATIENCE_S)
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            if not (self._grab() if self._capture else self._reopen()):
+                self._closed.wait(self._reopen_s)
+        if self._capture:
+            self._capture.release()
+
+    def _grab(self) -> bool:
+        assert self._capture
+        with self._arrived:
+            pairs, self._adjust = self._adjust, []
+        apply(self._capture, pairs, self.device)
+        ok, image = self._capture.read()
+        if not ok or image is None:
+            self._lose(self._capture)
+            return False
+        exposure_us = self.settings.exposure_us or 0.0
+        stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        now_ns = time.monotonic_ns()
+        t_ns = capture_time(stamp, now_ns, now_ns + unix_ahead_ns(), exposure_us)
+        self._keep(Frame(grey(image, self.settings.fourcc), t_ns, exposure_us))
+        return True
+
+    def _lose(self, capture: Capture) -> None:
+        capture.release()
+        self._capture = None
+        if not self._lost:
+            log.warning("%s stopped delivering; trying to reopen it", self.device)
+        self._lost = True
+
+    def _keep(self, frame: Frame) -> None:
+        if self._lost:
+            log.warning("%s delivers again", self.device)
+        self._lost = False
+        with self._arrived:
+            self.dropped += self._latest is not None
+            self._latest = frame
+            self._arrived.notify_all()
+
+    def _reopen(self) -> bool:
+        try:
+            self._capture = self._open(self.device, self.settings)
+        except CameraError as error:
+            log.debug("%s", error)
+            return False
+        return True
