@@ -5,9 +5,9 @@ from pathlib import Path
 
 import msgspec
 
-from calib.camera import Camera
-from calib.messages import RigMessage
-from calib.rig import Rig, load_rig
+from calib.rig.camera import Camera
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig, load_rig
 from fusion.errors import FusionError
 from fusion.kept import Kept
 

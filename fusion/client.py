@@ -19,8 +19,8 @@ from typing import Any, Generic, TypeVar
 
 import zenoh
 
-from calib.messages import RigMessage
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import open_client

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from fusion.instants import Frame, Instant
 from fusion.messages import State
 from fusion.optics import Exposures, Optics

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.health import Health

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.discs import fibonacci_sphere
+from camera_node.geometry.sphere import fibonacci_sphere
 from fusion import _core
 from fusion.estimator import AXIS_SIGMA_PX
 from fusion.grouping import Marker

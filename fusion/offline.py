@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from calib.camera import Camera
-from calib.recording import RecordingWriter, iterate
-from calib.rig import load_rig
+from calib.rig.camera import Camera
+from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.rig import load_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, encode

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from fusion._core import Poses
 from fusion.state import States
 from fusion.undistortion import table_of

@@ -17,9 +17,9 @@ from typing import Annotated
 import tyro
 import zenoh
 
-from calib.messages import RigMessage
-from calib.recording import RecordingWriter, iterate
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.session import open_client

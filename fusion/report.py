@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from fusion._core import ExpectedMarkers
 from fusion.grouping import Marker
 from fusion.instants import Instant

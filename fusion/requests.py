@@ -5,8 +5,8 @@ import time
 
 import zenoh
 
-from calib.messages import RigMessage
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.errors import FusionError

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.alignment import rigid_motions
 from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
+from camera_node.geometry.pose import rigid_motions
 from fusion.errors import FusionError
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 import zenoh
 
-from calib.camera import Camera
-from calib.messages import RigMessage
-from calib.rig import load_rig, save_rig
+from calib.rig.camera import Camera
+from calib.rig.messages import RigMessage
+from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from fusion.association import Association
 from fusion.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.inspection import Inspection

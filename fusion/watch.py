@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera, pixel_jacobians
+from calib.rig.camera import Camera, pixel_jacobians
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.instants import Frame
 

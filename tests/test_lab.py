@@ -21,8 +21,8 @@ import zenoh
 import camera_node.__main__ as camera_program
 import fusion.__main__ as fusion_program
 import web.__main__ as web_program
-from calib.live import publish
-from calib.rig import Rig
+from calib.live.collect import publish
+from calib.rig.rig import Rig
 from camera_node.protocol.messages import Detections, Keys, Roundels, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client import Arena

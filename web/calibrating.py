@@ -10,10 +10,10 @@ from typing import Any
 
 import viser
 
-from calib.live import publish
-from calib.recording import save_wave, wave_beside
-from calib.rig import load_rig
-from calib.waving import MOST_S, Progress, wave
+from calib.live.collect import publish
+from calib.live.wand_session import MOST_S, Progress, wave
+from calib.rig.recording import save_wave, wave_beside
+from calib.rig.rig import load_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
 from camera_node.geometry.body import Body

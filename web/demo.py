@@ -14,10 +14,10 @@ import numpy as np
 import psutil
 
 import web
-from calib.camera import Camera, transform
-from calib.live import publish
-from calib.rig import Rig, load_rig, save_rig
-from calib.world import align
+from calib.live.collect import publish
+from calib.rig.camera import Camera, transform
+from calib.rig.rig import Rig, load_rig, save_rig
+from calib.world.world_frame import align
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.geometry.pose import wxyz_from_rotation
 from web.feed import FAR_M, Latest
 from web.tables import robot_state

@@ -11,8 +11,8 @@ from typing import Any
 
 import msgspec
 
-from calib.messages import RigMessage
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from fusion.messages import FusionStatus, Markers, RobotPose
 from web.coverage import Coverage

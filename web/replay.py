@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from calib.recording import iterate
+from calib.rig.recording import iterate
 from camera_node.errors import ConfigError
 from web.feed import Feed
 

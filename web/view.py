@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
-from calib.rig import Rig
+from calib.rig.rig import Rig
 from web.drawing import GHOST, MarkerCloud, Robots, draw_camera, light
 from web.errors import WebError
 from web.feed import Feed, Latest

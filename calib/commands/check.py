@@ -9,18 +9,18 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from calib.agreement import Agreement, Placed, compare
 from calib.commands.choice import require_one
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
-from calib.outcome import Calibration
-from calib.problem import LENS, POSE
-from calib.rig import Rig, load_rig
-from calib.scale import SIGMA_M, Distance
-from calib.trust import assess
-from calib.wand import calibrate
+from calib.rig.rig import Rig, load_rig
+from calib.wand.bundle_adjustment.problem import LENS, POSE
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
+from calib.wand.quality.agreement import Agreement, Placed, compare
+from calib.wand.quality.grade import assess
+from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

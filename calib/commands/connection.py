@@ -10,8 +10,8 @@ from rich.console import Console
 from zenoh import Session
 
 from calib.commands.output import say
-from calib.live import publish
-from calib.rig import Rig
+from calib.live.collect import publish
+from calib.rig.rig import Rig
 from camera_node.protocol.session import open_client
 
 

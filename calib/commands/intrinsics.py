@@ -9,15 +9,15 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import track
 
-from calib.board import make_finder
-from calib.board_wave import show_board
 from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
-from calib.footage import find_cameras, read_frames, take_snapshots
-from calib.intrinsics import BoardViews, CalibratedLens, Model, merge
-from calib.residual_map import draw_residuals, save_map
-from calib.rig import load_rig
+from calib.intrinsics.board import make_finder
+from calib.intrinsics.calibrate import BoardViews, CalibratedLens, Model, merge
+from calib.intrinsics.guided_capture import show_board
+from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
+from calib.intrinsics.residual_plot import draw_residuals, save_map
+from calib.rig.rig import load_rig
 from camera_node.errors import ConfigError
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
-from calib.outcome import Calibration
-from calib.residual_map import draw_residuals, save_map
-from calib.rig import Rig, save_rig
-from calib.trust import Trust
+from calib.intrinsics.residual_plot import draw_residuals, save_map
+from calib.rig.rig import Rig, save_rig
+from calib.wand.outcome import Calibration
+from calib.wand.quality.grade import Trust
 from camera_node.errors import ConfigError
 
 

@@ -10,8 +10,8 @@ import tyro
 from rich.console import Console
 
 from calib.commands.output import check_folder, say
-from calib.planner import Forecast, Plan, foresee
-from calib.residual_map import save_map
+from calib.intrinsics.residual_plot import save_map
+from calib.plan.planner import Forecast, Plan, foresee
 from camera_node.config import load_yaml
 
 

@@ -4,8 +4,8 @@
 from pathlib import Path
 
 from calib.errors import CalibrationError
-from calib.recording import read_wave
-from calib.rig import Rig
+from calib.rig.recording import read_wave
+from calib.rig.rig import Rig
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations

@@ -7,12 +7,12 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from calib.lens_change import describe, find_changes
-from calib.lens_shape import find_misfit
-from calib.outcome import Calibration
-from calib.report import WandReport
-from calib.trust import Trust
-from calib.waving import Progress
+from calib.live.wand_session import Progress
+from calib.wand.outcome import Calibration
+from calib.wand.quality.grade import Trust
+from calib.wand.quality.lens_change import describe, find_changes
+from calib.wand.quality.lens_shape import find_misfit
+from calib.wand.report import WandReport
 
 WIDENED = 1.2  # below, it is not worth a line
 CLEAR = 3.0  # sigmas: below, a drift is not worth one either

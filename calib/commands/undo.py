@@ -8,8 +8,8 @@ from rich.console import Console
 
 from calib.commands.connection import Connection, Server
 from calib.commands.output import say
-from calib.history import undo
-from calib.rig import load_rig
+from calib.rig.history import undo
+from calib.rig.rig import load_rig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,14 +16,14 @@ from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.commands.report import print_report, show_progress
-from calib.live import Heard
-from calib.recalibration import place_one
-from calib.recording import save_wave, wave_beside
-from calib.rig import Rig, load_rig
-from calib.scale import SIGMA_M, Distance
-from calib.trust import assess
-from calib.wand import calibrate
-from calib.waving import MOST_S, wave
+from calib.live.collect import Heard
+from calib.live.wand_session import MOST_S, wave
+from calib.rig.recording import save_wave, wave_beside
+from calib.rig.rig import Rig, load_rig
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.grade import assess
+from calib.wand.recalibration import place_one
+from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body

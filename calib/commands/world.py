@@ -16,10 +16,10 @@ from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, say, write_rig
 from calib.commands.recording import read_recording
 from calib.errors import CalibrationError
-from calib.landmarks import is_line, locate_places, still_roundels
-from calib.live import collect
-from calib.rig import Rig, load_rig
-from calib.world import align, align_places, read_positions, require_above, stand
+from calib.live.collect import collect
+from calib.rig.rig import Rig, load_rig
+from calib.world.landmarks import is_line, locate_places, still_roundels
+from calib.world.world_frame import align, align_places, read_positions, require_above, stand
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body

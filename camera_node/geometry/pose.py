@@ -103,3 +103,20 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Array:
     T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
     T[:3, 3] = position
     return T
+
+
+def rigid_motions(source: Array, target: Array) -> Array:
+    """The motions (..., 4, 4) T that bring `source` (..., N, 3) nearest to `target`: target ~ T source.
+
+    Kabsch 1976; Umeyama 1991 without scale.
+    """
+    a, b = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(target - b, -1, -2) @ (source - a))
+    D = np.zeros(U.shape)
+    D[..., 0, 0] = D[..., 1, 1] = 1.0
+    D[..., 2, 2] = np.linalg.det(U @ Vt)
+    T = np.zeros((*U.shape[:-2], 4, 4))
+    T[..., :3, :3] = U @ D @ Vt
+    T[..., :3, 3] = (b - a @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
+    T[..., 3, 3] = 1.0
+    return T

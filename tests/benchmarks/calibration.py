@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from calib.camera import Camera
-from calib.outcome import Calibration
-from calib.rig import Rig, load_rig
-from calib.wand import calibrate
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, load_rig
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at
 from camera_node.protocol.messages import Detections

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 import zenoh
 
-from calib.rig import Rig, save_rig
+from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client import Arena, Stream

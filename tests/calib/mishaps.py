@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
-from calib.rig import Rig
+from calib.rig.rig import Rig
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
 

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.agreement import Placed, compare
-from calib.camera import Camera, transform
-from calib.outcome import Calibration
-from calib.rig import Rig
+from calib.rig.camera import Camera, transform
+from calib.rig.rig import Rig
+from calib.wand.outcome import Calibration
+from calib.wand.quality.agreement import Placed, compare
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.discs import displacement
 from calib.errors import CalibrationError
-from calib.labelling import label
-from calib.linearisation import Linearisation
-from calib.pairwise import Pairs
-from calib.problem import DRIFT, LENS, OFFSET, POSE, unobserved
-from calib.rig import Rig
-from calib.sightings import gather
-from calib.trajectory import hermite_rate, interpolate, locate
-from calib.wand import calibrate
+from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.disc_centres import displacement
+from calib.wand.bundle_adjustment.linear_system import Linearisation
+from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, unobserved
+from calib.wand.bundle_adjustment.trajectory import hermite_rate, interpolate, locate
+from calib.wand.calibrate import calibrate
+from calib.wand.detections import gather
+from calib.wand.initialization.two_view import Pairs
+from calib.wand.labeling import label
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
 from camera_node.protocol.messages import Detections

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
-from calib.agreement import Placed, compare
 from calib.commands.check import placed, split
 from calib.errors import CalibrationError
-from calib.rig import Rig
-from calib.wand import calibrate
+from calib.rig.rig import Rig
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.agreement import Placed, compare
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from tests.calib.synthetic import CAREFUL, Arena, record, ring, roughly
 

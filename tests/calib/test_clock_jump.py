@@ -4,8 +4,8 @@
 import msgspec
 import pytest
 
-from calib.outcome import Calibration
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
 from tests.calib.synthetic import OLD, roughly
 from tests.calib.wave import EPOCH_S, Wave, record
 

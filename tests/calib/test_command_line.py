@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera import Camera
-from calib.rig import Rig, load_rig, save_rig
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import Arena, assert_near, record, ring

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.agreement import Agreement, compare
 from calib.commands.check import placed, split
-from calib.outcome import Calibration
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
+from calib.wand.quality.agreement import Agreement, compare
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import Arena, record, ring

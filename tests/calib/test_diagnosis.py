@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from calib.errors import CalibrationError
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import WAND, Arena, record, ring

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.ends import label_ends
 from calib.errors import CalibrationError
-from calib.outcome import Calibration
-from calib.sightings import gather
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
+from calib.wand.detections import gather
+from calib.wand.outcome import Calibration
+from calib.wand.two_markers import label_ends
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, joint_error, roughly

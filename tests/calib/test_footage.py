@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.footage import find_cameras, read_frames, take_snapshots
+from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
 from camera_node.errors import CameraError
 from camera_node.protocol.messages import Keys
 from camera_node.protocol.requests import encode_jpeg, parse_quality, respond

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from calib.errors import CalibrationError
-from calib.history import keep, predecessors, undo
-from calib.rig import Rig, load_rig, save_rig
+from calib.rig.history import keep, predecessors, undo
+from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.errors import ConfigError
 from tests.calib.synthetic import ring
 

@@ -13,15 +13,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib.board import BoardFinder, ChessboardFinder, make_board, make_finder
-from calib.board_wave import show_board
-from calib.camera import Camera
 from calib.errors import CalibrationError
-from calib.footage import read_frames
-from calib.intrinsics import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge
-from calib.lens_adjustment import BoardView, adjust_lens
-from calib.residual_map import draw_residuals
-from calib.rig import Rig, load_rig
+from calib.intrinsics.adjustment import BoardView, adjust_lens
+from calib.intrinsics.board import BoardFinder, ChessboardFinder, make_board, make_finder
+from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge
+from calib.intrinsics.guided_capture import show_board
+from calib.intrinsics.images import read_frames
+from calib.intrinsics.residual_plot import draw_residuals
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, load_rig
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.lens_prior import told_sigma
-from calib.outcome import Calibration
-from calib.recalibration import place_one
-from calib.rig import Rig
-from calib.trust import assess
-from calib.wand import calibrate
+from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.lens_prior import told_sigma
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
+from calib.wand.quality.grade import assess
+from calib.wand.recalibration import place_one
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 

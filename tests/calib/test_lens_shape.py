@@ -5,9 +5,9 @@ from functools import cache
 
 import pytest
 
-from calib.lens_shape import Misfit, find_misfit
-from calib.rig import Rig
-from calib.wand import calibrate
+from calib.rig.rig import Rig
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.lens_shape import Misfit, find_misfit
 from tests.calib.synthetic import CAREFUL, OLD, roughly
 from tests.calib.wave import Recorded, Wave, record
 

@@ -6,9 +6,9 @@ import threading
 import pytest
 
 from calib.errors import CalibrationError
-from calib.live import collect, publish
-from calib.messages import RigMessage
-from calib.rig import dump_rig
+from calib.live.collect import collect, publish
+from calib.rig.messages import RigMessage
+from calib.rig.rig import dump_rig
 from camera_node.protocol.messages import Keys, decode, encode
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import record, ring

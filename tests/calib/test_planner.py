@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.planner import Plan, PlannedCamera, foresee, sees_level, sensor_range
+from calib.plan.planner import Plan, PlannedCamera, foresee, sees_level, sensor_range
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.recalibration import place_one
-from calib.rig import Rig
+from calib.rig.rig import Rig
+from calib.wand.recalibration import place_one
 from tests.calib.synthetic import CAREFUL, roughly
 from tests.calib.wave import Recorded, Wave, record
 

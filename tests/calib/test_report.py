@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from calib.commands.report import print_report
-from calib.lens_change import describe, find_changes
-from calib.trust import assess
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.grade import assess
+from calib.wand.quality.lens_change import describe, find_changes
 from tests.calib.wave import Wave, record
 
 

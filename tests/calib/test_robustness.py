@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import anywhere, in_a_mirror, in_runs, nothing, onto_a_feature, swap_ends

@@ -9,14 +9,14 @@ import pytest
 from scipy.stats import chi2
 
 from calib.__main__ import execute
-from calib.agreement import Agreement
-from calib.agreement import compare as compare_rigs
 from calib.commands.check import placed, split
 from calib.errors import CalibrationError
-from calib.rig import load_rig, save_rig
-from calib.scale import Distance, compare
-from calib.wand import calibrate
-from calib.waving import try_part
+from calib.live.wand_session import try_part
+from calib.rig.rig import load_rig, save_rig
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.agreement import Agreement
+from calib.wand.quality.agreement import compare as compare_rigs
+from calib.wand.scale import Distance, compare
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.observations import write_observations

@@ -6,8 +6,8 @@ import math
 import msgspec
 import numpy as np
 
-from calib.sightings import UNKNOWN_S, stamp_sigmas
-from calib.wand import calibrate
+from calib.wand.calibrate import calibrate
+from calib.wand.detections import UNKNOWN_S, stamp_sigmas
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import camera_errors
 from tests.calib.wave import EPOCH_S, Wave, record

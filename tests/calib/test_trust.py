@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.errors import CalibrationError
-from calib.outcome import Calibration
-from calib.precision import map_precision
-from calib.problem import PER_CAMERA, POSE, State
-from calib.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
-from calib.trust import GRADES, LIMITS, CameraTrust, Trust, assess, grade
-from calib.wand import calibrate
+from calib.plan.precision import map_precision
+from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
+from calib.rig.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
+from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, State
+from calib.wand.calibrate import calibrate
+from calib.wand.outcome import Calibration
+from calib.wand.quality.grade import GRADES, LIMITS, CameraTrust, Trust, assess, grade
 from tests.calib.synthetic import record, ring
 from tests.calib.test_agreement import covariance, disturb
 

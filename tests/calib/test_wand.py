@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.rig import Rig
-from calib.wand import calibrate
+from calib.rig.rig import Rig
+from calib.wand.calibrate import calibrate
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, WAND, Arena, assert_near, joint_error, record, ring, roughly

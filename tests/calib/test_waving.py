@@ -17,10 +17,10 @@ from calib.__main__ import execute
 from calib.commands.connection import Connection
 from calib.commands.wand import Wand
 from calib.errors import CalibrationError
-from calib.live import Heard
-from calib.recording import read_wave
-from calib.rig import load_rig, save_rig
-from calib.waving import IDLE_S, Progress, Rule, Trial, progress, thin, wave
+from calib.live.collect import Heard
+from calib.live.wand_session import IDLE_S, Progress, Rule, Trial, progress, thin, wave
+from calib.rig.recording import read_wave
+from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import assert_near, record, ring

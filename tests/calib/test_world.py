@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
-from calib.landmarks import locate_places, still_roundels
-from calib.rig import Rig
-from calib.world import align, align_places, move, read_positions, require_above, rescale, stand
+from calib.rig.rig import Rig
+from calib.world.landmarks import locate_places, still_roundels
+from calib.world.world_frame import align, align_places, move, read_positions, require_above, rescale, stand
 from camera_node.config import load_yaml
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import ConfigError

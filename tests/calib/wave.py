@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Camera
-from calib.rig import Rig
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at

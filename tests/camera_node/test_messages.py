@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import calib.messages
+import calib.rig.messages
 import camera_node.protocol.messages
 import fusion.messages
 from camera_node.detection.roundels import Roundels
@@ -132,7 +132,7 @@ def test_a_newer_sender_may_add_fields():
 def test_every_field_is_documented():
     """docs/messages.md names every message of the three packages and every field of it in its own section."""
     sections = (Path(__file__).parents[2] / "docs" / "messages.md").read_text().split("\n## ")
-    for module in (camera_node.protocol.messages, calib.messages, fusion.messages):
+    for module in (camera_node.protocol.messages, calib.rig.messages, fusion.messages):
         for name, kind in vars(module).items():
             if (
                 isinstance(kind, type)

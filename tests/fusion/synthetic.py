@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections

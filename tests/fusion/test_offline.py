@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.camera import Camera
-from calib.rig import Rig, save_rig
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from fusion.__main__ import main

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from calib.camera import Camera
+from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import CAUCHY, NOMINAL_WEIGHT

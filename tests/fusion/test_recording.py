@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.messages import RigMessage
-from calib.recording import RecordingWriter
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.recording import RecordingWriter
+from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from fusion.messages import Robots

@@ -9,8 +9,8 @@ import sys
 import msgspec
 import pytest
 
-from calib.messages import RigMessage
-from calib.rig import Rig, dump_rig, load_rig, save_rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
 from fusion.calibration import Calibration

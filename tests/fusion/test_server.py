@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.messages import RigMessage
-from calib.rig import Rig, save_rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig, save_rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import ClockReply, Detections, Keys, decode, encode
 from fusion.client import Arena as Client

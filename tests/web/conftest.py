@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from calib.camera import Camera
-from calib.messages import RigMessage
-from calib.rig import Rig
+from calib.rig.camera import Camera
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode

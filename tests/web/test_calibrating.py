@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from calib.recording import read_wave, save_wave
-from calib.rig import load_rig, save_rig
+from calib.rig.recording import read_wave, save_wave
+from calib.rig.rig import load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode

@@ -60,7 +60,7 @@ def test_a_pose_that_can_not_be_drawn_is_counted(played: Played, feed: Feed):
 
 def test_a_rig_that_is_none_is_counted(played: Played, feed: Feed):
     """Valid MessagePack around text that is no rig."""
-    from calib.messages import RigMessage
+    from calib.rig.messages import RigMessage
 
     for text in ("cameras: [", "cameras: 3", "&a [*a]", "!!python/object:os.system {}"):
         played.put(played.keys.rig, encode(RigMessage(t_ns=0, yaml=text)))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.recording import RecordingWriter
+from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
 from tests.conftest import free_port
 from tests.web.conftest import Said, four_cameras, wait_for

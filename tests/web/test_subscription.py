@@ -4,8 +4,8 @@
 import numpy as np
 import zenoh
 
-from calib.messages import RigMessage
-from calib.rig import Rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from fusion.messages import undo_key

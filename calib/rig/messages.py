@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What calibration says over Zenoh, in the encoding of `camera_node.protocol.messages`; the key is `Keys.rig`."""
+
+import time
+
+import msgspec
+import yaml
+
+from calib.rig.rig import Rig, dump_rig
+from camera_node.protocol.messages import VERSION, MessageError
+
+
+class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """The calibration in force, as the text of its `rig.yaml`."""
+
+    version: int = VERSION
+    t_ns: int
+    yaml: str
+
+    @classmethod
+    def of(cls, rig: Rig) -> "RigMessage":
+        """A rig that is in force from now on."""
+        return cls(t_ns=time.time_ns(), yaml=dump_rig(rig))
+
+    def rig(self) -> Rig:
+        """The rig that it tells of.
+
+        Raises:
+            MessageError: the text is no rig.yaml; in one line.
+        """
+        try:
+            return msgspec.yaml.decode(self.yaml, type=Rig)
+        except (msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
+            raise MessageError(f"no rig.yaml: {' '.join(str(error).split())[:200]}") from None

@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Directions spread evenly over the sphere."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def fibonacci_sphere(n: int) -> Array:
+    """(n, 3) unit vectors spread evenly (Gonzalez 2010)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    level = np.sqrt(1 - z**2)
+    return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
