@@ -15,12 +15,12 @@ from camera_node.errors import check_command, run
 
 # imported when asked for: what runs on a robot's computer has neither GTSAM nor SciPy
 COMMANDS = {
-    "run": "fusion.offline",
-    "replay": "fusion.offline",
-    "record": "fusion.recording",
-    "define": "fusion.defining",
-    "undo": "fusion.undoing",
-    "ros2": "fusion.ros2",
+    "run": "fusion.recordings.run",
+    "replay": "fusion.recordings.run",
+    "record": "fusion.recordings.record",
+    "define": "fusion.client.define",
+    "undo": "fusion.client.undo",
+    "ros2": "fusion.bridges.ros2",
 }
 
 
@@ -55,8 +55,8 @@ class Serve:
         """Serve until Ctrl-C or SIGTERM."""
         from dataclasses import asdict
 
-        from fusion.config import ArenaConfig, load_arena, override
-        from fusion.server import Server
+        from fusion.server.config import ArenaConfig, load_arena, override
+        from fusion.server.server import Server
 
         settings = asdict(self)
         path = settings.pop("config")

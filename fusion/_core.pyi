@@ -96,7 +96,7 @@ def predict(
 ) -> tuple[Array, Array, Array, Array]:
     """R (N, 3, 3), p (N, 3) and P (N, 12, 12) after dt (N,) seconds, and T (N, 3, 3): turns' errors by rates'.
 
-    densities (N, 2) and single (N,) as `fusion.state.predict` has them.
+    densities (N, 2) and single (N,) as `fusion.model.states.predict` has them.
     """
 
 def reweigh(

@@ -25,8 +25,8 @@ from calib.live.collect import publish
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import Detections, Keys, Roundels, decode, encode
 from camera_node.protocol.session import open_client
-from fusion.client import Arena
-from fusion.messages import FusionStatus
+from fusion.client.arena import Arena
+from fusion.protocol.messages import FusionStatus
 from tests.camera_node.conftest import DEADLINE_S, Inbox, eventually
 from tests.conftest import ROOT, free_port
 

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = """
 import pathlib, sys
-import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fusion.client
+import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fusion.client.arena
 here = pathlib.Path(sys.argv[1])
 for module in (camera_node, camera_node._core, calib, fusion, fusion._core):
     assert here in pathlib.Path(module.__file__).parents, module.__file__

@@ -22,7 +22,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from camera_node.simulation.scene import Scene
-from fusion.messages import RobotPose
+from fusion.protocol.messages import RobotPose
 from web.errors import WebError
 from web.feed import Feed, Latest
 from web.messages import Progress, progress_key

@@ -14,7 +14,7 @@ import msgspec
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
-from fusion.messages import FusionStatus, Markers, RobotPose
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage import Coverage
 from web.messages import Progress, progress_key
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the demo says over Zenoh, in the encoding of `camera_node.protocol.messages`: how far it is, and what is true."""
+"""The demo's message over Zenoh, encoded as in `camera_node.protocol.messages`: its progress, and the true poses."""
 
 import math
 

@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.config import is_name
 from camera_node.errors import RoundelError
-from fusion.defining import describe
+from fusion.client.define import describe
+from fusion.client.measure import Standing, find_standing, robot_of
 from fusion.errors import FusionError
-from fusion.measuring import Standing, find_standing, robot_of
 from web.drawing import PICKED
 from web.feed import Latest
 from web.panel import plain, write

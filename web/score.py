@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.messages import RobotPose
+from fusion.protocol.messages import RobotPose
 
 Array = NDArray[np.float64]
 RMS_MM, GAP_S = (

@@ -6,10 +6,10 @@ from typing import Any
 import zenoh
 
 from camera_node.errors import RoundelError
-from fusion.measuring import watch
-from fusion.messages import Markers, RobotsRequest
-from fusion.requests import change_robots, undo_correction
-from fusion.robots import Robot
+from fusion.client.measure import watch
+from fusion.model.robots import Robot
+from fusion.protocol.messages import Markers, RobotsRequest
+from fusion.protocol.requests import change_robots, undo_correction
 from web.feed import Feed
 
 ASK_S = 2.0

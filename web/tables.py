@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.messages import CameraHealth, FusionStatus, Latency, RobotPose
+from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, RobotPose
 from web.feed import Latest, Seen
 
 STALE_S = 2.0  # a robot or a camera that was silent for so long is away

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The least squares problem of one lens and the poses in which a board stood before it (Zhang 2000, section 3).
 
-Works for every model that `camera_node.geometry.lens` knows: it asks the lens for its derivatives. Poses are eliminated view by
-view (the Schur complement of bundle adjustment), so the cost grows with the number of views, not with its cube.
+Works for every model that `camera_node.geometry.lens` knows: it asks the lens for its derivatives. Poses are eliminated
+view by view (the Schur complement of bundle adjustment), so the cost grows with the number of views, not with its cube.
 """
 
 from collections.abc import Sequence

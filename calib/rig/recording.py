@@ -2,7 +2,7 @@
 """Recordings: messages in MCAP, as they came, one channel a key.
 
 Messages are in MessagePack as on the wire, under their Zenoh keys; `log_time` is when one arrived, in the recorder's
-clock. What an arena's recording holds beside detections is fusion's (`fusion.recording`).
+clock. What an arena's recording holds beside detections is fusion's (`fusion.recordings.record`).
 """
 
 import os

@@ -120,3 +120,49 @@ def rigid_motions(source: Array, target: Array) -> Array:
     T[..., :3, 3] = (b - a @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
     T[..., 3, 3] = 1.0
     return T
+
+
+def exp_so3(vectors: Array) -> Array:
+    """(N, 3, 3) rotations by vectors (N, 3)."""
+    return np.ascontiguousarray(turns(vectors.T).transpose(2, 0, 1))
+
+
+def log_so3(R: Array) -> Array:
+    """(N, 3) vectors of rotations (N, 3, 3) of less than half a turn: the quaternion's."""
+    q = wxyz_of(R)
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2 * np.arctan2(sine, q[:, 0])
+    return q[:, 1:] * (angle / np.maximum(sine, 1e-12))[:, None]
+
+
+def turns(w: Array) -> Array:
+    """(3, 3, ...) rotations by vectors (3, ...).
+
+    Rodrigues' formula: R = cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T, a = |w|.
+    """
+    angle = np.maximum(np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]), 1e-12)
+    cosine, s, half = np.cos(angle), np.sin(angle) / angle * w, np.sin(angle / 2) / angle
+    R = (2 * half * half * w)[:, None] * w
+    R[0, 0] += cosine
+    R[1, 1] += cosine
+    R[2, 2] += cosine
+    R[0, 1] -= s[2]
+    R[1, 0] += s[2]
+    R[0, 2] += s[1]
+    R[2, 0] -= s[1]
+    R[1, 2] -= s[0]
+    R[2, 1] += s[0]
+    return R
+
+
+def wxyz_of(R: Array) -> Array:
+    """(N, 4) unit quaternions w >= 0, x, y, z of rotations (N, 3, 3) (Shepperd's largest component first)."""
+    diagonal = np.einsum("nii->ni", R)
+    trace = diagonal.sum(1, keepdims=True)
+    largest = np.argmax(np.concatenate([trace, 2 * diagonal - trace], 1), axis=1)
+    a, b, c = (R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]).T
+    d, e, f = (R[:, [1, 0, 2], [0, 2, 1]] + R[:, [0, 2, 1], [1, 0, 2]]).T
+    s = 1 + np.concatenate([trace, 2 * diagonal - trace], 1).T
+    rows = np.array([[s[0], a, b, c], [a, s[1], d, e], [b, d, s[2], f], [c, e, f, s[3]]])
+    q = rows[largest, :, np.arange(len(R))]
+    return np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)

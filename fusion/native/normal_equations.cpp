@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <stdexcept>
 
-#include "../../camera_node/native/cholesky.hpp"
+#include "../../camera_node/native/numeric/cholesky.hpp"
 #include "../../camera_node/native/numeric/simd.hpp"
 
 namespace roundel::fusion {

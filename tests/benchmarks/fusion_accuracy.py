@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.instants import Instant, Instants
-from fusion.sightings import Matches, Observations, Sightings
-from fusion.tracker import Limits, Tracker
+from fusion.model.frames import Instant
+from fusion.model.observations import Matches, Observations, Sightings
+from fusion.server.frame_synchronizer import Instants
+from fusion.tracking.tracker import Limits, Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
 
 LIMITS = Limits(sigma_floor_px=1e-3)

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.protocol.messages import Detections, decode, encode
-from fusion.instants import Frame, Instants
-from fusion.messages import Latency, RobotPose, ShardPoses
-from fusion.server import collecting_between_instants
-from fusion.shards import Shard
-from fusion.tracker import Tracker
+from fusion.model.frames import Frame
+from fusion.protocol.messages import Latency, RobotPose, ShardPoses
+from fusion.protocol.shards import Shard
+from fusion.server.frame_synchronizer import Instants
+from fusion.server.server import collecting_between_instants
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import Load
 
 T = TypeVar("T")

@@ -6,10 +6,10 @@ from collections import Counter
 
 import numpy as np
 
-from fusion.grouping import group
-from fusion.instants import Instant
-from fusion.optics import Optics
-from fusion.sightings import Sightings
+from fusion.model.camera_array import Optics
+from fusion.model.frames import Instant
+from fusion.model.observations import Sightings
+from fusion.tracking.multiview import group
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
 
 APART_M = 0.12  # between discs of 0.08 m with their white margins

@@ -9,14 +9,14 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.pose import Pose, look_at
+from camera_node.geometry.pose import Pose, exp_so3, look_at
 from camera_node.protocol.messages import Detections
 from fusion.errors import FusionError
-from fusion.instants import Frame
-from fusion.optics import Exposures, Optics
-from fusion.robots import Robot, require_distinct
-from fusion.sightings import Catalogue
-from fusion.state import States, exp_so3
+from fusion.model.camera_array import Exposures, Optics
+from fusion.model.frames import Frame
+from fusion.model.observations import Catalogue
+from fusion.model.robots import Robot, require_distinct
+from fusion.model.states import States
 from tests.fusion.equations import outlines
 
 START_NS = 1_000_000_000_000

@@ -12,8 +12,8 @@ import numpy as np
 import tyro
 
 from camera_node.protocol.messages import encode
-from fusion.health import memory_mb
-from fusion.server import collecting_between_instants
+from fusion.server.server import collecting_between_instants
+from fusion.server.status import memory_mb
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series
 from tests.benchmarks.fusion_load import START_NS, Load
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.tracker import Tracker
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_accuracy import instants
 from tests.benchmarks.fusion_load import START_NS, Load
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 import calib.rig.messages
 import camera_node.protocol.messages
-import fusion.messages
+import fusion.protocol.messages
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import (
     MAX_ROUNDELS,
@@ -26,7 +26,7 @@ from camera_node.protocol.messages import (
     decode,
     encode,
 )
-from fusion.messages import FusionStatus, Markers, RobotPose
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 
 KINDS = (Detections, CameraStatus, ClockReply, Settings, Markers, RobotPose, FusionStatus)
 HEADER = {"camera": "cam0", "seq": 3, "t_ns": 1_700_000_000_000_000_000, "width": 640, "height": 480}
@@ -132,7 +132,7 @@ def test_a_newer_sender_may_add_fields():
 def test_every_field_is_documented():
     """docs/messages.md names every message of the three packages and every field of it in its own section."""
     sections = (Path(__file__).parents[2] / "docs" / "messages.md").read_text().split("\n## ")
-    for module in (camera_node.protocol.messages, calib.rig.messages, fusion.messages):
+    for module in (camera_node.protocol.messages, calib.rig.messages, fusion.protocol.messages):
         for name, kind in vars(module).items():
             if (
                 isinstance(kind, type)

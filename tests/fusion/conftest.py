@@ -10,10 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from fusion.instants import Frame, Instants
-from fusion.messages import RobotPose
-from fusion.report import Fused
-from fusion.tracker import Limits, Tracker
+from fusion.model.frames import Frame
+from fusion.protocol.messages import RobotPose
+from fusion.server.frame_synchronizer import Instants
+from fusion.tracking.result import Fused
+from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.synthetic import Arena
 
 

@@ -11,9 +11,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.optics import Discs, Exposures, Optics, Views
-from fusion.sightings import Observations, Sightings
-from fusion.state import OMEGA, POSITION, THETA, VELOCITY, Motion, States, exp_so3, turns
+from camera_node.geometry.pose import exp_so3, turns
+from fusion.model.camera_array import Discs, Exposures, Optics, Views
+from fusion.model.observations import Observations, Sightings
+from fusion.model.states import (
+    OMEGA,
+    POSITION,
+    THETA,
+    VELOCITY,
+    Motion,
+    States,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -222,7 +230,7 @@ def candidates(
 
 
 def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Motion]:
-    """See `fusion.state.predict`."""
+    """See `fusion.model.states.predict`."""
     half = exp_so3(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
     turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))

@@ -10,10 +10,10 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
-from fusion.instants import Frame
-from fusion.optics import Optics
-from fusion.robots import Robot
-from fusion.sightings import Catalogue
+from fusion.model.camera_array import Optics
+from fusion.model.frames import Frame
+from fusion.model.observations import Catalogue
+from fusion.model.robots import Robot
 from tests.fusion.equations import outlines
 
 PERIOD_NS = 33_333_333

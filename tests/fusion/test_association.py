@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 
 from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import exp_so3
 from fusion._core import ExpectedMarkers
-from fusion.association import Association
-from fusion.instants import Frame, Instant
-from fusion.optics import Optics
-from fusion.robots import Robot
-from fusion.sightings import Catalogue
-from fusion.state import States, exp_so3
+from fusion.model.camera_array import Optics
+from fusion.model.frames import Frame, Instant
+from fusion.model.observations import Catalogue
+from fusion.model.robots import Robot
+from fusion.model.states import States
+from fusion.tracking.association import Association
 from tests.fusion.synthetic import WIDE, ring
 
 

@@ -12,12 +12,13 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import exp_so3
 from fusion import _core
-from fusion.association import assign
-from fusion.instants import Frame, Instant
-from fusion.optics import Discs, Optics
-from fusion.sightings import Observations, Sightings
-from fusion.state import States, exp_so3, predict
+from fusion.model.camera_array import Discs, Optics
+from fusion.model.frames import Frame, Instant
+from fusion.model.observations import Observations, Sightings
+from fusion.model.states import States, predict
+from fusion.tracking.association import assign
 from tests.fusion import equations
 from tests.fusion.synthetic import ring
 

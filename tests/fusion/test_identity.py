@@ -8,13 +8,13 @@ import pytest
 
 from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
-from fusion.grouping import Marker, group
-from fusion.instants import Frame, Instant
-from fusion.optics import Optics
-from fusion.robots import Robot, require_distinct
-from fusion.sightings import Sightings
-from fusion.signature import Fit, identify
-from fusion.tracker import Limits
+from fusion.model.camera_array import Optics
+from fusion.model.frames import Frame, Instant
+from fusion.model.observations import Sightings
+from fusion.model.robots import Robot, require_distinct
+from fusion.tracking.constellation import Fit, identify
+from fusion.tracking.multiview import Marker, group
+from fusion.tracking.tracker import Limits
 from tests.benchmarks.fusion_accuracy import accuracy
 from tests.benchmarks.fusion_grouping import cold_grouping
 from tests.benchmarks.fusion_load import DIAMETER_M, Load

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
-from fusion.instants import GONE_NS, Frame, Instant, Instants
-from fusion.tracker import Limits
+from fusion.model.frames import Frame, Instant
+from fusion.server.frame_synchronizer import GONE_NS, Instants
+from fusion.tracking.tracker import Limits
 
 PERIOD = 33_333_333
 MS = 1_000_000

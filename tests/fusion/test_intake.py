@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
-from fusion.health import MAX_STRANGERS, Health
-from fusion.instants import Frame, Instants
-from fusion.intake import Intake
-from fusion.report import Fused
-from fusion.tracker import Tracker
+from fusion.model.frames import Frame
+from fusion.server.frame_synchronizer import Instants
+from fusion.server.ingest import Intake
+from fusion.server.status import MAX_STRANGERS, Health
+from fusion.tracking.result import Fused
+from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
 
 ARENA = Arena(

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.client import Arena as Client
+from fusion.client.arena import Arena as Client
+from fusion.client.measure import Standing, find_standing, robot_of
 from fusion.errors import FusionError
-from fusion.measuring import Standing, find_standing, robot_of
-from fusion.messages import Markers
-from fusion.robots import distances, load_robots, require_distinct
+from fusion.model.robots import distances, load_robots, require_distinct
+from fusion.protocol.messages import Markers
 from tests.conftest import free_port
 from tests.fusion.conftest import fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line

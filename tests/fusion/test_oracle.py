@@ -18,11 +18,11 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import CAUCHY, NOMINAL_WEIGHT
-from fusion.estimator import Estimator, Prediction
-from fusion.instants import Frame, Instant
-from fusion.optics import Discs, Optics
-from fusion.sightings import Observations, Sightings
-from fusion.state import States
+from fusion.model.camera_array import Discs, Optics
+from fusion.model.frames import Frame, Instant
+from fusion.model.observations import Observations, Sightings
+from fusion.model.states import States
+from fusion.tracking.estimator import Estimator, Prediction
 from tests.fusion.synthetic import ring
 
 CAMERAS = ring(distortion=(-0.1, 0.02, 0.0003, -0.0002))  # all that GTSAM's Cal3DS2 models

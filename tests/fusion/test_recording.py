@@ -14,11 +14,11 @@ from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
-from fusion.messages import Robots
-from fusion.offline import fuse_recording, replay
-from fusion.recording import read_recording, record
-from fusion.report import Fused
-from fusion.tracker import Limits
+from fusion.protocol.messages import Robots
+from fusion.recordings.record import read_recording, record
+from fusion.recordings.run import fuse_recording, replay
+from fusion.tracking.result import Fused
+from fusion.tracking.tracker import Limits
 from tests.fusion.conftest import errors, poses_of
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.test_server import ARENA, KEYS, config, live, send, serving

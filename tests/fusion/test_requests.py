@@ -13,10 +13,10 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
-from fusion.calibration import Calibration
 from fusion.errors import FusionError
-from fusion.kept import Kept
-from fusion.messages import Robots, RobotsRequest, robots_key
+from fusion.protocol.messages import Robots, RobotsRequest, robots_key
+from fusion.server.active_rig import Calibration
+from fusion.server.persistence import Kept
 from tests.fusion.synthetic import WIDE
 from tests.fusion.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 

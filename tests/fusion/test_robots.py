@@ -8,7 +8,7 @@ import pytest
 
 from camera_node.errors import ConfigError
 from fusion.errors import FusionError
-from fusion.robots import Robot, load_robots, require_distinct
+from fusion.model.robots import Robot, load_robots, require_distinct
 
 ROOT = Path(__file__).resolve().parents[2]
 SQUARE = ((0.1, 0.1, 0.0), (-0.1, 0.1, 0.0), (-0.1, -0.1, 0.0), (0.1, -0.1, 0.0))

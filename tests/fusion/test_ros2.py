@@ -20,10 +20,10 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.client import Arena
-from fusion.messages import RobotPose
-from fusion.ros2 import Node, ros2, ros_name
-from fusion.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
+from fusion.bridges.ros2 import Node, ros2, ros_name
+from fusion.bridges.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
+from fusion.client.arena import Arena
+from fusion.protocol.messages import RobotPose
 from tests.conftest import free_port
 
 DEADLINE_S = 60.0

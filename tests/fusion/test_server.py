@@ -18,10 +18,10 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, save_rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import ClockReply, Detections, Keys, decode, encode
-from fusion.client import Arena as Client
-from fusion.config import ArenaConfig
-from fusion.server import Server
-from fusion.tracker import Limits
+from fusion.client.arena import Arena as Client
+from fusion.server.config import ArenaConfig
+from fusion.server.server import Server
+from fusion.tracking.tracker import Limits
 from tests.conftest import free_port
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
@@ -152,7 +152,7 @@ def in_time(server: Server, frames: int) -> None:
 @pytest.mark.parametrize(("behind_ns", "drops"), [(60 * 10**9, False), (0, True)])
 def test_what_waits_for_the_server_is_late_only_if_it_is_far_behind(tmp_path, monkeypatch, behind_ns, drops):
     """Frames came in time, and the server was busy meanwhile with something else."""
-    monkeypatch.setattr("fusion.server.BEHIND_NS", behind_ns)
+    monkeypatch.setattr("fusion.server.server.BEHIND_NS", behind_ns)
     settings = msgspec.structs.replace(config(tmp_path), limits=Limits(lateness_ms=50))
     with Server(settings) as server, Client.connect(*settings.listen, arena="test") as client:
         until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
@@ -227,6 +227,6 @@ def test_bytes_that_are_no_pose_are_counted(tmp_path):
 
 
 def test_a_client_needs_neither_gtsam_nor_scipy():
-    code = "import fusion.client, sys; sys.exit(bool({'gtsam', 'scipy', 'viser'} & set(sys.modules)))"
+    code = "import fusion.client.arena, sys; sys.exit(bool({'gtsam', 'scipy', 'viser'} & set(sys.modules)))"
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=120).returncode == 0

@@ -10,12 +10,13 @@ import pytest
 
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
-from fusion.instants import Frame, Instant, Instants
-from fusion.messages import RobotPose, ShardPoses
-from fusion.robots import Robot
-from fusion.server import Server
-from fusion.shards import Shard
-from fusion.tracker import Limits, Tracker
+from fusion.model.frames import Frame, Instant
+from fusion.model.robots import Robot
+from fusion.protocol.messages import RobotPose, ShardPoses
+from fusion.protocol.shards import Shard
+from fusion.server.frame_synchronizer import Instants
+from fusion.server.server import Server
+from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 from tests.fusion.test_server import DEADLINE_S, config, live, send, serving, until

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from fusion.instants import Instants
-from fusion.messages import Markers
-from fusion.tracker import Tracker
+from fusion.protocol.messages import Markers
+from fusion.server.frame_synchronizer import Instants
+from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 
 AXIS_PX = 0.25  # what fusion takes a measured axis to be off by

@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 
-from fusion.instants import Frame, Instants
-from fusion.tracker import Limits, Tracker
+from fusion.model.frames import Frame
+from fusion.server.frame_synchronizer import Instants
+from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors, fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.geometry.lens import Lens
-from fusion.undistortion import TOLERANCE_PX, TOLERANCE_SCALE, table_of, undistort
+from fusion.model.undistortion import TOLERANCE_PX, TOLERANCE_SCALE, table_of, undistort
 
 SIZE = {"width": 800, "height": 600, "cx": 402.0, "cy": 297.0}
 LENSES = {

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import Pose, rotation_from_vector
-from fusion.instants import Instants
-from fusion.tracker import Tracker
+from fusion.server.frame_synchronizer import Instants
+from fusion.tracking.tracker import Tracker
 from tests.fusion.conftest import errors
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 

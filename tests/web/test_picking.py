@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page, TimeoutError
 
 from camera_node.protocol.session import open_client
-from fusion.client import Arena as Client
+from fusion.client.arena import Arena as Client
 from tests.conftest import free_port
 from tests.fusion.synthetic import WIDE
 from tests.fusion.test_measuring import DEADLINE_S, STANDS, running, until

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
-from fusion.messages import RobotPose, State
+from fusion.protocol.messages import RobotPose, State
 from web.score import Score, angle_deg, longest_gap_s, summarise
 
 SECOND = 10**9

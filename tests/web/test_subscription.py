@@ -8,7 +8,7 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
-from fusion.messages import undo_key
+from fusion.protocol.messages import undo_key
 from tests.web.conftest import Played, four_cameras, wait_for
 from web.feed import Feed
 from web.subscription import Subscription

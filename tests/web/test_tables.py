@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from camera_node.protocol.messages import CameraStatus
-from fusion.messages import CameraHealth, FusionStatus
+from fusion.protocol.messages import CameraHealth, FusionStatus
 from tests.web.conftest import Played, wait_for
 from web.coverage import Coverage, montage
 from web.feed import Feed, Latest, Seen

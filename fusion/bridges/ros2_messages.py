@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot's pose as ROS 2's own messages, in bytes: little-endian CDR as rmw implementations put it on the wire.
+
+Turned into ROS's conventions (REP 103, REP 105, the comments of `geometry_msgs`): quaternions x, y, z, w; covariances
+of position, then of rotation about the frame's fixed axes; a twist in the frame of what moves.
+"""
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.geometry.pose import rotation_from_wxyz, skew
+from fusion.protocol.messages import RobotPose
+
+Array = NDArray[np.float64]
+
+# What ROS 2 calls a message, and the hash of its definition (REP 2016), the same in all releases since Iron.
+TYPE_HASHES = {
+    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+}
+
+
+class Cdr:
+    """Bytes in the making. Each number stands at a multiple of its size, counted from behind the four-byte head."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def u32(self, *values: int) -> None:
+        self._align(4)
+        self._data += struct.pack(f"<{len(values)}I", *values)
+
+    def doubles(self, *values: float) -> None:
+        self._align(8)
+        self._data += struct.pack(f"<{len(values)}d", *values)
+
+    def array(self, values: Array) -> None:
+        self._align(8)
+        self._data += np.asarray(values, "<f8").tobytes()
+
+    def text(self, value: str) -> None:
+        data = value.encode() + b"\0"
+        self.u32(len(data))
+        self._data += data
+
+    def finish(self) -> bytes:
+        return b"\0\1\0\0" + self._data
+
+    def _align(self, size: int) -> None:
+        self._data += bytes(-len(self._data) % size)
+
+
+def pose_stamped(pose: RobotPose, frame: str) -> bytes:
+    """`geometry_msgs/msg/PoseStamped` in the frame named `frame`, our world."""
+    cdr = Cdr()
+    _put_header(cdr, pose, frame)
+    _put_pose(cdr, pose)
+    return cdr.finish()
+
+
+def odometry(pose: RobotPose, frame: str, child: str) -> bytes:
+    """`nav_msgs/msg/Odometry`: the pose in `frame`, the twist in the body's frame `child`, and both covariances."""
+    R = rotation_from_wxyz(pose.quaternion_wxyz)
+    twist = np.array([pose.velocity, pose.angular_velocity]) @ R
+    C = covariance(pose, R, twist)
+    cdr = Cdr()
+    _put_header(cdr, pose, frame)
+    cdr.text(child)
+    _put_pose(cdr, pose)
+    cdr.array(C[:6, :6])
+    cdr.array(twist)
+    cdr.array(C[6:, 6:])
+    return cdr.finish()
+
+
+def transform(pose: RobotPose, frame: str, child: str) -> bytes:
+    """`tf2_msgs/msg/TFMessage` of one transform, of `child` in `frame`."""
+    cdr = Cdr()
+    cdr.u32(1)
+    _put_header(cdr, pose, frame)
+    cdr.text(child)
+    _put_pose(cdr, pose)
+    return cdr.finish()
+
+
+def covariance(pose: RobotPose, R: Array, twist: Array) -> Array:
+    """(12, 12) covariance in ROS's order: position and rotation in the world, velocity and turn in the body's frame.
+
+    With R exp(theta) for the true rotation, R^T v is off by R^T dv + v_body x theta, and the turn likewise.
+
+    Args:
+        pose: with its own covariance.
+        R: (3, 3) its rotation, body to world.
+        twist: (2, 3) its velocity and angular velocity in the body's frame.
+    """
+    J = np.zeros((12, 12))  # by rotation (body), position, angular velocity and velocity (world)
+    J[0:3, 3:6], J[3:6, 0:3], J[6:9, 9:12], J[9:12, 6:9] = np.eye(3), R, R.T, R.T
+    J[6:12, 0:3] = skew(twist).reshape(6, 3)
+    return J @ pose.covariance_matrix @ J.T
+
+
+def _put_header(cdr: Cdr, pose: RobotPose, frame: str) -> None:
+    cdr.u32(*divmod(pose.t_ns, 1_000_000_000))
+    cdr.text(frame)
+
+
+def _put_pose(cdr: Cdr, pose: RobotPose) -> None:
+    """A Pose and a Transform have the same seven numbers."""
+    w, x, y, z = pose.quaternion_wxyz
+    cdr.doubles(*pose.position, x, y, z, w)

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Robot poses for programs: iterate, ask for the latest, be called back, or `async for`.
+
+Needs no GTSAM and no SciPy. A reader slower than the poses gets the newest and skips the rest.
+
+    with Arena.connect("tcp/host:7447", arena="demo") as arena:
+        for pose in arena.robot("robot_a"):
+            print(pose.t_ns, pose.position, pose.quaternion_wxyz)
+"""
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import zenoh
+
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
+from camera_node.errors import NetworkError
+from camera_node.protocol.messages import Keys, MessageError, decode
+from camera_node.protocol.session import open_client
+from fusion.model.robots import Robot as RobotBody
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotsRequest
+from fusion.protocol.requests import AGAIN_S, change_robots, undo_correction
+
+T = TypeVar("T")
+TIMEOUT_S = 10.0
+MAX_ROBOTS = 1024
+
+
+class Stream(Generic[T]):
+    """One kind of message, such as the poses of one robot.
+
+    Iterating blocks for the next one, `timeout_s` at the most (None: for ever), and ends when the arena is closed.
+
+    Raises, while iterating:
+        NetworkError: none came within `timeout_s`.
+    """
+
+    def __init__(self, what: str, timeout_s: float | None) -> None:
+        self.timeout_s = timeout_s
+        self._what = what
+        self._changed = threading.Condition()
+        self._latest: T | None = None
+        self._count = 0
+        self._closed = False
+        self._callbacks: list[Callable[[T], object]] = []
+
+    def latest(self) -> T | None:
+        """The newest message, or None before the first."""
+        return self._latest
+
+    def next(self, timeout_s: float | None = None) -> T:
+        """Block for a message newer than this call; the stream's own timeout unless one is given."""
+        for message in self._follow(self.timeout_s if timeout_s is None else timeout_s):
+            return message
+        raise NetworkError(f"the arena was closed while waiting for {self._what}")
+
+    def on_message(self, callback: Callable[[T], object]) -> Callable[[], None]:
+        """Call back with every message, on Zenoh's thread: be quick. Returns what ends it."""
+        self._callbacks.append(callback)
+
+        def remove() -> None:
+            with contextlib.suppress(ValueError):
+                self._callbacks.remove(callback)
+
+        return remove
+
+    def __iter__(self) -> Iterator[T]:
+        return self._follow(self.timeout_s)
+
+    async def __aiter__(self) -> AsyncIterator[T]:
+        loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake(_: T) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(arrived.set)
+
+        remove = self.on_message(wake)
+        try:
+            while not self._closed:
+                try:
+                    await asyncio.wait_for(arrived.wait(), self.timeout_s)
+                except TimeoutError:
+                    raise self._silence(self.timeout_s) from None
+                arrived.clear()
+                if self._latest is not None:
+                    yield self._latest
+        finally:
+            remove()
+
+    def _follow(self, timeout_s: float | None) -> Iterator[T]:
+        with self._changed:
+            seen = self._count
+        while True:
+            with self._changed:
+                came = self._changed.wait_for(lambda: self._closed or self._count > seen, timeout_s)  # noqa: B023
+                if self._closed:
+                    return
+                if not came:
+                    raise self._silence(timeout_s)
+                seen, message = self._count, self._latest
+            if message is not None:
+                yield message
+
+    def _silence(self, timeout_s: float | None) -> NetworkError:
+        return NetworkError(f"no {self._what} within {timeout_s:g} s; is python -m fusion running there?")
+
+    def _put(self, message: T) -> None:
+        with self._changed:
+            self._latest = message
+            self._count += 1
+            self._changed.notify_all()
+        for callback in tuple(self._callbacks):
+            callback(message)
+
+    def _close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+class Robot(Stream[RobotPose]):
+    """The poses of one robot."""
+
+    def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
+        """Call back with every pose, on Zenoh's thread: be quick. Returns what ends it."""
+        return self.on_message(callback)
+
+
+class Arena:
+    """A connection to an arena's server. `faults` counts bytes that were no message."""
+
+    def __init__(self, session: zenoh.Session, arena: str, where: str) -> None:
+        self.keys = Keys(arena)
+        self.faults: Counter[str] = Counter()
+        self._session, self._where = session, f"from arena '{arena}' at {where}"
+        self._lock = threading.Lock()
+        self._robots: dict[str, Robot] = {}
+        self._streams: dict[str, Stream] = {}
+        self._all: Stream[RobotPose] = Stream(f"poses {self._where}", TIMEOUT_S)
+        self._known: set[str] = set()
+        poses = session.declare_subscriber(self.keys.robot_pose(), self._take_pose)
+        self._subscribers: list[Any] = [poses]
+
+    @classmethod
+    def connect(cls, *endpoints: str, arena: str = "arena", zenoh_config: Path | None = None) -> "Arena":
+        """Connect to "tcp/host:7447"; returns at once and keeps trying while no server is there.
+
+        Raises:
+            NetworkError: an endpoint is none.
+        """
+        chosen: Sequence[str] = endpoints or ("tcp/127.0.0.1:7447",)
+        return cls(open_client(chosen, zenoh_config), arena, " ".join(chosen))
+
+    def __enter__(self) -> "Arena":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all iterations and the connection."""
+        for stream in (self._all, *self._robots.values(), *self._streams.values()):
+            stream._close()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._session.close()
+
+    def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> Robot:
+        """The poses of a robot; iterating waits `timeout_s` for the next (None: for ever)."""
+        with self._lock:
+            robot = self._robots.setdefault(name, Robot(f"pose of '{name}' {self._where}", timeout_s))
+        robot.timeout_s = timeout_s
+        return robot
+
+    def poses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[RobotPose]:
+        """The poses of all robots as they come, each in every instant: a callback has them all."""
+        self._all.timeout_s = timeout_s
+        return self._all
+
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots that were heard of so far."""
+        return tuple(sorted(self._known))
+
+    def change_robots(
+        self,
+        rename: dict[str, str] | None = None,
+        remove: Sequence[str] = (),
+        define: dict[str, RobotBody] | None = None,
+    ) -> dict[str, RobotBody]:
+        """Rename, then remove, then define robots while the server runs, all or nothing; those that there are then.
+
+        Raises:
+            FusionError: the change makes no sense; the server's own words.
+            NetworkError: no server answers in time.
+        """
+        request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
+        return change_robots(self._session, self.keys.arena, request)
+
+    def undo_correction(self) -> Rig:
+        """Put the camera that the server placed anew last back where it stood; the rig in force then.
+
+        Raises:
+            FusionError: there is nothing to undo; the server's own words.
+            NetworkError: no server answers in time.
+        """
+        return undo_correction(self._session, self.keys.arena)
+
+    def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
+        """All markers of every instant."""
+        return self._stream(self.keys.markers, Markers, "markers", timeout_s)
+
+    def status(self, timeout_s: float | None = TIMEOUT_S) -> Stream[FusionStatus]:
+        """How the server does, once a second."""
+        return self._stream(self.keys.fusion_status, FusionStatus, "status", timeout_s)
+
+    def rig(self, timeout_s: float = TIMEOUT_S) -> Rig | None:
+        """The calibration in force, or None where the server has none.
+
+        Raises:
+            NetworkError: no server answers within `timeout_s`.
+        """
+        deadline = time.monotonic() + timeout_s
+        while (left := deadline - time.monotonic()) > 0:
+            # asked before the rig: a session that has just been opened may reach the server in between
+            there = any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0)))
+            for reply in self._session.get(self.keys.rig, timeout=min(left, 1.0)):
+                if reply.ok is not None and (rig := self._read_rig(reply.ok.payload.to_bytes())):
+                    return rig
+            if there:
+                return None
+            time.sleep(min(AGAIN_S, left))
+        raise NetworkError(f"no rig {self._where} within {timeout_s:g} s; is python -m fusion running there?")
+
+    def _read_rig(self, data: bytes) -> Rig | None:
+        try:
+            return decode(data, RigMessage).rig()
+        except MessageError:
+            self.faults["RigMessage"] += 1
+            return None
+
+    def _stream(self, key: str, kind: type, what: str, timeout_s: float | None) -> Stream:
+        if key not in self._streams:
+            stream = self._streams[key] = Stream(f"{what} {self._where}", timeout_s)
+            take = self._taker(kind, stream._put)
+            self._subscribers.append(self._session.declare_subscriber(key, take))
+        self._streams[key].timeout_s = timeout_s
+        return self._streams[key]
+
+    def _taker(self, kind: type, put: Callable[[Any], None]) -> Callable[[zenoh.Sample], None]:
+        def take(sample: zenoh.Sample) -> None:
+            try:
+                message = decode(sample.payload.to_bytes(), kind)
+            except MessageError:
+                self.faults[kind.__name__] += 1
+                return
+            put(message)
+
+        return take
+
+    def _take_pose(self, sample: zenoh.Sample) -> None:
+        self._taker(RobotPose, lambda pose: self._give(pose, str(sample.key_expr)))(sample)
+
+    def _give(self, pose: RobotPose, key: str) -> None:
+        if key != self.keys.robot_pose(pose.robot) or len(self._known | {pose.robot}) > MAX_ROBOTS:
+            self.faults["RobotPose"] += 1
+            return
+        self._known.add(pose.robot)
+        with self._lock:
+            robot = self._robots.get(pose.robot)
+        if robot is None:
+            robot = self.robot(pose.robot)
+        robot._put(pose)
+        self._all._put(pose)

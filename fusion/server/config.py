@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The live server's settings: `configs/arena.yaml`, all of them with defaults."""
+
+from pathlib import Path
+
+import msgspec
+
+from camera_node.config import is_name, load_yaml
+from camera_node.errors import ConfigError
+from fusion.tracking.tracker import Limits
+
+
+class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One arena.
+
+    Attributes:
+        arena: its name, the first part of all Zenoh keys.
+        listen: Zenoh endpoints on which the server is the router.
+        zenoh: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        rig: rig.yaml; without one the server waits for a calibration to be published.
+        kept_rig: where a rig that was published, or corrected after a bump, is kept over a restart; the newer of this
+            file and `rig` is in force. Not kept unless given.
+        robots: robots.yaml.
+        kept_robots: the same for robots that were defined, renamed or removed while the server ran.
+        rate_hz: instants a second; without it those of the fastest camera.
+        limits: see `Limits`.
+        shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
+    """
+
+    arena: str = "arena"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    zenoh: str | None = None
+    rig: str | None = None
+    kept_rig: str | None = None
+    robots: str = "robots.yaml"
+    kept_robots: str | None = None
+    rate_hz: float | None = None
+    limits: Limits = Limits()
+    shard: str = "1/1"
+
+    def __post_init__(self) -> None:
+        if not is_name(self.arena):
+            raise ValueError(f"'{self.arena}' can't name an arena; use letters, digits, - and _")
+        if self.rate_hz is not None and not 0.1 <= self.rate_hz <= 1000:
+            raise ValueError(f"rate_hz is {self.rate_hz}; it must be within 0.1 and 1000")
+        if not self.listen:
+            raise ValueError("listen names no endpoint; give one such as tcp/0.0.0.0:7447")
+
+
+def load_arena(path: Path) -> ArenaConfig:
+    """Read `arena.yaml`; the paths in it count from its folder.
+
+    Raises:
+        ConfigError: the file is missing, broken, or has a field that no arena has.
+    """
+    config = load_yaml(path, ArenaConfig)
+    found = {
+        name: str(path.parent / value)
+        for name in ("rig", "kept_rig", "robots", "kept_robots", "zenoh")
+        if (value := getattr(config, name))
+    }
+    return override(config, **found)
+
+
+def override(config: ArenaConfig, **settings) -> ArenaConfig:
+    """The config with those settings that are not None."""
+    given = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
+    try:
+        return msgspec.structs.replace(config, **given)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
