@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from tests.calib.test_intrinsics import SPEC, board_poses, render
+from tests.calib.intrinsics.test_calibrate import SPEC, board_poses, render
 from tests.conftest import free_port, wait_for_port
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,8 +12,8 @@ from playwright.sync_api import Page, TimeoutError
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from tests.conftest import free_port
+from tests.fusion.client.test_measure import DEADLINE_S, STANDS, running, until
 from tests.fusion.synthetic import WIDE
-from tests.fusion.test_measuring import DEADLINE_S, STANDS, running, until
 from tests.web.conftest import wait_for
 from tests.web.test_view import browsing, drawing
 from web.feed import Feed

@@ -20,8 +20,8 @@ from fusion.recordings.run import fuse_recording, replay
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Limits
 from tests.fusion.conftest import errors, poses_of
+from tests.fusion.server.test_server import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
-from tests.fusion.test_server import ARENA, KEYS, config, live, send, serving
 
 MOVING = Arena(
     {"a": TRIANGLE}, {"a": line((0.2, -0.3, 0.4), (0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0))}, sigma_px=0.1

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fusion import _core
+from tests.conftest import ROOT
 from tests.native import fuzz
 
-NATIVE = Path(__file__).resolve().parents[2] / "fusion" / "native"
+NATIVE = ROOT / "fusion" / "native"
 
 
 @pytest.mark.slow

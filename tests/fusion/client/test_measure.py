@@ -22,8 +22,8 @@ from fusion.model.robots import distances, load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import free_port
 from tests.fusion.conftest import fuse
+from tests.fusion.server.test_server import ARENA, DEADLINE_S, config, send, serving, until
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
-from tests.fusion.test_server import ARENA, DEADLINE_S, config, send, serving, until
 
 STANDS = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))
 UNKNOWN = np.full((3, 3), np.nan)

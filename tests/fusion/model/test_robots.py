@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Robots that nothing could tell apart are refused, with the reason."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from camera_node.errors import ConfigError
 from fusion.errors import FusionError
 from fusion.model.robots import Robot, load_robots, require_distinct
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 SQUARE = ((0.1, 0.1, 0.0), (-0.1, 0.1, 0.0), (-0.1, -0.1, 0.0), (0.1, -0.1, 0.0))
 SCALENE = ((0.15, 0.0, 0.0), (-0.13, 0.14, 0.0), (-0.03, -0.14, 0.0))
 

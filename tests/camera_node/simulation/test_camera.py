@@ -21,8 +21,8 @@ from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
 from camera_node.sources.replay import FolderSource, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 FAST = CAMERA | {"fps": 100.0, "phase_ms": 3.0, "exposure_us": 4000.0}
 
 

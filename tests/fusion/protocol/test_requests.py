@@ -17,8 +17,8 @@ from fusion.errors import FusionError
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key
 from fusion.server.active_rig import Calibration
 from fusion.server.persistence import Kept
+from tests.fusion.server.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 from tests.fusion.synthetic import WIDE
-from tests.fusion.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 
 
 def ask(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:

@@ -2,7 +2,6 @@
 """The scene: motions, faults in its files, and what the demo's scene promises to everything that stands on it."""
 
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +14,9 @@ from camera_node.geometry.pose import Array, invert
 from camera_node.simulation.renderer import discs_of
 from camera_node.simulation.scene import Scene, SceneCamera
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
+from tests.conftest import ROOT
 
-DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml"
+DEMO = ROOT / "configs" / "demo" / "scene.yaml"
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rendered pixels against what geometry says of them: outlines projected through the lens, and their moments."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,6 +9,7 @@ from camera_node.simulation.background import FLOOR
 from camera_node.simulation.renderer import BLACK, WHITE, Disc, Renderer, cover, discs_of, vignette
 from camera_node.simulation.scene import Scene
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
+from tests.conftest import ROOT
 
 ROUNDING = 0.29  # standard deviation of a rounded grey level, sqrt(1/12)
 TILTED = {"pitch_deg": {"mean": 25}, "roll_deg": {"mean": -20}, "z_m": {"mean": 0.3}}
@@ -176,7 +175,7 @@ def test_clutter_is_the_same_floor_in_all_cameras_and_no_flat_one():
 
     At 6,400 places the correlation of unrelated floors would stay below 4 / sqrt(6400) = 0.05.
     """
-    scene = Scene.load(Path(__file__).resolve().parents[2] / "configs" / "demo" / "scene.yaml")
+    scene = Scene.load(ROOT / "configs" / "demo" / "scene.yaml")
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     levels = []

@@ -19,7 +19,7 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import Arena, assert_near, record, ring
-from tests.calib.test_world import L_FRAME, elsewhere, lie_still
+from tests.calib.world.test_world_frame import L_FRAME, elsewhere, lie_still
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 

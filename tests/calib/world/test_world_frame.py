@@ -18,6 +18,7 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rotation_from_vector
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import Arena, errors, ring
+from tests.conftest import ROOT
 
 
 def test_align_undoes_any_motion():
@@ -147,7 +148,7 @@ def test_a_broken_survey_names_the_fault(tmp_path: Path, text: str, fault: str):
 
 def test_the_frame_that_is_shipped_fixes_a_world():
     """`configs/l.yaml`: an L whose legs differ, as far as a turn is concerned."""
-    frame = load_yaml(Path(__file__).resolve().parents[2] / "configs" / "l.yaml", Body)
+    frame = load_yaml(ROOT / "configs" / "l.yaml", Body)
     places = {str(k): point for k, point in enumerate(frame.points)}
     arena = ring()
     seen = still_roundels(lie_still(arena, {name: list(at) for name, at in places.items()}))

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
+from tests.conftest import ROOT
 from tests.native import fuzz
 
-NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
+NATIVE = ROOT / "camera_node" / "native"
 
 
 @pytest.mark.slow

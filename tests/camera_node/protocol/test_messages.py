@@ -3,7 +3,6 @@
 
 import contextlib
 import math
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -27,6 +26,7 @@ from camera_node.protocol.messages import (
     encode,
 )
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
+from tests.conftest import ROOT
 
 KINDS = (Detections, CameraStatus, ClockReply, Settings, Markers, RobotPose, FusionStatus)
 HEADER = {"camera": "cam0", "seq": 3, "t_ns": 1_700_000_000_000_000_000, "width": 640, "height": 480}
@@ -131,7 +131,7 @@ def test_a_newer_sender_may_add_fields():
 
 def test_every_field_is_documented():
     """docs/messages.md names every message of the three packages and every field of it in its own section."""
-    sections = (Path(__file__).parents[2] / "docs" / "messages.md").read_text().split("\n## ")
+    sections = (ROOT / "docs" / "messages.md").read_text().split("\n## ")
     for module in (camera_node.protocol.messages, calib.rig.messages, fusion.protocol.messages):
         for name, kind in vars(module).items():
             if (

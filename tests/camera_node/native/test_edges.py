@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.conftest import ROOT
 from tests.native import build
 
-NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
+NATIVE = ROOT / "camera_node" / "native"
 SOURCES = "edge_pixels", "normal_equations", "ellipse"
 
 

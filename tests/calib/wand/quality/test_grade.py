@@ -16,7 +16,7 @@ from calib.wand.calibrate import calibrate
 from calib.wand.outcome import Calibration
 from calib.wand.quality.grade import GRADES, LIMITS, CameraTrust, Trust, assess, grade
 from tests.calib.synthetic import record, ring
-from tests.calib.test_agreement import covariance, disturb
+from tests.calib.wand.quality.test_agreement import covariance, disturb
 
 ALL = np.ones((4, 6), bool)
 

@@ -13,8 +13,8 @@ import pytest
 from calib.plan.planner import Plan, PlannedCamera, foresee, sees_level, sensor_range
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PLAN = load_yaml(ROOT / "configs" / "plan.yaml", Plan)
 
 

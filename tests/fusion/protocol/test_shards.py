@@ -18,8 +18,8 @@ from fusion.server.frame_synchronizer import Instants
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors
+from tests.fusion.server.test_server import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
-from tests.fusion.test_server import DEADLINE_S, config, live, send, serving, until
 
 NAMES = [f"robot_{k}" for k in range(200)]
 

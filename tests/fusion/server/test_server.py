@@ -22,7 +22,7 @@ from fusion.client.arena import Arena as Client
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits
-from tests.conftest import free_port
+from tests.conftest import ROOT, free_port
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
@@ -228,5 +228,5 @@ def test_bytes_that_are_no_pose_are_counted(tmp_path):
 
 def test_a_client_needs_neither_gtsam_nor_scipy():
     code = "import fusion.client.arena, sys; sys.exit(bool({'gtsam', 'scipy', 'viser'} & set(sys.modules)))"
-    root = Path(__file__).resolve().parents[2]
+    root = ROOT
     assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=120).returncode == 0

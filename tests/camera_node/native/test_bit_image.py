@@ -9,9 +9,10 @@ import pytest
 
 from camera_node import _core
 from tests.camera_node.rendering import Disc, expose, render
+from tests.conftest import ROOT
 from tests.native import build
 
-NATIVE = Path(__file__).resolve().parents[2] / "camera_node" / "native"
+NATIVE = ROOT / "camera_node" / "native"
 CPU = Path("/proc/cpuinfo")
 
 
