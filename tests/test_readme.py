@@ -110,7 +110,7 @@ def test_a_recording_from_frames_to_poses(folder: Path):
     assert {row.split(",")[1] for row in rows if ",tracked," in row} == {"rover", "drone", "puck"}
 
 
-COMMAND_BLOCK = next(k for k, block in enumerate(blocks("sh")) if "camera_node.simulation.camera" in block)
+COMMAND_BLOCK = next(k for k, block in enumerate(blocks("sh")) if "camera_node.simulation" in block)
 
 
 @pytest.fixture

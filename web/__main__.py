@@ -12,7 +12,7 @@ import tyro
 from camera_node.errors import run
 from camera_node.protocol.session import open_client
 from web.feed import Feed
-from web.replay import Replay
+from web.replay import RecordingPlayer
 from web.subscription import Subscription
 from web.tables import describe
 
@@ -64,7 +64,7 @@ def watch(options: Options, stop: threading.Event) -> None:
 
 def replay(path: Path, options: Options, stop: threading.Event) -> None:
     """Show a recording until `stop` is set; without a page, until it ends."""
-    recorded = Replay(path)
+    recorded = RecordingPlayer(path)
     feed = Feed(recorded.arena, clock=recorded.seconds)
     teller = threading.Thread(target=recorded.run, args=(feed, stop, options.headless))
     teller.start()
@@ -75,7 +75,9 @@ def replay(path: Path, options: Options, stop: threading.Event) -> None:
         teller.join()
 
 
-def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: threading.Event) -> None:
+def _show(
+    feed: Feed, source: Subscription | RecordingPlayer, options: Options, stop: threading.Event
+) -> None:
     if options.headless:
         ended = False
         while not ended:
@@ -94,7 +96,7 @@ def _show(feed: Feed, source: Subscription | Replay, options: Options, stop: thr
     with contextlib.ExitStack() as stack:
         view = View(feed, options.host, options.port)
         stack.callback(view.close)
-        if isinstance(source, Replay):
+        if isinstance(source, RecordingPlayer):
             view.add(ReplayControls(view.server, source))
         else:
             if files is not None:

@@ -11,7 +11,7 @@ from typing import Any
 import viser
 
 from calib.live.collect import publish
-from calib.live.wand_session import MOST_S, Progress, wave
+from calib.live.wand_session import MOST_S, SessionProgress, wave
 from calib.rig.recording import save_wave, wave_beside
 from calib.rig.rig import load_rig
 from camera_node.config import load_yaml
@@ -101,7 +101,7 @@ class Calibrating:
             "" if taken else f"; no server is there to take it: give it {files.rig}"
         )
 
-    def _show(self, told: Progress) -> None:
+    def _show(self, told: SessionProgress) -> None:
         rows = [Row((*rest, used), "ok" if used else "warn") for *rest, used, _ in told.cells()]
         write(self._seen, Table(("camera", "frames", "image", "shared part"), rows, "no roundel yet").html())
         self._tell(f"{told.standing}: {told.advice}")

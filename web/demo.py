@@ -18,6 +18,7 @@ from calib.live.collect import publish
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align
+from camera_node.arrays import Array
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
@@ -25,9 +26,9 @@ from camera_node.simulation.scene import Scene
 from fusion.protocol.messages import RobotPose
 from web.errors import WebError
 from web.feed import Feed, Latest
-from web.messages import Progress, progress_key
+from web.messages import DemoProgress, progress_key
 from web.processes import Processes, ProgramFailed, ended_by_signals
-from web.score import Array, Score, summarise
+from web.score import Score, summarise
 from web.subscription import Subscription
 from web.usage import Usage
 
@@ -240,7 +241,7 @@ class Demo:
         ghosts = (
             {} if T is None else {"wand": tuple(map(tuple, transform(T, self.scene.wand.points).tolist()))}
         )
-        progress = Progress(t_ns=time.time_ns(), text=text, share=share, ghosts=ghosts)
+        progress = DemoProgress(t_ns=time.time_ns(), text=text, share=share, ghosts=ghosts)
         self.session.put(progress_key(ARENA), encode(progress))
         if aloud:
             print(text, flush=True)

@@ -77,7 +77,7 @@ class MarkerCloud:
             self._cloud.colors = np.where(labelled[:, None], LABELLED, UNLABELLED).astype(np.uint8)
 
 
-class Robots:
+class RobotDrawing:
     """Axes, bodies and trails of all robots, one batched handle each; and one label a robot."""
 
     def __init__(self, scene: viser.SceneApi) -> None:

@@ -16,7 +16,7 @@ from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage import Coverage
-from web.messages import Progress, progress_key
+from web.messages import DemoProgress, progress_key
 
 MAX_NAMES = 256  # cameras or robots of one arena; more are a fault of whoever publishes them
 MAX_REASONS = 32
@@ -77,7 +77,7 @@ class Feed:
             keys.camera_status(): (CameraStatus, self._take_camera),
             keys.detections(): (Detections, self._take_detections),
             keys.rig: (RigMessage, self._take_rig),
-            progress_key(arena): (Progress, self._keep("progress")),
+            progress_key(arena): (DemoProgress, self._keep("progress")),
         }
 
     @property

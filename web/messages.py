@@ -10,7 +10,7 @@ from camera_node.protocol.messages import VERSION, MessageError
 Vector = tuple[float, float, float]
 
 
-class Progress(msgspec.Struct, frozen=True, kw_only=True):
+class DemoProgress(msgspec.Struct, frozen=True, kw_only=True):
     """A line for people, how much of the step is done, and where the simulation knows things to be.
 
     `ghosts` maps a name to points in the world, metres, joined by a line in the viewer.
@@ -30,5 +30,5 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def progress_key(arena: str) -> str:
-    """The Zenoh key of `Progress`."""
+    """The Zenoh key of `DemoProgress`."""
     return f"{arena}/demo/progress"

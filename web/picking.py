@@ -3,8 +3,9 @@
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from camera_node.arrays import Array
 from camera_node.config import is_name
 from camera_node.errors import RoundelError
 from fusion.client.define import describe
@@ -15,7 +16,6 @@ from web.feed import Latest
 from web.panel import plain, write
 from web.subscription import Subscription
 
-Array = NDArray[np.float64]
 AIM_RAD = 0.03  # a click is meant for the marker in this direction
 WATCH_S = 1.5
 SAME_M = 0.05  # a marker that was picked is still the one that stands there

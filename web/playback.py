@@ -4,7 +4,7 @@
 import viser
 
 from web.feed import Latest
-from web.replay import Replay
+from web.replay import RecordingPlayer
 
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")
 
@@ -12,10 +12,10 @@ SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")
 class ReplayControls:
     """A button, a slider over the recording, and the pace."""
 
-    def __init__(self, server: viser.ViserServer, replay: Replay) -> None:
+    def __init__(self, server: viser.ViserServer, replay: RecordingPlayer) -> None:
         self.replay = replay
         gui = server.gui
-        with gui.add_folder("Replay"):
+        with gui.add_folder("RecordingPlayer"):
             self._button = gui.add_button("Pause")
             self._moment = gui.add_slider(
                 "Seconds", 0.0, max(0.1, round(replay.duration_s, 1)), step=0.1, initial_value=0.0

@@ -18,7 +18,7 @@ TURN_S = 1 / 60
 ARENA = re.compile(r"(.+?)/(?:camera/[^/]+/|robot/[^/]+/|fusion/|markers$|rig$)")
 
 
-class Replay:
+class RecordingPlayer:
     """A recording (MCAP) and a clock that can be paused, sped up and put elsewhere; `run` tells a feed what is due.
 
     Attributes:
@@ -122,7 +122,7 @@ class Replay:
 class Telling:
     """One uninterrupted telling of a recording, from a little before the present moment on."""
 
-    def __init__(self, replay: Replay, feed: Feed) -> None:
+    def __init__(self, replay: RecordingPlayer, feed: Feed) -> None:
         feed.forget()
         self._feed = feed
         self._messages = replay.messages(max(0.0, replay.seconds() - LEAD_S))

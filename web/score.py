@@ -5,12 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.protocol.messages import RobotPose
 
-Array = NDArray[np.float64]
 RMS_MM, GAP_S = (
     5.0,
     0.5,
@@ -41,7 +40,7 @@ class Result:
 
 
 @dataclass
-class Track:
+class ScoredTrack:
     """What became of one robot's poses."""
 
     poses: int = 0
@@ -61,7 +60,7 @@ class Score:
     ) -> None:
         """`robots` maps a name to its number of markers; poses of before `start_ns` do not count."""
         self._truth, self._markers, self._start_ns = truth, robots, start_ns
-        self.tracks = {robot: Track() for robot in robots}
+        self.tracks = {robot: ScoredTrack() for robot in robots}
         self.latencies_ms: list[float] = []
 
     def add(self, pose: RobotPose) -> None:
@@ -93,7 +92,7 @@ class Score:
         """One result a robot for the time from `start_ns` to `end_ns`."""
         return [self._result(robot, track, start_ns, end_ns) for robot, track in self.tracks.items()]
 
-    def _result(self, robot: str, track: Track, start_ns: int, end_ns: int) -> Result:
+    def _result(self, robot: str, track: ScoredTrack, start_ns: int, end_ns: int) -> Result:
         count = len(track.t_ns)
         constellation = self._markers[robot] > 1
         return Result(

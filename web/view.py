@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from calib.rig.rig import Rig
-from web.drawing import GHOST, MarkerCloud, Robots, draw_camera, light
+from web.drawing import GHOST, MarkerCloud, RobotDrawing, draw_camera, light
 from web.errors import WebError
 from web.feed import Feed, Latest
 from web.panel import Panel
@@ -45,7 +45,7 @@ class View:
         self._frames = 0
         self._rig: Rig | None = None
         self._cameras: list[Any] = []
-        self._robots = Robots(self.server.scene)
+        self._robots = RobotDrawing(self.server.scene)
         self._markers = MarkerCloud(self.server.scene)
         self.ghosts: dict[str, Any] = {}
         light(self.server.scene)

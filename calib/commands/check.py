@@ -17,7 +17,7 @@ from calib.errors import CalibrationError
 from calib.rig.rig import Rig, load_rig
 from calib.wand.bundle_adjustment.problem import LENS, POSE
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.quality.agreement import Agreement, Placed, compare
 from calib.wand.quality.grade import assess
 from calib.wand.scale import SIGMA_M, Distance
@@ -104,7 +104,7 @@ def _compare_halves(
     return agreement
 
 
-def _compare_with_rig(rig: Rig, result: Calibration, console: Console) -> Agreement | None:
+def _compare_with_rig(rig: Rig, result: WandCalibration, console: Console) -> Agreement | None:
     known = Placed.of_rig(rig)
     if len([name for name in known.names if name in result.names]) < 2:
         say(console, "the rig has no places with covariances to compare; the recording alone was judged")
@@ -125,7 +125,7 @@ def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detect
     return [m for m in messages if m.t_ns <= middle], [m for m in messages if m.t_ns > middle]
 
 
-def placed(result: Calibration) -> Placed:
+def placed(result: WandCalibration) -> Placed:
     """The cameras of a calibration, for comparing."""
     adjusted = result.adjusted
     free, count = list(adjusted.problem.free), len(result.names)

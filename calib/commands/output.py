@@ -12,8 +12,8 @@ from rich.console import Console
 
 from calib.intrinsics.residual_plot import draw_residuals, save_map
 from calib.rig.rig import Rig, save_rig
-from calib.wand.outcome import Calibration
-from calib.wand.quality.grade import Trust
+from calib.wand.outcome import WandCalibration
+from calib.wand.quality.grade import RigQuality
 from camera_node.errors import ConfigError
 
 
@@ -33,7 +33,7 @@ def write_rig(rig: Rig, out: Path, console: Console) -> None:
     say(console, f"wrote {out}" + (f"; the one before is kept as {kept.name}" if kept else ""))
 
 
-def save_maps(folder: Path, result: Calibration, trust: Trust, console: Console) -> None:
+def save_maps(folder: Path, result: WandCalibration, trust: RigQuality, console: Console) -> None:
     """A picture of each camera's residuals, with where to wave next, and one of the expected errors."""
     seen, adjusted = result.observations, result.adjusted
     for k, camera in enumerate(trust.cameras):

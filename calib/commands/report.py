@@ -7,9 +7,9 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from calib.live.wand_session import Progress
-from calib.wand.outcome import Calibration
-from calib.wand.quality.grade import Trust
+from calib.live.wand_session import SessionProgress
+from calib.wand.outcome import WandCalibration
+from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lens_change import describe, find_changes
 from calib.wand.quality.lens_shape import find_misfit
 from calib.wand.report import WandReport
@@ -19,7 +19,7 @@ CLEAR = 3.0  # sigmas: below, a drift is not worth one either
 WORST = 5  # outliers that are listed one by one
 
 
-def print_report(result: Calibration, trust: Trust, console: Console) -> None:
+def print_report(result: WandCalibration, trust: RigQuality, console: Console) -> None:
     """A table of the cameras, then what else a person has to know; the grade comes last."""
     report, clocks = result.report, bool((result.time_sigma_ms > 0).any())
     error = "error mm" if report.metric else "error %"
@@ -53,14 +53,14 @@ def print_report(result: Calibration, trust: Trust, console: Console) -> None:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-def _drifts(result: Calibration) -> list[str]:
+def _drifts(result: WandCalibration) -> list[str]:
     if not (np.abs(result.drift_ppm) > CLEAR * result.drift_sigma_ppm).any():
         return []
     rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
     return ["clocks drift apart, in ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]
 
 
-def show_progress(told: Progress) -> Group:
+def show_progress(told: SessionProgress) -> Group:
     """A wave as it goes: what each camera has seen, what it would give now, and what to do next."""
     table = Table("camera", "frames", "image", "shared part", "place over noise")
     for cells in told.cells():

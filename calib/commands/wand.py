@@ -16,7 +16,7 @@ from calib.commands.connection import Connection, Server
 from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
 from calib.commands.recording import read_recording
 from calib.commands.report import print_report, show_progress
-from calib.live.collect import Heard
+from calib.live.collect import CollectedFrames
 from calib.live.wand_session import MOST_S, wave
 from calib.rig.recording import save_wave, wave_beside
 from calib.rig.rig import Rig, load_rig
@@ -161,7 +161,7 @@ class Wand:
 
     def _wave(
         self, session: Session, rig: Rig, wand: Body, distance: Distance | None, console: Console
-    ) -> tuple[Heard, str]:
+    ) -> tuple[CollectedFrames, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
         trials = self.seconds is None or console.is_terminal
         with Live(console=console, transient=True) as live:

@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from calib.commands.choice import require_one
@@ -20,13 +19,14 @@ from calib.live.collect import collect
 from calib.rig.rig import Rig, load_rig
 from calib.world.landmarks import is_line, locate_places, still_roundels
 from calib.world.world_frame import align, align_places, read_positions, require_above, stand
+from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
 UPSIDE_DOWN = 0.3  # of the images' downward axes, that points up, on average
-Places = Mapping[str, NDArray[np.float64]]
+Places = Mapping[str, Array]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class World:
             return collect(session, self.server.arena, self.seconds, "looking").messages
 
 
-def _markers(body: Body) -> dict[str, NDArray[np.float64]]:
+def _markers(body: Body) -> dict[str, Array]:
     return {str(k): point for k, point in enumerate(body.points)}
 
 

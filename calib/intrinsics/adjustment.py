@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
-
-Array = NDArray[np.float64]
 
 CAUCHY = 2.3849  # 95 % efficient on normal residuals
 MAX_ITERATIONS = 100

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import AdjustedLens, BoardView, adjust_lens, locate, start_lens
@@ -15,10 +14,9 @@ from calib.intrinsics.board import Finder
 from calib.rig.camera import Camera
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.rig.rig import Rig
+from camera_node.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
-from camera_node.sources.grey import Grey
 
-Array = NDArray[np.float64]
 Model = Literal["pinhole", "fisheye"]
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}

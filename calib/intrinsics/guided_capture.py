@@ -12,7 +12,7 @@ from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import BoardView
 from calib.intrinsics.calibrate import MIN_VIEWS, BoardViews, CalibratedLens, Model
 from calib.rig.coverage import Coverage, enumerate_words
-from camera_node.sources.grey import Grey
+from camera_node.arrays import Grey
 
 NEW = 0.04  # of the image's width, that a view must differ from every one before
 EVERY = 5  # views, between two trial calibrations

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import zenoh
 
+from camera_node.arrays import Grey
 from camera_node.errors import CameraError
 from camera_node.protocol.messages import Keys
-from camera_node.sources.grey import Grey, grey
+from camera_node.sources.grey import grey
 from camera_node.sources.replay import IMAGES, read_grey
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")

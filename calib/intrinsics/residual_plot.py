@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Mask
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
 
 WIDTH = 1200  # pixels of the picture
 TITLE = 34  # pixels above it
@@ -21,7 +20,7 @@ PAPER, INK, FIELD, SHADE = (252, 252, 250), (60, 50, 40), (200, 90, 20), (205, 2
 
 
 def draw_residuals(
-    name: str, lens: Lens, seen: Array, residuals: Array, missing: NDArray[np.bool_] | None = None
+    name: str, lens: Lens, seen: Array, residuals: Array, missing: Mask | None = None
 ) -> NDArray[np.uint8]:
     """An arrow from every point's expected place, magnified, coloured by its length; the cells' mean over them.
 
@@ -67,7 +66,7 @@ def save_map(path: Path, picture: NDArray[np.uint8]) -> None:
         raise ConfigError(f"{path} can't be written: {error.strerror}") from None
 
 
-def _shade(canvas: np.ndarray, cells: NDArray[np.bool_]) -> None:
+def _shade(canvas: np.ndarray, cells: Mask) -> None:
     rows = np.linspace(TITLE, canvas.shape[0], cells.shape[0] + 1).round().astype(int)
     columns = np.linspace(0, WIDTH, cells.shape[1] + 1).round().astype(int)
     for r, c in np.argwhere(cells):

@@ -24,7 +24,7 @@ SILENT_S = 2.0  # without a frame: a camera that is lost
 
 
 @dataclass(slots=True)
-class Heard:
+class CollectedFrames:
     """What came so far: messages; by camera the frames with roundels and where in its image they were, and when
     it was heard last, seconds; and how many messages were none."""
 
@@ -56,8 +56,8 @@ class Heard:
 
 
 def listen(
-    session: zenoh.Session, arena: str, seconds: float, look: Callable[[Heard, float], str]
-) -> tuple[Heard, str]:
+    session: zenoh.Session, arena: str, seconds: float, look: Callable[[CollectedFrames, float], str]
+) -> tuple[CollectedFrames, str]:
     """Hear all cameras of an arena for a while.
 
     Args:
@@ -88,9 +88,9 @@ def listen(
 
 
 def _follow(
-    arrived: queue.SimpleQueue[bytes], seconds: float, look: Callable[[Heard, float], str]
-) -> tuple[Heard, str]:
-    heard, begun, looked = Heard(), time.monotonic(), 0.0
+    arrived: queue.SimpleQueue[bytes], seconds: float, look: Callable[[CollectedFrames, float], str]
+) -> tuple[CollectedFrames, str]:
+    heard, begun, looked = CollectedFrames(), time.monotonic(), 0.0
     try:
         while (passed := time.monotonic() - begun) < seconds:
             with suppress(queue.Empty):
@@ -105,7 +105,7 @@ def _follow(
     return heard, f"{seconds:g} s are over"
 
 
-def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> Heard:
+def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> CollectedFrames:
     """What all cameras of an arena see for a while, with a line of progress.
 
     Raises:
@@ -115,7 +115,7 @@ def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> H
     with Progress(*columns, transient=True) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
 
-        def show(heard: Heard, passed: float) -> str:
+        def show(heard: CollectedFrames, passed: float) -> str:
             told = ", ".join(f"{name} {n}" for name, n in sorted(heard.frames.items()))
             progress.update(task, completed=passed, description=told or "waiting for cameras")
             return ""

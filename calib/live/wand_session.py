@@ -21,7 +21,7 @@ from multiprocessing.pool import AsyncResult
 import zenoh
 
 from calib.errors import CalibrationError
-from calib.live.collect import Heard, listen
+from calib.live.collect import CollectedFrames, listen
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
@@ -62,7 +62,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class SessionProgress:
     """How far a wave is: seconds, frames with roundels and the share of the image that had them by camera, the latest
     trial, whether it is enough, and what to do next."""
 
@@ -122,13 +122,13 @@ def wave(
     rig: Rig,
     wand: Body,
     seconds: float,
-    tell: Callable[[Progress], None] = lambda progress: None,
+    tell: Callable[[SessionProgress], None] = lambda progress: None,
     ended: threading.Event | None = None,
     by_itself: bool = True,
     trials: bool = True,
     every_s: float = TRIAL_EVERY_S,
     distance: Distance | None = None,
-) -> tuple[Heard, str]:
+) -> tuple[CollectedFrames, str]:
     """Collect the detections of all cameras of an arena while a wand is waved.
 
     Args:
@@ -152,7 +152,7 @@ def wave(
     rule = Rule()
     with _Trials(rig, wand, distance, trials, every_s) as solver:
 
-        def look(heard: Heard, passed: float) -> str:
+        def look(heard: CollectedFrames, passed: float) -> str:
             if ended is not None and ended.is_set():
                 return "ended by hand"
             trial = solver.step(heard.messages, passed)
@@ -163,10 +163,10 @@ def wave(
         return listen(session, arena, seconds, look)
 
 
-def progress(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> Progress:
+def progress(heard: CollectedFrames, passed: float, trial: Trial | None, enough: bool) -> SessionProgress:
     """What to tell a person."""
     covered = {name: coverage.share() for name, coverage in sorted(heard.coverage.items())}
-    return Progress(
+    return SessionProgress(
         passed,
         dict(sorted(heard.frames.items())),
         covered,
@@ -176,7 +176,7 @@ def progress(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> 
     )
 
 
-def _advise(heard: Heard, passed: float, trial: Trial | None, enough: bool) -> str:
+def _advise(heard: CollectedFrames, passed: float, trial: Trial | None, enough: bool) -> str:
     if enough:
         return "that is enough"
     if lost := heard.silent(passed):

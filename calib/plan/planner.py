@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import Camera
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import Pose, look_at
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 
@@ -112,7 +111,7 @@ def sensor_range(camera: Camera, diameter_m: float, min_diameter_px: float, tilt
     return Range(v_min, v_max, v_max * w / f_x - 2 * diameter_m, v_max * h / f_y - 2 * diameter_m, 0.0)
 
 
-def sees_level(camera: Camera, points: Array, diameter_m: float, min_diameter_px: float) -> NDArray[np.bool_]:
+def sees_level(camera: Camera, points: Array, diameter_m: float, min_diameter_px: float) -> Mask:
     """Which of the points (N, 3) a camera above sees as level roundels, wholly and not too small.
 
     A level disc seen under the angle phi from the vertical, at distance r, has a minor axis of about f d_o cos phi / r.
@@ -133,7 +132,7 @@ def foresee(plan: Plan) -> Forecast:
     cameras = {name: entry.camera() for name, entry in plan.cameras.items()}
     low, high = np.array(plan.area_m[:2]), np.array(plan.area_m[2:])
 
-    def seen(camera: Camera, points: Array) -> NDArray[np.bool_]:
+    def seen(camera: Camera, points: Array) -> Mask:
         return sees_level(camera, points, plan.diameter_m, plan.min_diameter_px)
 
     expected = map_precision(list(cameras.values()), low, high, plan.height_m, plan.sigma_px, sees=seen)

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.rig.camera import Camera
 from calib.rig.triangulation import Joint, Sees, in_image, point_covariances
-
-Array = NDArray[np.float64]
+from camera_node.arrays import Array, Index
 
 SIGMA_PX = 0.1  # of a roundel's centre: what the detector reaches in real pictures
 COLUMNS = 8  # of a map, about
@@ -37,7 +36,7 @@ class PrecisionMap:
     z: float
     sigma_px: float
     sigma_mm: Array
-    views: NDArray[np.intp]
+    views: Index
 
     @property
     def points(self) -> Array:

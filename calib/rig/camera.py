@@ -4,12 +4,12 @@
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import Pose, invert, skew
 
-Array = NDArray[np.float64]
 AnyLens = TypeVar("AnyLens", bound=Lens)
 
 
@@ -38,7 +38,7 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         """Raw pixels (N, 2) of points (N, 3) in the world; NaN for those not before the camera."""
         return self.project(transform(invert(self.matrix()), p_world))
 
-    def sees(self, uv: ArrayLike) -> NDArray[np.bool_]:
+    def sees(self, uv: ArrayLike) -> Mask:
         """Which of the pixels (N, 2) lie in the image; NaN does not."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         inside = (uv >= -0.5) & (uv < [self.width - 0.5, self.height - 0.5])

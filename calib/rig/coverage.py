@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from camera_node.arrays import Array, Mask
 
 CELLS = (6, 8)  # rows and columns in which an image is counted
 REGIONS = (
@@ -35,16 +35,16 @@ class Coverage:
         return Coverage(self.counts + other.counts)
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """(rows, columns) the cells with at least one point."""
         return self.counts > 0
 
-    def share(self, useful: NDArray[np.bool_] | None = None) -> float:
+    def share(self, useful: Mask | None = None) -> float:
         """Part of the cells, or of those that are useful, that are used; 1 where none is useful."""
         cells = self.used if useful is None else self.used[useful]
         return float(cells.mean()) if cells.size else 1.0
 
-    def missing(self, useful: NDArray[np.bool_] | None = None) -> list[str]:
+    def missing(self, useful: Mask | None = None) -> list[str]:
         """Names of the thirds of the image that are hardly used, emptiest first."""
         wanted = np.ones(self.counts.shape, bool) if useful is None else useful
         told = []

@@ -5,16 +5,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, pixel_jacobians, transform
 from calib.wand.bundle_adjustment.problem import POSE
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 
-Array = NDArray[np.float64]
-Sees = Callable[[Camera, Array], NDArray[np.bool_]]
+Sees = Callable[[Camera, Array], Mask]
 
 MIN_ANGLE = 0.01  # radians between rays, about: nearer to parallel, they fix no point
 ITERATIONS = 8
@@ -73,7 +73,7 @@ class Joint:
     covariance: Array
 
 
-def in_image(camera: Camera, points: Array) -> NDArray[np.bool_]:
+def in_image(camera: Camera, points: Array) -> Mask:
     """Which of the points (N, 3), world, lie in a camera's image."""
     return camera.sees(camera.project_world(points))
 

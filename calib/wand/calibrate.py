@@ -6,41 +6,39 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
-from calib.wand.detections import Frames, Sightings, frame_counts, gather
+from calib.wand.detections import FrameTable, WandDetections, frame_counts, gather
 from calib.wand.initialization.diagnosis import find_faults
-from calib.wand.initialization.initial_rig import Start, explain_unplaced, find_start
-from calib.wand.initialization.two_view import MIN_INSTANTS, Pairs
+from calib.wand.initialization.initial_rig import InitialRig, explain_unplaced, find_start
+from calib.wand.initialization.two_view import MIN_INSTANTS, TwoViewGeometry
 from calib.wand.labeling import label
-from calib.wand.outcome import Calibration, Told, conclude
+from calib.wand.outcome import Told, WandCalibration, conclude
 from calib.wand.quality.checks import check_motion
 from calib.wand.scale import Distance
 from calib.wand.solution import Solution, solve
 from calib.wand.wave import Wave
+from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class WandRecording:
     """A labelled recording: cameras in order of names."""
 
     names: list[str]
     lenses: list[Lens]
-    frames: Frames
-    seen: Sightings
+    frames: FrameTable
+    seen: WandDetections
     left_out: list[Counter[str]]
 
 
 def calibrate(
     rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None = None
-) -> Calibration:
+) -> WandCalibration:
     """Place the cameras of a rig, and set their clocks, by a wand waved before them.
 
     Args:
@@ -63,14 +61,14 @@ def calibrate(
     if not len(recording.seen):
         raise CalibrationError(_unseen(recording))
     check_motion(recording.seen, recording.names, recording.lenses)
-    pairs = Pairs(recording.seen, recording.lenses, wand, recording.frames.period_s())
+    pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
     told, solution = _solve_majority(recording, pairs, wand, distance)
     absent = {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
     return conclude(rig, solution, replace(told, unplaced=told.unplaced | absent))
 
 
 def _solve_majority(
-    recording: Recording, pairs: Pairs, wand: Body, distance: Distance | None
+    recording: WandRecording, pairs: TwoViewGeometry, wand: Body, distance: Distance | None
 ) -> tuple[Told, Solution]:
     """The solution of the cameras that agree; those that contradict them are left out, and told.
 
@@ -121,22 +119,26 @@ def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
             )
 
 
-def read(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Recording:
+def read(rig: Rig, wand: Body, messages: Sequence[Detections]) -> WandRecording:
     """Label a recording's detections."""
     names = sorted({message.camera for message in messages})
     lenses: list[Lens] = [rig.cameras[name] for name in names]
     frames, seen = gather(messages, names, lenses)
-    return Recording(names, lenses, frames, *label(frames, seen, wand, lenses))
+    return WandRecording(names, lenses, frames, *label(frames, seen, wand, lenses))
 
 
-def _unseen(recording: Recording) -> str:
+def _unseen(recording: WandRecording) -> str:
     reasons = sum(recording.left_out, Counter())
     told = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
     return f"the wand was in no frame ({told}); do the wand file's diameter and markers match the wand?"
 
 
 def _unplaceable(
-    recording: Recording, counts: list[int], pairs: Pairs, unplaced: dict[str, str], faults: dict[str, str]
+    recording: WandRecording,
+    counts: list[int],
+    pairs: TwoViewGeometry,
+    unplaced: dict[str, str],
+    faults: dict[str, str],
 ) -> str:
     if faults:
         told = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
@@ -157,7 +159,7 @@ def _unplaceable(
     return f"no two cameras could be placed; wave where two see the wand at once ({told})"
 
 
-def gather_wave(recording: Recording, pairs: Pairs, wand: Body, placed: list[int]) -> Wave:
+def gather_wave(recording: WandRecording, pairs: TwoViewGeometry, wand: Body, placed: list[int]) -> Wave:
     """What the placed cameras saw, numbered anew."""
     number = np.full(len(recording.names), -1)
     number[placed] = np.arange(len(placed))
@@ -176,5 +178,5 @@ def gather_wave(recording: Recording, pairs: Pairs, wand: Body, placed: list[int
     )
 
 
-def _columns(start: Start, placed: list[int]) -> tuple[Array, Array]:
+def _columns(start: InitialRig, placed: list[int]) -> tuple[Array, Array]:
     return np.array([start.poses[k] for k in placed]), np.array([start.offset_s[k] for k in placed])

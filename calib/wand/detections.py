@@ -9,11 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 UNKNOWN_S = 1.0  # more than cameras' clocks may be apart
 HEADER = ("camera", "t_ns", "clock_error_us")
@@ -28,7 +26,7 @@ COLUMNS = {
 
 
 class Ellipses(Protocol):
-    """Columns of detections with their ellipses, as `Sightings` has them."""
+    """Columns of detections with their ellipses, as `WandDetections` has them."""
 
     @property
     def camera(self) -> Index: ...
@@ -41,7 +39,7 @@ class Ellipses(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameTable:
     """All frames of a recording, by camera, then by time.
 
     Attributes:
@@ -61,7 +59,7 @@ class Frames:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class WandDetections:
     """Detections, sorted by frame.
 
     Attributes:
@@ -89,9 +87,9 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.uv)
 
-    def select(self, rows: NDArray) -> "Sightings":
+    def select(self, rows: NDArray) -> "WandDetections":
         """The rows that a mask or an index array names."""
-        return Sightings(*(getattr(self, name)[rows] for name in self.__slots__))
+        return WandDetections(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def rays(self) -> Array:
         """(n, 3) unit viewing rays, camera frames."""
@@ -120,7 +118,7 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
     for k, lens in enumerate(lenses):
         mine = camera[frame] == k
         xy[mine] = lens.normalise(uv[mine])
-    every = Sightings(
+    every = WandDetections(
         camera[frame],
         frame,
         t_s[frame],
@@ -132,7 +130,7 @@ def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequenc
         angle_rad[:, 0],
         xy,
     )
-    return Frames(camera, t_s, origin_ns), every.select(np.flatnonzero(np.isfinite(xy).all(axis=1)))
+    return FrameTable(camera, t_s, origin_ns), every.select(np.flatnonzero(np.isfinite(xy).all(axis=1)))
 
 
 def stamp_sigmas(camera: Index, bound_s: Array) -> Array:
@@ -169,7 +167,7 @@ def ranges(lenses: Sequence[Lens], seen: Ellipses, diameter_m: float) -> Array:
     return distances
 
 
-def frame_counts(seen: Sightings, cameras: int) -> list[int]:
+def frame_counts(seen: WandDetections, cameras: int) -> list[int]:
     """The number of frames with sightings, by camera."""
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
     return np.bincount(seen.camera[first], minlength=cameras).tolist()

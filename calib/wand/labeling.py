@@ -16,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
-from calib.wand.detections import Frames, Sightings, ranges
+from calib.wand.detections import FrameTable, WandDetections, ranges
 from calib.wand.tracks import follow
 from calib.wand.two_markers import label_ends
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 GATE_PX = 3.0  # how far a marker may be from where the others say it is
 SIGMA_PX = 1.0
@@ -63,8 +61,8 @@ def require_distinct(wand: Body) -> None:
 
 
 def label(
-    frames: Frames, seen: Sightings, wand: Body, lenses: Sequence[Lens]
-) -> tuple[Sightings, list[Counter[str]]]:
+    frames: FrameTable, seen: WandDetections, wand: Body, lenses: Sequence[Lens]
+) -> tuple[WandDetections, list[Counter[str]]]:
     """The detections that are markers of the wand, labelled.
 
     Returns:
@@ -104,7 +102,7 @@ def label(
     return labelled, left_out
 
 
-def _by_number(seen: Sightings, markers: int) -> Index:
+def _by_number(seen: WandDetections, markers: int) -> Index:
     """The numbers that detections carry; -1 for those that no marker has, or twice in a frame."""
     valid = (seen.label >= 0) & (seen.label < markers)
     key = np.where(valid, seen.frame * markers + seen.label, -1)
@@ -126,7 +124,7 @@ class _Fits:
 class _Spacing:
     """Labels all frames that hold the same number of detections at once."""
 
-    def __init__(self, wand: Body, lenses: Sequence[Lens], seen: Sightings) -> None:
+    def __init__(self, wand: Body, lenses: Sequence[Lens], seen: WandDetections) -> None:
         self.wand, self.seen = wand, seen
         self.focal = np.array([(lens.fx + lens.fy) / 2 for lens in lenses])
         self.distance = ranges(lenses, seen, wand.diameter_m)
@@ -228,7 +226,7 @@ class _Spacing:
         cost = ((miss / SIGMA_PX) ** 2).sum(axis=1) + prior.sum(axis=1)
         return _Fits(frame[good], chosen[good], cost[good], known[good].sum(axis=1))
 
-    def _prior(self, points: Array, distance: Array, known: NDArray[np.bool_]) -> Array:
+    def _prior(self, points: Array, distance: Array, known: Mask) -> Array:
         """(H, M) squared sigmas by which sizes disagree; where they are not known, by which the wand is slanted."""
         far = np.linalg.norm(points, axis=2)
         sizes = np.where(known, (np.log(distance / far) / SIGMA_LOG_RANGE) ** 2, 0.0)

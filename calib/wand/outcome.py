@@ -7,12 +7,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import written
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, Observations
+from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, WandObservations
 from calib.wand.quality.clock_jump import ClockJump, find_jump
 from calib.wand.quality.lengths import measure_lengths
 from calib.wand.quality.lens_change import find_changes
@@ -20,13 +19,12 @@ from calib.wand.report import CameraReport, Outlier, WandReport
 from calib.wand.scale import Distance, compare, loosen
 from calib.wand.solution import Solution
 from calib.world.world_frame import move, upright
+from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class WandCalibration:
     """A rig with poses and covariances, what there is to say of it, and the adjustment.
 
     Attributes:
@@ -45,7 +43,7 @@ class Calibration:
     report: WandReport
     names: list[str]
     adjusted: Adjusted
-    observations: Observations
+    observations: WandObservations
     covariance: Array
     time_offset_ms: Array
     time_sigma_ms: Array
@@ -88,7 +86,7 @@ class Told:
     scaled: bool = False
 
 
-def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
+def conclude(rig: Rig, solution: Solution, told: Told) -> WandCalibration:
     """The rig in an upright world, and the report."""
     adjusted, count = solution.adjusted, len(told.names)
     if told.distance is not None and told.scaled:
@@ -100,7 +98,7 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> Calibration:
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
     covariance = joint.reshape(6 * count, 6 * count)
     placed = _place(rig, solution, told, joint, offsets)
-    return Calibration(
+    return WandCalibration(
         placed,
         _report(solution, told, joint),
         told.names,
@@ -163,7 +161,9 @@ def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
     )
 
 
-def _report_camera(told: Told, k: int, seen: Observations, adjusted: Adjusted, cov: Array) -> CameraReport:
+def _report_camera(
+    told: Told, k: int, seen: WandObservations, adjusted: Adjusted, cov: Array
+) -> CameraReport:
     mine = seen.camera == k
     used = mine & adjusted.used
     rms = float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())) if used.any() else float("nan")
@@ -179,7 +179,7 @@ def _report_camera(told: Told, k: int, seen: Observations, adjusted: Adjusted, c
     )
 
 
-def _outliers(names: list[str], seen: Observations, adjusted: Adjusted) -> list[Outlier]:
+def _outliers(names: list[str], seen: WandObservations, adjusted: Adjusted) -> list[Outlier]:
     rows = np.flatnonzero(~adjusted.used)
     far = np.linalg.norm(adjusted.residuals, axis=1)
     return [

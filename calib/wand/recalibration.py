@@ -6,24 +6,22 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.lens_prior import settle, written
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import LENS, OFFSET, POSE, Observations
+from calib.wand.bundle_adjustment.problem import LENS, OFFSET, POSE, WandObservations
 from calib.wand.calibrate import check_recording, gather_wave, read
-from calib.wand.initialization.two_view import Pairs
+from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.outcome import clock_values
 from calib.wand.quality.checks import check_agreement, check_lenses
 from calib.wand.solution import with_disc_centres
+from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert
 from camera_node.protocol.messages import Detections
-
-Array = NDArray[np.float64]
 
 MOMENTS = 300  # of the wave, that are used
 
@@ -50,7 +48,7 @@ class Recalibration:
     sigma_mm: float
     time_sigma_ms: float
     adjusted: Adjusted
-    observations: Observations
+    observations: WandObservations
 
 
 def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Recalibration:
@@ -76,7 +74,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     if name not in recording.names:
         raise CalibrationError(f"camera '{name}' is not in the recording, or never saw the wand")
     this = recording.names.index(name)
-    pairs = Pairs(recording.seen, recording.lenses, wand, recording.frames.period_s())
+    pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
     cameras, offset_s = _start(rig, recording.names, pairs, this)
     wave = gather_wave(recording, pairs, wand, list(range(len(recording.names))))
     found = wave.pose_problem(cameras, offset_s, MOMENTS)
@@ -93,7 +91,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     return _conclude(rig, name, this, adjusted, observations)
 
 
-def _start(rig: Rig, names: list[str], pairs: Pairs, this: int) -> tuple[Array, Array]:
+def _start(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) -> tuple[Array, Array]:
     """Poses and time offsets of all cameras; of the one that is sought, by the camera that shares most with it."""
     shared = pairs.shared()[this]
     for other in np.argsort(-shared).tolist():
@@ -117,7 +115,7 @@ def _start(rig: Rig, names: list[str], pairs: Pairs, this: int) -> tuple[Array, 
     )
 
 
-def _conclude(rig: Rig, name: str, this: int, adjusted: Adjusted, seen: Observations) -> Recalibration:
+def _conclude(rig: Rig, name: str, this: int, adjusted: Adjusted, seen: WandObservations) -> Recalibration:
     before, T = rig.cameras[name], adjusted.state.cameras[this]
     cov = adjusted.covariance(POSE)[this, :, this]
     offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted, OFFSET, 1e3))

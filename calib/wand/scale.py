@@ -5,13 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import POSE, unobserved
-
-Array = NDArray[np.float64]
 
 SIGMA_M = 0.005  # of a tape's reading from one lens to another: where in it the centre is, nobody sees
 CLEAR = 3.0  # sigmas, beyond which measures contradict each other

@@ -4,7 +4,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.wand.bundle_adjustment.dependence import widen
@@ -19,15 +18,14 @@ from calib.wand.bundle_adjustment.problem import (
     OFFSET,
     POSE,
     SLEWED,
-    Observations,
     Problem,
     State,
+    WandObservations,
 )
 from calib.wand.bundle_adjustment.trajectory import acceleration_density
 from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
 from calib.wand.wave import Wave
-
-Array = NDArray[np.float64]
+from camera_node.arrays import Array
 
 FEW, MANY = 250, 800  # moments: to find the rig and the model, and to settle it
 DRIFT_S = 2.0  # a recording must last to show clocks that drift
@@ -38,7 +36,7 @@ class Solution:
     """The adjusted rig of a wave, and the observations it stands on, with discs' own centres."""
 
     adjusted: Adjusted
-    observations: Observations
+    observations: WandObservations
 
 
 def solve(
@@ -97,7 +95,7 @@ def solve(
 
 def _around(
     wave: Wave, cameras: Array, offset_s: Array, budget: int, known: tuple[int, int, float] | None
-) -> tuple[Problem, State, Observations]:
+) -> tuple[Problem, State, WandObservations]:
     found = wave.pose_problem(cameras, offset_s, budget)
     if found is None:
         raise CalibrationError(
@@ -116,7 +114,7 @@ def _farthest(cameras: Array) -> tuple[int, int, float]:
     return int(a), int(b), float(gaps[a, b])
 
 
-def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: Observations) -> Observations:
+def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: WandObservations) -> WandObservations:
     """The observations with discs' own centres in place of their ellipses'."""
     points = Linearisation(problem, seen).positions(state)
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]

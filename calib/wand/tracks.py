@@ -4,13 +4,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.trajectory import hermite
-from calib.wand.detections import Frames, Sightings
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from calib.wand.detections import FrameTable, WandDetections
+from camera_node.arrays import Array, Index
 
 FOLLOW_PX = 8.0  # how far a marker may be from between its neighbours, at least
 FOLLOW_SHARE = 0.15  # and of the way from one to the next
@@ -18,7 +15,7 @@ FOLLOW_FRAMES = 3.5  # for how many frame periods labels are carried over
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class MarkerTrack:
     """One marker in one camera: times (n,) ascending, and positions and velocities (n, 2)."""
 
     t_s: Array
@@ -26,7 +23,7 @@ class Track:
     velocity: Array
 
     @classmethod
-    def of(cls, t_s: Array, at: Array) -> "Track":
+    def of(cls, t_s: Array, at: Array) -> "MarkerTrack":
         """Velocities by central differences."""
         if len(t_s) < 2:
             return cls(t_s, at, np.zeros_like(at))
@@ -48,16 +45,16 @@ class Track:
         return np.where(inside[..., None], found, np.nan)
 
 
-def tracks_of(seen: Sightings, cameras: int, markers: int) -> list[list[Track]]:
+def tracks_of(seen: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
     """Tracks by camera and marker, in undistorted image plane coordinates, by stamps."""
     found = []
     for camera in range(cameras):
         mine = [np.flatnonzero((seen.camera == camera) & (seen.label == marker)) for marker in range(markers)]
-        found.append([Track.of(seen.t_s[rows], seen.xy[rows]) for rows in mine])
+        found.append([MarkerTrack.of(seen.t_s[rows], seen.xy[rows]) for rows in mine])
     return found
 
 
-def follow(frames: Frames, seen: Sightings, labels: Index, markers: int) -> Index:
+def follow(frames: FrameTable, seen: WandDetections, labels: Index, markers: int) -> Index:
     """Labels also for detections that lie where a marker must have been between two labelled frames of its camera.
 
     Each marker is sought linearly between its neighbours; the detection nearest to it takes its label if it is no

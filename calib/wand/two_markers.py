@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.trajectory import finite_velocities, hermite
-from calib.wand.detections import Frames, Sightings
-from calib.wand.initialization.initial_rig import Start, find_start
-from calib.wand.initialization.two_view import INTERPOLATED, SLOWEST_S, Pairs, sampson
+from calib.wand.detections import FrameTable, WandDetections
+from calib.wand.initialization.initial_rig import InitialRig, find_start
+from calib.wand.initialization.two_view import INTERPOLATED, SLOWEST_S, TwoViewGeometry, sampson
+from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, skew
@@ -29,8 +30,6 @@ from camera_node.geometry.pose import invert, skew
 if TYPE_CHECKING:
     from scipy.sparse import coo_array
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 FIRM = 0.5  # of the change that a swap would be: a turn of 53 degrees; more, and the sign is open
 CHAINED_S = 0.2  # or a frame and a half: after so long a stick may lie anywhere
@@ -67,7 +66,7 @@ class _Sticks:
         return gap[:, 0] + 1j * gap[:, 1]
 
 
-def label_ends(frames: Frames, seen: Sightings, wand: Body, lenses: Sequence[Lens]) -> Index:
+def label_ends(frames: FrameTable, seen: WandDetections, wand: Body, lenses: Sequence[Lens]) -> Index:
     """The end (n,), 0 or 1, that each sighting in a frame of two is; -1 where nothing tells."""
     sticks = _chain(seen, frames.period_s())
     labels = np.full(len(seen), -1, np.intp)
@@ -75,18 +74,18 @@ def label_ends(frames: Frames, seen: Sightings, wand: Body, lenses: Sequence[Len
         return labels
     period_s, cameras = frames.period_s(), range(len(lenses))
     light = Body(diameter_m=wand.diameter_m)
-    start = find_start(Pairs(_middles(seen, sticks), lenses, light, period_s), cameras)
+    start = find_start(TwoViewGeometry(_middles(seen, sticks), lenses, light, period_s), cameras)
     labels = _name(sticks, _signs(sticks, start, lenses, period_s, ROUGH_PX), len(seen))
     if not (labels >= 0).any():
         return labels
     named = replace(seen, label=labels).select(labels >= 0)
-    finer = find_start(Pairs(named, lenses, wand, period_s), cameras)
+    finer = find_start(TwoViewGeometry(named, lenses, wand, period_s), cameras)
     if len(finer.poses) < len(start.poses):
         return labels
     return _name(sticks, _signs(sticks, finer, lenses, period_s, FINE_PX), len(seen))
 
 
-def _chain(seen: Sightings, period_s: float) -> _Sticks:
+def _chain(seen: WandDetections, period_s: float) -> _Sticks:
     """Chain frames of two detections into runs, and cut these into segments."""
     rows = np.flatnonzero((np.bincount(seen.frame) == 2)[seen.frame]).reshape(-1, 2)
     camera, t_s = seen.camera[rows[:, 0]], seen.t_s[rows[:, 0]]
@@ -100,7 +99,7 @@ def _chain(seen: Sightings, period_s: float) -> _Sticks:
     return _cut(_sticks(seen, rows[whole], run[whole]))
 
 
-def _sticks(seen: Sightings, rows: Index, run: Index) -> _Sticks:
+def _sticks(seen: WandDetections, rows: Index, run: Index) -> _Sticks:
     return _Sticks(rows, seen.camera[rows[:, 0]], seen.t_s[rows[:, 0]], seen.xy[rows], run, run)
 
 
@@ -143,7 +142,7 @@ def _same_way(before: complex, now: complex) -> int:
     return 1 if kept < FIRM * swapped else -1 if swapped < FIRM * kept else 0
 
 
-def _middles(seen: Sightings, sticks: _Sticks) -> Sightings:
+def _middles(seen: WandDetections, sticks: _Sticks) -> WandDetections:
     """The sticks' middles, as sightings of one marker without a size."""
     first = seen.select(sticks.rows[:, 0])
     unknown = np.full(len(first), np.nan)
@@ -165,7 +164,9 @@ def _name(sticks: _Sticks, signs: Index, sightings: int) -> Index:
     return labels
 
 
-def _signs(sticks: _Sticks, start: Start, lenses: Sequence[Lens], period_s: float, sigma_px: float) -> Index:
+def _signs(
+    sticks: _Sticks, start: InitialRig, lenses: Sequence[Lens], period_s: float, sigma_px: float
+) -> Index:
     """(S,) 1 or -1 by segment, 0 where what speaks for it is not enough. Of cameras that have no place, segments stay
     as they are: what is wrong with these is told by those who look for it."""
     count, edges, placed = int(sticks.segment.max()) + 1, [], sorted(start.poses)
@@ -195,7 +196,7 @@ def _turns(sticks: _Sticks, gap_s: float, lag: int) -> tuple[Index, Index, Array
 
 
 def _evidence(
-    sticks: _Sticks, velocity: Array, start: Start, pair: tuple[int, int], gap_s: float, sigma: float
+    sticks: _Sticks, velocity: Array, start: InitialRig, pair: tuple[int, int], gap_s: float, sigma: float
 ) -> tuple[Index, Index, Array]:
     """Segments of two cameras that overlap in time, (e,) each, and by how much their signs are likelier alike than
     unlike, in the logarithm, by Cauchy's density of epipolar residuals at `sigma`."""

@@ -5,20 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.frame_sets import choose_instants, group_instants
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
-from calib.wand.bundle_adjustment.problem import Observations, Problem, State
+from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.trajectory import AffineWand, acceleration_density, finite_velocities
-from calib.wand.detections import Sightings
+from calib.wand.detections import WandDetections
 from calib.wand.initialization.initial_rig import triangulate
-from calib.wand.tracks import Track
+from calib.wand.tracks import MarkerTrack
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MIN_SIGMA_PX = 0.02  # no lens model is better than this, whatever a detector claims
 LENGTH_SLACK = 0.25  # of a wand length at the start: beyond, a detection is wrong
@@ -30,10 +27,10 @@ MIN_KNOTS = 2
 class Wave:
     """Sightings of the C cameras that stand somewhere, numbered 0 to C - 1, and what is known of the recording."""
 
-    seen: Sightings
+    seen: WandDetections
     names: Sequence[str]
     lenses: Sequence[Lens]
-    tracks: Sequence[Sequence[Track]]
+    tracks: Sequence[Sequence[MarkerTrack]]
     wand: Body
     period_s: float
     gap_s: float
@@ -43,7 +40,7 @@ class Wave:
         """The same, its tracks as other lenses saw them; the lenses that were given stay."""
         tracks = [
             [
-                Track.of(
+                MarkerTrack.of(
                     track.t_s, new.normalise(old.project(np.column_stack([track.at, np.ones(len(track.at))])))
                 )
                 for track in mine
@@ -54,7 +51,7 @@ class Wave:
 
     def pose_problem(
         self, cameras: Array, offset_s: Array, budget: int
-    ) -> tuple[Problem, State, Observations] | None:
+    ) -> tuple[Problem, State, WandObservations] | None:
         """The problem around a rig that is nearly right, with about `budget` moments; None where no two good views
         of the wand are at one of them.
 
@@ -99,11 +96,11 @@ class Wave:
         instant[order] = of_frame[back]
         return instant
 
-    def _observe(self, rows: Index, knot: Index) -> Observations:
+    def _observe(self, rows: Index, knot: Index) -> WandObservations:
         seen = self.seen.select(rows)
         cov = seen.cov + MIN_SIGMA_PX**2 * np.eye(2)
         columns = (seen.t_s, seen.stamp_sigma_s, seen.uv, cov, seen.axes_px, seen.angle_rad)
-        return Observations(seen.camera, knot, seen.label, *columns)
+        return WandObservations(seen.camera, knot, seen.label, *columns)
 
 
 def middles(t_s: Array, knot: Index) -> Array:
@@ -128,7 +125,7 @@ def find_basis(markers: Array, affine: AffineWand) -> Array:
     return basis
 
 
-def without_spikes(knot_s: Array, basis: Array, sure: NDArray[np.bool_], gap_s: float) -> Array:
+def without_spikes(knot_s: Array, basis: Array, sure: Mask, gap_s: float) -> Array:
     """The basis without knots that are much farther from between their neighbours than is usual, and than these are,
     unless they are `sure` (K,)."""
     if len(knot_s) < 3:

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, transform
 from calib.rig.triangulation import triangulate_point
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import rigid_motions
 from camera_node.protocol.messages import Detections
-
-Array = NDArray[np.float64]
 
 STILL_PX = 2.0  # a roundel that lies still stays within
 PRESENT = 0.3  # of a camera's frames, that a roundel must be in
@@ -54,7 +53,7 @@ def still_roundels(messages: Sequence[Detections]) -> list[Sighting]:
     return found
 
 
-def _around(uv: Array, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _around(uv: Array, left: Mask) -> Mask:
     """Which of the pixels (N, 2) that are left stay with the first of them, which is always among them."""
     first = int(left.argmax())
     mine = left & (np.linalg.norm(uv - uv[first], axis=1) < STILL_PX)

@@ -7,16 +7,15 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
 from calib.rig.camera import transform
 from calib.rig.rig import Rig
+from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.pose import Pose, rigid_motions
-
-Array = NDArray[np.float64]
 
 LEVEL = 0.7  # of a plane's normal that is upright: below, roundels hang on a wall
 MISFIT = 0.1  # of the survey's extent, that places may miss: beyond, names or units are wrong

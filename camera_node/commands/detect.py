@@ -12,13 +12,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.disc_pose import locate_all
 from camera_node.detection.overlay import draw_roundels
 from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens, load_lens
-from camera_node.sources.grey import Grey
 from camera_node.sources.replay import read_grey
 
 

@@ -13,7 +13,7 @@ from camera_node.commands.source_selection import open_source
 from camera_node.config import is_name
 from camera_node.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.replay import Replay
+from camera_node.sources.replay import PacedSource
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Publish:
             source = open_source(self.source, self.settings, self.name)
             stack.callback(source.close)
             session = stack.enter_context(open_client(self.connect, self.zenoh))
-            keep_stamps = isinstance(source, Replay) and self.settings.stamps == "recorded"
+            keep_stamps = isinstance(source, PacedSource) and self.settings.stamps == "recorded"
             detector = {"detector": self.detector, "inner_ratios": self.inner_ratios}
             with contextlib.suppress(KeyboardInterrupt):
                 Node(self.name, source, session, self.arena, detector, keep_stamps).run()

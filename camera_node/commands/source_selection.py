@@ -7,8 +7,8 @@ from pathlib import Path
 from camera_node.errors import ConfigError
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.frame import Source, SourceSettings
-from camera_node.sources.replay import FolderSource, Replay, VideoSource
-from camera_node.sources.v4l2 import DeviceSource, find_device
+from camera_node.sources.replay import FolderSource, PacedSource, VideoSource
+from camera_node.sources.v4l2 import V4l2Source, find_device
 
 
 def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Source:
@@ -27,10 +27,10 @@ def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Sour
     if text == "sim":
         return _open_simulation(settings, name)
     if Path(text).is_dir():
-        return Replay(FolderSource(Path(text)), settings)
+        return PacedSource(FolderSource(Path(text)), settings)
     if Path(text).is_file():
-        return Replay(VideoSource(Path(text), settings.fps), settings)
-    return DeviceSource(find_device(text), settings)
+        return PacedSource(VideoSource(Path(text), settings.fps), settings)
+    return V4l2Source(find_device(text), settings)
 
 
 def _open_simulation(settings: SourceSettings, name: str) -> Source:

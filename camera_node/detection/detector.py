@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
+from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import ConfigError
 from camera_node.sources.grey import grey
-
-Array = NDArray[np.float64]
 
 
 class Detector:

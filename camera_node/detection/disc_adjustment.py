@@ -6,11 +6,10 @@ own centre projects. What they contradict each other in is noise, and their cova
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
-Array = NDArray[np.float64]
 STEPS = 4  # of Gauss and Newton; both poses of the conic are near
 STEP = 0.2  # radians, and of the distance: no step is longer
 

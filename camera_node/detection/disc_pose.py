@@ -5,14 +5,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node import _core
+from camera_node.arrays import Array
 from camera_node.detection.disc_adjustment import adjust, covariance_through, shape_of
 from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.geometry.lens import Lens
 
-Array = NDArray[np.float64]
 BOUNDARY = 24  # points of an ellipse that are taken through the lens
 SCATTER = (
     1.5  # squared errors of small roundels' offsets over their covariance, which is to first order (measured)

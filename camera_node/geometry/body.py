@@ -5,7 +5,8 @@ import math
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+
+from camera_node.arrays import Array
 
 Vector = tuple[float, float, float]
 
@@ -34,6 +35,6 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
 
     @property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Array:
         """(M, 3) marker centres, body frame, metres."""
         return np.array(self.markers, float)

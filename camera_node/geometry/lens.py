@@ -8,12 +8,11 @@ import cv2
 import msgspec
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 MAX_FISHEYE_DEG = 89.0  # from the axis: beyond, x/z and y/z run away
 

@@ -9,9 +9,9 @@ import math
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from camera_node.arrays import Array
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -2,9 +2,8 @@
 """Directions spread evenly over the sphere."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from camera_node.arrays import Array
 
 
 def fibonacci_sphere(n: int) -> Array:

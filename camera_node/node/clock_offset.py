@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from camera_node.arrays import Array
 
 WINDOW_NS = 300_000_000_000  # how long a round trip is remembered: longer than a bad minute
 DRIFT = 100e-6  # two clocks of 50 ppm each, running apart

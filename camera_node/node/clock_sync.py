@@ -19,7 +19,7 @@ BURST = 3  # round trips a period
 TIMEOUT_S = 0.5
 
 
-class Clock:
+class ClockSync:
     """Keeps an estimate of the server's clock fresh, in a thread of its own, from `start` to `close`.
 
     The server's clock is compared with the monotonic one, so that setting this machine's clock changes no stamp.
@@ -39,7 +39,7 @@ class Clock:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
 
-    def start(self) -> "Clock":
+    def start(self) -> "ClockSync":
         self._thread.start()
         return self
 

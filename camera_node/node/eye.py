@@ -6,12 +6,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
+from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import Source
-from camera_node.sources.grey import Grey
 
 OF_THE_SOURCE = ("exposure_us", "gain")
 OF_THE_DETECTOR = tuple(set(Settings.__struct_fields__) - {"version", *OF_THE_SOURCE})

@@ -14,9 +14,9 @@ import zenoh
 
 from camera_node.detection.overlay import draw_roundels
 from camera_node.detection.roundels import Roundels
-from camera_node.node.clock_sync import Clock
+from camera_node.node.clock_sync import ClockSync
 from camera_node.node.eye import Eye
-from camera_node.node.status import Health
+from camera_node.node.status import NodeStatistics
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, Settings, encode
 from camera_node.protocol.requests import (
     RequestError,
@@ -30,7 +30,7 @@ from camera_node.protocol.requests import (
 )
 from camera_node.protocol.session import ServerWatch
 from camera_node.sources.frame import Frame, Source
-from camera_node.sources.replay import Replay
+from camera_node.sources.replay import PacedSource
 
 log = logging.getLogger("camera_node")
 
@@ -63,8 +63,8 @@ class Node:
         """
         self.name, self.source, self.session = name, source, session
         self.keys = Keys(arena)
-        self.clock = Clock(session, self.keys)
-        self.health = Health(name)
+        self.clock = ClockSync(session, self.keys)
+        self.health = NodeStatistics(name)
         self.keep_stamps = keep_stamps
         self.eye = Eye(source, detector or {})
         self._seen: tuple[Frame, Roundels] | None = None
@@ -141,7 +141,7 @@ class Node:
         reporter.start()
         stack.callback(reporter.join, STATUS_S)
         stack.callback(self._closed.set)
-        if isinstance(self.source, Replay):
+        if isinstance(self.source, PacedSource):
             self._await_listener(publisher)
         return publisher
 

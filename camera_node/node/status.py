@@ -7,12 +7,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import CameraStatus
 from camera_node.sources.frame import Frame
-from camera_node.sources.grey import Grey
 
 THERMAL = Path("/sys/class/thermal")
 FULL = 250  # grey levels from which a pixel counts as saturated
@@ -25,7 +24,7 @@ STRIDE = 8  # every eighth pixel each way tells the brightness
 NOTHING = np.empty((0, 0), np.uint8), np.empty((0, 2))
 
 
-class Health:
+class NodeStatistics:
     """Counts frames, and sums them up once a second."""
 
     def __init__(self, camera: str) -> None:
@@ -84,7 +83,7 @@ def saturated_share(image: Grey) -> float:
     return float(np.mean(image >= FULL)) if image.size else 0.0
 
 
-def advise(image: Grey, uv: NDArray[np.float64]) -> str:
+def advise(image: Grey, uv: Array) -> str:
     """What is wrong with the light, and what to change by how much; nothing where all is well.
 
     The white in the middle of the roundels at `uv` (N, 2) tells. Where there are none, the histogram does.
@@ -99,7 +98,7 @@ def advise(image: Grey, uv: NDArray[np.float64]) -> str:
     return f"too dark: {min(MOST, WHITE / max(white, 1.0)):.1f} times the exposure or the gain"
 
 
-def _white_seen(image: Grey, uv: NDArray[np.float64]) -> float:
+def _white_seen(image: Grey, uv: Array) -> float:
     """The grey level of the white discs in the middle of roundels."""
     h, w = image.shape
     u, v = np.rint(uv).astype(int).T

@@ -12,9 +12,9 @@ import cv2
 import msgspec
 import zenoh
 
+from camera_node.arrays import Grey
 from camera_node.errors import RoundelError
 from camera_node.protocol.messages import MessageError, decode, encode
-from camera_node.sources.grey import Grey
 
 log = logging.getLogger("camera_node.requests")
 

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.geometry.pose import Array
+from camera_node.arrays import Array
 
 Picture = NDArray[np.float32]
 SIZE_M = 10.0  # the floor is a square around the world's origin

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import Array, invert
+from camera_node.geometry.pose import invert
 from camera_node.simulation.background import paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene
-from camera_node.sources.grey import Grey
 
 Picture = NDArray[np.float32]
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print where the lens lets all light through

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body, Vector
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import look_at, rotation_from_vector
 
-Array = NDArray[np.float64]
 WAND = "wand"  # its name among the bodies
 
 
@@ -43,7 +42,7 @@ class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return math.tau * t_s / self.period_s + math.radians(self.phase_deg)
 
 
-class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SimulatedMotion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a body's origin goes (metres, world), and how the body turns (degrees: yaw, then pitch, then roll).
 
     Two swings a quarter period apart draw a circle, one of half the other's period a figure eight. With
@@ -122,8 +121,8 @@ class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     robots: str
     wave_s: float
     cameras: dict[str, SceneCamera]
-    wand_motion: Motion
-    robot_motions: dict[str, Motion]
+    wand_motion: SimulatedMotion
+    robot_motions: dict[str, SimulatedMotion]
     seed: int = 0
     clutter: bool = True
 

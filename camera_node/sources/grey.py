@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
+from camera_node.arrays import Grey
+
 DEPTHS = (8, 10, 12, 14, 16)  # bits that sensors have
 
 # V4L2's names of raw formats. Mosaics go by the colours of their first row; OpenCV names them by the second's.

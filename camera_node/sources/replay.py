@@ -11,9 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from camera_node.arrays import Grey
 from camera_node.errors import CameraError
 from camera_node.sources.frame import Frame, Source, SourceSettings
-from camera_node.sources.grey import Grey, grey
+from camera_node.sources.grey import grey
 
 IMAGES = (".png", ".jpg", ".jpeg")  # files that hold one frame
 
@@ -113,7 +114,7 @@ def read_timestamps(video: Path) -> list[int] | None:
     return sorted(times)
 
 
-class Replay:
+class PacedSource:
     """A recording delivered at its own pace or as fast as it is read, with its own times or moved to now."""
 
     def __init__(self, recording: Source, settings: SourceSettings) -> None:

@@ -162,7 +162,7 @@ def apply(capture: Capture, pairs: list[tuple[int, float]], device: Path) -> Non
             log.warning("%s does not take %s = %g", device, NAMES[key], value)
 
 
-class DeviceSource:
+class V4l2Source:
     """A camera of which always the newest frame is taken; frames that nobody took in time are counted in `dropped`.
 
     A thread grabs. A camera that stops delivering is reported once and reopened until it is back.

@@ -35,7 +35,7 @@ SILENCE_S = 5.0
 MAX_DOMAIN = 232
 
 
-class Node:
+class Ros2Node:
     """A ROS 2 node in a Zenoh session: its publishers, and the tokens that show them. `faults` counts."""
 
     def __init__(
@@ -44,7 +44,7 @@ class Node:
         self.faults: Counter[str] = Counter()
         self._session, self._domain, self._humble = session, domain, humble
         self._namespace = namespace
-        self._topics: dict[str, Topic] = {}
+        self._topics: dict[str, Ros2Topic] = {}
         self._robots: dict[str, str] = {}  # ROS's name -> ours
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
@@ -61,14 +61,14 @@ class Node:
             self._topic(f"{own}/odometry", "nav_msgs/msg/Odometry").put(odometry(pose, frame, name))
             self._topic("tf", "tf2_msgs/msg/TFMessage").put(transform(pose, frame, name))
 
-    def _topic(self, name: str, kind: str) -> "Topic":
+    def _topic(self, name: str, kind: str) -> "Ros2Topic":
         if name not in self._topics:
             log.info("publishes /%s, %s", name, kind)
             package, _, message = kind.split("/")
             dds = f"{package}::msg::dds_::{message}_"
             typed = f"{dds}/{NO_HASH if self._humble else 'RIHS01_' + TYPE_HASHES[kind]}"
             entity = f"{self._entity(len(self._topics) + 1, 'MP')}/%{name.replace('/', '%')}/{typed}/{QOS}"
-            self._topics[name] = Topic(self._session, f"{self._domain}/{name}/{typed}", entity)
+            self._topics[name] = Ros2Topic(self._session, f"{self._domain}/{name}/{typed}", entity)
         return self._topics[name]
 
     def _entity(self, number: int, kind: str) -> str:
@@ -77,7 +77,7 @@ class Node:
         return f"{where}/%/%{self._namespace.replace('/', '%')}/{NODE}"
 
 
-class Topic:
+class Ros2Topic:
     """A publisher as rmw_zenoh_cpp has them: each message comes with its number, its time and who sent it."""
 
     def __init__(self, session: zenoh.Session, key: str, entity: str) -> None:
@@ -126,7 +126,7 @@ def ros2(
     with contextlib.ExitStack() as stack:
         client = stack.enter_context(Arena.connect(*connect, arena=arena, zenoh_config=zenoh_config))
         session = stack.enter_context(open_client(ros or connect, None if ros else zenoh_config))
-        node = Node(session, domain, namespace, humble)
+        node = Ros2Node(session, domain, namespace, humble)
         stack.callback(_tell, node.faults, client.faults)
         stack.callback(client.poses().on_message(lambda pose: _enqueue(arrived, pose, node.faults)))
         with contextlib.suppress(KeyboardInterrupt):
@@ -159,7 +159,7 @@ def _enqueue(arrived: queue.Queue[RobotPose], pose: RobotPose, faults: Counter[s
         faults["poses dropped, which came faster than they could be passed on"] += 1
 
 
-def _pass_on(arrived: queue.Queue[RobotPose], node: Node, frame: str, whence: str) -> None:
+def _pass_on(arrived: queue.Queue[RobotPose], node: Ros2Node, frame: str, whence: str) -> None:
     silent = False
     while True:
         try:

@@ -8,12 +8,10 @@ of position, then of rotation about the frame's fixed axes; a twist in the frame
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz, skew
 from fusion.protocol.messages import RobotPose
-
-Array = NDArray[np.float64]
 
 # What ROS 2 calls a message, and the hash of its definition (REP 2016), the same in all releases since Iron.
 TYPE_HASHES = {

@@ -125,7 +125,7 @@ class Stream(Generic[T]):
             self._changed.notify_all()
 
 
-class Robot(Stream[RobotPose]):
+class RobotStream(Stream[RobotPose]):
     """The poses of one robot."""
 
     def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
@@ -141,7 +141,7 @@ class Arena:
         self.faults: Counter[str] = Counter()
         self._session, self._where = session, f"from arena '{arena}' at {where}"
         self._lock = threading.Lock()
-        self._robots: dict[str, Robot] = {}
+        self._robots: dict[str, RobotStream] = {}
         self._streams: dict[str, Stream] = {}
         self._all: Stream[RobotPose] = Stream(f"poses {self._where}", TIMEOUT_S)
         self._known: set[str] = set()
@@ -172,10 +172,10 @@ class Arena:
             subscriber.undeclare()
         self._session.close()
 
-    def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> Robot:
+    def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> RobotStream:
         """The poses of a robot; iterating waits `timeout_s` for the next (None: for ever)."""
         with self._lock:
-            robot = self._robots.setdefault(name, Robot(f"pose of '{name}' {self._where}", timeout_s))
+            robot = self._robots.setdefault(name, RobotStream(f"pose of '{name}' {self._where}", timeout_s))
         robot.timeout_s = timeout_s
         return robot
 

@@ -9,16 +9,16 @@ from typing import Literal
 
 import numpy as np
 import zenoh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from camera_node.arrays import Array
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
-from fusion.model.robots import Motion, Robot
+from fusion.model.robots import MotionModel, Robot
 from fusion.protocol.messages import Markers
 
-Array = NDArray[np.float64]
 SAME_M = 0.02  # from one instant to the next: a marker that stands is no further off
 REST_M = 0.005  # median distance from its place: more, and it does not stand
 SEEN = 0.5  # share of the instants in which a marker that counts is seen
@@ -87,7 +87,7 @@ def find_standing(instants: Sequence[Markers]) -> Standing:
 
 
 def robot_of(
-    markers: Standing, diameter_m: float, motion: Literal["ground", "aerial"] | Motion = "aerial"
+    markers: Standing, diameter_m: float, motion: Literal["ground", "aerial"] | MotionModel = "aerial"
 ) -> Robot:
     """A robot with these markers: its origin in their middle, z out of the prints, x towards the first marker.
 

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
+from camera_node.arrays import Array, Index
 from fusion._core import Poses
 from fusion.model.states import States
 from fusion.model.undistortion import table_of
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +81,7 @@ class Views:
         return -along / np.sqrt(np.einsum("in,in->n", self.centre, self.centre))
 
 
-class Optics:
+class CameraArray:
     """The placed cameras of a rig, by index in the order of `names`."""
 
     def __init__(self, cameras: dict[str, Camera]) -> None:

@@ -4,20 +4,16 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib.rig.camera import Camera
+from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 from fusion.model.undistortion import undistort
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class CalibratedFrame:
     """A camera's roundels at `t_ns`, its capture time with the calibrated offset; `sent_ns` and `received_ns` live.
 
     `xy` (2, N) are their undistorted centres, NaN where the lens has no inverse, and `scale` (2, 2, N) the derivative
@@ -35,7 +31,7 @@ class Frame:
     detect_us: float = 0.0
 
     @classmethod
-    def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "Frame":
+    def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
         """The frame that a message of a calibrated camera tells of."""
         return cls.measure(
             message.camera,
@@ -49,14 +45,16 @@ class Frame:
         )
 
     @classmethod
-    def measure(cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **arrival: Any) -> "Frame":
+    def measure(
+        cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **arrival: Any
+    ) -> "CalibratedFrame":
         """The frame of roundels that a lens saw, and what else is known of its way."""
         return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **arrival)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Instant:
+class FrameSet:
     """The frames nearest to `t_ns`, each with a capture time of its own."""
 
     t_ns: int
-    frames: tuple[Frame, ...]
+    frames: tuple[CalibratedFrame, ...]

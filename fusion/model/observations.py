@@ -6,16 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.model.camera_array import Discs, Exposures, Optics, taken
-from fusion.model.frames import Instant
+from camera_node.arrays import Array, Index
+from fusion.model.camera_array import CameraArray, Discs, Exposures, taken
+from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class DetectionTable:
     """All N detections of an instant, columns last.
 
     Attributes:
@@ -49,13 +47,13 @@ class Sightings:
         """(N,) capture time less the instant's, seconds."""
         return self.exposures.tau[self.frame]
 
-    def select(self, rows: NDArray) -> "Sightings":
+    def select(self, rows: NDArray) -> "DetectionTable":
         """The columns that a mask or an index array names."""
         of_each = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
-        return Sightings(self.exposures, *taken(rows, *of_each))
+        return DetectionTable(self.exposures, *taken(rows, *of_each))
 
     @classmethod
-    def of(cls, instant: Instant, optics: Optics, floor_px: float) -> "Sightings":
+    def of(cls, instant: FrameSet, optics: CameraArray, floor_px: float) -> "DetectionTable":
         """The detections of an instant; `floor_px` is added to what detectors say of their noise."""
         frames = instant.frames
         exposures = Exposures(
@@ -82,7 +80,7 @@ def _joined(columns: list[Array], empty: tuple[int, ...]) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Catalogue:
+class MarkerTable:
     """All K markers of all robots: robot (K,), number in the robot (K,), centre (3, K), radius (K,).
 
     `first` (R + 1,): robot r has the rows first[r] to first[r + 1].
@@ -95,7 +93,7 @@ class Catalogue:
     first: Index
 
     @classmethod
-    def of(cls, robots: list[Robot]) -> "Catalogue":
+    def of(cls, robots: list[Robot]) -> "MarkerTable":
         counts = [len(robot.markers) for robot in robots]
         return cls(
             np.repeat(np.arange(len(robots)), counts),
@@ -111,7 +109,7 @@ class Catalogue:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matches:
+class Assignments:
     """Rows of the sightings, the rows of the catalogue that they are of, and what remains of each, px^2."""
 
     sighting: Index
@@ -119,41 +117,43 @@ class Matches:
     squared_px: Array
 
     @classmethod
-    def of(cls, sighting: Index, disc: Index) -> "Matches":
+    def of(cls, sighting: Index, disc: Index) -> "Assignments":
         """Matches before any estimate."""
         return cls(sighting, disc, np.full(len(disc), np.nan))
 
     @classmethod
-    def none(cls) -> "Matches":
+    def none(cls) -> "Assignments":
         """No match."""
         return cls.of(np.empty(0, np.intp), np.empty(0, np.intp))
 
     def __len__(self) -> int:
         return len(self.sighting)
 
-    def remaining(self, error_px: Array) -> "Matches":
+    def remaining(self, error_px: Array) -> "Assignments":
         """The same, with what remains of each (2, N)."""
-        return Matches(self.sighting, self.disc, np.sum(error_px**2, 0))
+        return Assignments(self.sighting, self.disc, np.sum(error_px**2, 0))
 
-    def select(self, rows: NDArray) -> "Matches":
+    def select(self, rows: NDArray) -> "Assignments":
         """The rows that a mask or an index array names."""
-        return Matches(self.sighting[rows], self.disc[rows], self.squared_px[rows])
+        return Assignments(self.sighting[rows], self.disc[rows], self.squared_px[rows])
 
-    def joined(self, other: "Matches") -> "Matches":
+    def joined(self, other: "Assignments") -> "Assignments":
         """Both."""
-        return Matches(*(np.concatenate([getattr(self, k), getattr(other, k)]) for k in self.__slots__))
+        return Assignments(*(np.concatenate([getattr(self, k), getattr(other, k)]) for k in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observations:
+class MatchedObservations:
     """N detections and the discs they are of. `whiten` (2, 2, N) takes errors in xy to a standard deviation of 1."""
 
     discs: Discs
-    seen: Sightings
+    seen: DetectionTable
     whiten: Array
 
     @classmethod
-    def of(cls, matches: Matches, sightings: Sightings, catalogue: Catalogue) -> "Observations":
+    def of(
+        cls, matches: Assignments, sightings: DetectionTable, catalogue: MarkerTable
+    ) -> "MatchedObservations":
         """The matched detections."""
         return cls.seeing(
             sightings.select(matches.sighting),
@@ -161,20 +161,20 @@ class Observations:
         )
 
     @classmethod
-    def seeing(cls, seen: Sightings, discs: Discs) -> "Observations":
+    def seeing(cls, seen: DetectionTable, discs: Discs) -> "MatchedObservations":
         """Detections of known discs."""
         return cls(discs, seen, _whiten(seen))
 
     def __len__(self) -> int:
         return len(self.discs)
 
-    def select(self, rows: NDArray) -> "Observations":
+    def select(self, rows: NDArray) -> "MatchedObservations":
         """The columns that a mask or an index array names."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        return Observations(self.discs.select(rows), self.seen.select(rows), *taken(rows, self.whiten))
+        return MatchedObservations(self.discs.select(rows), self.seen.select(rows), *taken(rows, self.whiten))
 
 
-def _whiten(seen: Sightings) -> Array:
+def _whiten(seen: DetectionTable) -> Array:
     """L^-1 scale, where L L^T is the detection's covariance."""
     a = np.sqrt(seen.cov[0, 0])
     b = seen.cov[0, 1] / a

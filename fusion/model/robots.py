@@ -12,15 +12,14 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index
 from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions
 from fusion.errors import FusionError
 
-Array = NDArray[np.float64]
 DISTINCT_M = 0.010  # two labellings must differ by this in some distance: several sigma of a triangulated one
 SIZES_DIFFER = 1.25  # diameters in this ratio are told apart by apparent size
 APART_M = 0.6  # between the starts of identical robots: several sigma of where a person puts them
@@ -28,7 +27,7 @@ MAX_MARKERS = 7  # keeps the comparison of all labellings at load, and the searc
 MANOEUVRE_S = 0.1  # how long an acceleration lasts, to turn its size into the density of white noise
 
 
-class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How violently a robot moves: typical accelerations, each lasting about `MANOEUVRE_S`."""
 
     acceleration_m_s2: float
@@ -47,7 +46,7 @@ class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-MOTIONS = {"ground": Motion(3.0, 15.0), "aerial": Motion(10.0, 40.0)}
+MOTIONS = {"ground": MotionModel(3.0, 15.0), "aerial": MotionModel(10.0, 40.0)}
 
 
 class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -58,7 +57,7 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         start_m: roughly where a robot stands at first; what tells robots of one marker, or of the same markers, apart.
     """
 
-    motion: Literal["ground", "aerial"] | Motion = "aerial"
+    motion: Literal["ground", "aerial"] | MotionModel = "aerial"
     start_m: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -83,7 +82,7 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
 
     @property
     def densities(self) -> tuple[float, float]:
-        """Those of its motion: see `Motion.densities`."""
+        """Those of its motion: see `MotionModel.densities`."""
         return (MOTIONS[self.motion] if isinstance(self.motion, str) else self.motion).densities
 
 
@@ -199,7 +198,7 @@ def _likeness(small: Robot, large: Robot) -> str | None:
     return None
 
 
-def _explain(D: Array, E: Array, order: NDArray[np.intp], worst: Array) -> str:
+def _explain(D: Array, E: Array, order: Index, worst: Array) -> str:
     i, j = np.unravel_index(np.argmax(worst), worst.shape)
     a, b = sorted((order[i], order[j]))
     return (

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import exp_so3
 from fusion import _core
 
-Array = NDArray[np.float64]
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UNKNOWN_TURN = np.pi**2  # variance of a turn about the normal that nothing tells, rad^2
 UNKNOWN_RATE = 10.0**2  # variance of a turning rate that nothing tells, rad^2/s^2
@@ -62,7 +62,7 @@ class States:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class Transition:
     """How errors of N bodies move in `dt` (N,) seconds: F adds `turn` (N, 3, 3) of the rate's, dt of the speed's."""
 
     turn: Array
@@ -75,12 +75,12 @@ class Motion:
         moved[:, POSITION] += self.dt[:, None, None] * errors[:, VELOCITY]
         return moved
 
-    def select(self, rows: NDArray) -> "Motion":
+    def select(self, rows: NDArray) -> "Transition":
         """The rows that a mask or an index array names."""
-        return Motion(self.turn[rows], self.dt[rows])
+        return Transition(self.turn[rows], self.dt[rows])
 
 
-def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Motion]:
+def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[States, Transition]:
     """Where bodies are after `dt` (N,) seconds.
 
     Args:
@@ -94,7 +94,7 @@ def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool
     """
     of_each = states.R, states.p, states.omega, states.v, states.P
     R, p, P, turn = _core.predict(*of_each, dt, densities, single)
-    return States(R, p, states.omega, states.v, P), Motion(turn, dt)
+    return States(R, p, states.omega, states.v, P), Transition(turn, dt)
 
 
 def forget_turn(P: Array) -> Array:

@@ -9,12 +9,11 @@ empty, and what falls in there, or outside the image, is done by the lens itself
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from fusion import _core
 
-Array = NDArray[np.float64]
 CELL_PX, FINE_CELL_PX = 32, 16
 ENOUGH = 0.99  # share of the cells that must be near the lens; else they are made finer
 TOLERANCE_PX = 1e-3  # a hundredth of a good detection's noise
@@ -54,17 +53,17 @@ def undistort(lens: Lens, uv: Array) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=256)
-def table_of(lens: Lens) -> "Table":
+def table_of(lens: Lens) -> "UndistortionTable":
     """The lens's table, made once for all cameras and poses with these intrinsics: 30 to 150 ms."""
     return _table_of(Lens(**{name: getattr(lens, name) for name in Lens.__struct_fields__}))
 
 
 @lru_cache(maxsize=256)
-def _table_of(lens: Lens) -> "Table":
-    return Table(lens)
+def _table_of(lens: Lens) -> "UndistortionTable":
+    return UndistortionTable(lens)
 
 
-class Table:
+class UndistortionTable:
     """A lens's cells, and a ring of empty ones around the image: `coefficients` (rows + 2, columns + 2, 20) of x and y.
 
     They are NaN in empty cells.
@@ -123,7 +122,7 @@ def _square(side: Array) -> Array:
     return np.array(np.meshgrid(side, side)).reshape(2, -1)
 
 
-def _samples(lens: Lens, cell_px: int, side: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _samples(lens: Lens, cell_px: int, side: Array) -> tuple[Array, Mask]:
     """(rows, columns, M * M, 6) the exact xy and derivatives at points of all cells; which cells know all of them."""
     rows, columns = -(-lens.height // cell_px), -(-lens.width // cell_px)
     s, t = _square(side)
@@ -135,7 +134,7 @@ def _samples(lens: Lens, cell_px: int, side: Array) -> tuple[Array, NDArray[np.b
     return values, np.isfinite(values.sum((2, 3)))
 
 
-def _is_near(fitted: Array, lens: Lens, cell_px: int) -> NDArray[np.bool_]:
+def _is_near(fitted: Array, lens: Lens, cell_px: int) -> Mask:
     """(rows, columns) cells whose polynomials are within the tolerances at points that they were not fitted to."""
     exact, known = _samples(lens, cell_px, CHECKED)
     at = _monomials(_square(CHECKED))

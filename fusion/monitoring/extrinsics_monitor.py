@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera, pixel_jacobians
+from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose, rotation_from_vector
-from fusion.model.frames import Frame
+from fusion.model.frames import CalibratedFrame
 
-Array = NDArray[np.float64]
 AGREE_PX = 2.0  # between where a roundel is expected and detected, while a camera stands
 STRANGE_PX, STRANGE = 0.2, 2.0  # median residual: at the least, and by the usual one
 LEARN = 15  # instants in which the usual one is learnt
@@ -47,7 +47,7 @@ SIGMA_M, SIGMA_RAD = 0.008, 0.004  # by which it must be known, if residuals wer
 class Expected:
     """What a frame should show: points (3, N) in the world that project to its outlines' centres."""
 
-    frame: Frame
+    frame: CalibratedFrame
     points: Array
 
 
@@ -60,7 +60,7 @@ class _Watched:
     tried_ns: int = 0
 
 
-class Watch:
+class ExtrinsicsMonitor:
     """Which cameras stand where the rig says; `bumped` are those that do not, set aside."""
 
     def __init__(self) -> None:

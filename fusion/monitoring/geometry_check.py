@@ -8,15 +8,15 @@ own detections is large in every instant, and is said with its name.
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from camera_node.arrays import Array, Mask
+
 MISFIT_PX = 1.0  # RMS of what remains: good cameras leave 0.1 to 0.5
 MEMORY = 60  # instants over which it is averaged
 log = logging.getLogger("fusion")
 
 
-class Shapes:
+class GeometryCheck:
     """What remains of each robot's detections, over the last instants.
 
     Args:
@@ -24,7 +24,7 @@ class Shapes:
         single: (N,) those of one marker, which have no shape.
     """
 
-    def __init__(self, names: tuple[str, ...], single: NDArray[np.bool_]) -> None:
+    def __init__(self, names: tuple[str, ...], single: Mask) -> None:
         self._names, self._single = names, single
         self._mean_px2, self._count = np.zeros(len(names)), np.zeros(len(names), int)
         self._told: set[str] = set()

@@ -8,19 +8,18 @@ aside, in every instant.
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
-from fusion.model.camera_array import Exposures, Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Catalogue, Matches, Sightings
+from camera_node.arrays import Array, Index
+from fusion.model.camera_array import CameraArray, Exposures
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
-from fusion.monitoring.extrinsics_monitor import Expected, Watch
-from fusion.protocol.messages import State
+from fusion.monitoring.extrinsics_monitor import Expected, ExtrinsicsMonitor
+from fusion.protocol.messages import TrackingState
 from fusion.protocol.shards import Shard
 from fusion.tracking.result import Move
 
-Array = NDArray[np.float64]
 WATCHED = 20  # markers, at the most, that are compared with their images in one look
 LOOK_NS = 250_000_000  # between looks at a camera of so many markers; of fewer, more often
 WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
@@ -29,12 +28,12 @@ WATCH_FACING, WATCH_MARGIN_PX = 0.35, 30.0  # what a camera surely sees
 class Inspected(Protocol):
     """What an inspection needs of a tracker."""
 
-    optics: Optics
-    catalogue: Catalogue
+    optics: CameraArray
+    catalogue: MarkerTable
     states: States
-    status: list[State | None]
+    status: list[TrackingState | None]
     shard: Shard
-    watch: Watch
+    watch: ExtrinsicsMonitor
 
     def place(self, name: str, camera: Camera) -> None: ...
 
@@ -47,7 +46,7 @@ class Inspection:
         self._watched = 0
         self._turns: dict[str, int] = {}  # of each camera, the last in which it was looked at
 
-    def inspect(self, instant: Instant, sightings: Sightings, matches: Matches) -> tuple[Move, ...]:
+    def inspect(self, instant: FrameSet, sightings: DetectionTable, matches: Assignments) -> tuple[Move, ...]:
         """Place cameras anew that were moved; says which were, and where they stand."""
         tracker = self.tracker
         seen = np.zeros((len(tracker.status), len(tracker.optics.names)), bool)
@@ -65,7 +64,7 @@ class Inspection:
                 tracker.watch.note(tracker.optics.cameras[camera], Expected(frame, points))
         return self._heal()
 
-    def _is_due(self, frame: Frame, n_markers: int) -> bool:
+    def _is_due(self, frame: CalibratedFrame, n_markers: int) -> bool:
         """Whether it is the camera's turn, which comes at other times than the other cameras'."""
         optics = self.tracker.optics
         interval_ns = LOOK_NS * min(n_markers, WATCHED) / WATCHED
@@ -75,7 +74,7 @@ class Inspection:
         was, self._turns[frame.camera] = self._turns.get(frame.camera), turn
         return turn != was
 
-    def _expect(self, frame: Frame, camera: int, tau: float, markers: NDArray[np.intp]) -> Array:
+    def _expect(self, frame: CalibratedFrame, camera: int, tau: float, markers: Index) -> Array:
         """(3, N) points in the world whose projections are the outlines' centres that the frame should show."""
         exposures = Exposures(np.array([camera]), np.array([tau]))
         optics, lens = self.tracker.optics, self.tracker.optics.cameras[camera]

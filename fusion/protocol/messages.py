@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index
 from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.robots import Robot
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
-State = Literal["tracked", "coasting", "lost"]
+TrackingState = Literal["tracked", "coasting", "lost"]
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,7 +40,7 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     version: int = VERSION
     robot: str
     t_ns: int
-    state: State
+    state: TrackingState
     position: Vector
     quaternion_wxyz: tuple[float, float, float, float]
     velocity: Vector
@@ -75,7 +75,7 @@ class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
     version: int = VERSION
     t_ns: int
     robots: tuple[str, ...]
-    states: tuple[State, ...]
+    states: tuple[TrackingState, ...]
     motion: bytes
     covariance: bytes
 
@@ -156,7 +156,7 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M,) index into `robots`, -1 for none."""
         return np.frombuffer(self.robot, "<i4")
 
-    def free(self) -> NDArray[np.intp]:
+    def free(self) -> Index:
         """(F,) rows of the markers that no robot has and that are placed by more than one camera."""
         alone = np.isfinite(self.normal_candidates()).any((1, 2))
         return np.flatnonzero((self.robot_index() < 0) & ~alone)
@@ -190,7 +190,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cpu: float  # this process's share of one core
     memory_mb: float
     cameras: dict[str, CameraHealth]
-    robots: dict[str, State]
+    robots: dict[str, TrackingState]
     faults: dict[str, int]
     misfits: dict[str, float] = {}  # RMS, pixels, of robots whose markers do not stand as declared
 

@@ -10,14 +10,12 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Index
 from camera_node.errors import ConfigError
 from camera_node.geometry.pose import exp_so3, rotation_from_wxyz, wxyz_of
 from fusion.model.states import States
-from fusion.protocol.messages import ShardPoses, State
-
-Index = NDArray[np.intp]
+from fusion.protocol.messages import ShardPoses, TrackingState
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Shard:
 
 
 def told_of(
-    names: tuple[str, ...], t_ns: int, states: States, status: list[State | None], rows: Index
+    names: tuple[str, ...], t_ns: int, states: States, status: list[TrackingState | None], rows: Index
 ) -> ShardPoses:
     """What a shard tells the others of robots `rows`, each of which has a status."""
     of_each = states.select(rows)

@@ -32,7 +32,7 @@ ASK_S = 1.0  # for the server to tell of its rig and robots; they are asked for 
 
 
 @dataclass
-class Recording:
+class ArenaRecording:
     """What a recording holds: detections and when they arrived (ns), poses as they were told, rig and robots."""
 
     detections: list[tuple[int, Detections]] = field(default_factory=list)
@@ -56,13 +56,13 @@ class Recording:
             self.faults[f"messages on {key} that are none"] += 1
 
 
-def read_recording(path: Path) -> Recording:
+def read_recording(path: Path) -> ArenaRecording:
     """Read a recording; of one that was cut off, what was written.
 
     Raises:
         ConfigError: the file is missing, or no recording of an arena.
     """
-    recording = Recording()
+    recording = ArenaRecording()
     for key, data, received_ns in iterate(path, recording.faults):
         recording.take(key, data, received_ns)
     if not recording.detections:

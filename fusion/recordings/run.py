@@ -18,11 +18,11 @@ from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.observations import detect_frames, read_observations
-from fusion.model.frames import Frame, Instant
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.robots import Robot, load_robots
 from fusion.protocol.messages import RobotPose
 from fusion.recordings.record import read_recording
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import Fused, Move
 from fusion.tracking.smoothing import Smoother
 from fusion.tracking.tracker import Limits, Tracker
@@ -93,7 +93,7 @@ def fuse_recording(
     limits = limits or Limits()
     tracker = Tracker(cameras, robots, limits)
     smoother = Smoother(tracker) if smooth else None
-    instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(limits.lateness_ms * 1e6))
+    instants = FrameSynchronizer(round(1e9 / rate_hz) if rate_hz else None, round(limits.lateness_ms * 1e6))
     told = Counter() if faults is None else faults
     for instant in _gather(messages, cameras, instants, told):
         fused = tracker.fuse(instant)
@@ -238,9 +238,9 @@ def _in_order(messages: Iterable[Detections], cameras: dict[str, Camera]) -> lis
 def _gather(
     messages: Iterable[tuple[int, Detections]],
     cameras: dict[str, Camera],
-    instants: Instants,
+    instants: FrameSynchronizer,
     faults: Counter[str],
-) -> Iterator[Instant]:
+) -> Iterator[FrameSet]:
     for received_ns, message in messages:
         camera = cameras.get(message.camera)
         if camera is None:
@@ -248,7 +248,7 @@ def _gather(
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            instants.add(Frame.of(message, camera))
+            instants.add(CalibratedFrame.of(message, camera))
             yield from instants.take(received_ns)
     for name, late in instants.late.items():
         if late:

@@ -9,13 +9,13 @@ from calib.rig.camera import Camera
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, load_rig
 from fusion.errors import FusionError
-from fusion.server.persistence import Kept
+from fusion.server.persistence import PersistedFile
 
 
-class Calibration:
+class ActiveRig:
     """The rig in force, None until there is one; its corrections can be undone one by one."""
 
-    def __init__(self, rig: Path | None, kept: Kept[Rig]) -> None:
+    def __init__(self, rig: Path | None, kept: PersistedFile[Rig]) -> None:
         """The newer of the file that a person gave and the one in which a published rig was kept.
 
         Raises:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from fusion.model.frames import Frame, Instant
+from fusion.model.frames import CalibratedFrame, FrameSet
 
 LEARN_FRAMES = 8  # of one camera, from which its rate is learnt
 DEFAULT_NS = 33_333_333  # the period where no camera sent two frames
@@ -31,7 +31,7 @@ class _Camera:
         self.interval_ns = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) // 2 if steps else 0
 
 
-class Instants:
+class FrameSynchronizer:
     """Closes an instant when every live camera delivered what belongs to it, or when it is too late to wait.
 
     Instants follow each other steadily. Their phase is that of the first camera by name, so that its frames lie in
@@ -45,7 +45,7 @@ class Instants:
         self._learns = period_ns is None
         self.lateness_ns = lateness_ns
         self._cameras: dict[str, _Camera] = {}
-        self._waiting: list[Frame] = []
+        self._waiting: list[CalibratedFrame] = []
         self._end_ns: int | None = None  # of the instant that is open; None while there is none
         self._newest_ns = 0
 
@@ -54,7 +54,7 @@ class Instants:
         """Frames dropped since the start, by camera."""
         return {name: camera.late for name, camera in self._cameras.items()}
 
-    def add(self, frame: Frame) -> bool:
+    def add(self, frame: CalibratedFrame) -> bool:
         """Take a frame; False if it came too late."""
         camera = self._cameras.setdefault(frame.camera, _Camera())
         if frame.t_ns < self._oldest_ns():
@@ -66,20 +66,20 @@ class Instants:
         self._newest_ns = max(self._newest_ns, frame.t_ns)
         return True
 
-    def take(self, now_ns: int) -> list[Instant]:
+    def take(self, now_ns: int) -> list[FrameSet]:
         """The instants that are complete at `now_ns`: a server's time, or offline the newest capture time."""
         if self._end_ns is None and not self._begin(now_ns):
             return []
         return self._close(lambda end: self._complete(end) or now_ns >= end + self.lateness_ns, GONE_NS)
 
-    def open(self) -> tuple[Instant | None, int]:
+    def open(self) -> tuple[FrameSet | None, int]:
         """What is there already of the instant that is closed next, and how many cameras it waits for."""
         if self._end_ns is None or not self.period_ns or not self._waiting:
             return None, 0
         opened = self._gather(self._end_ns, self.period_ns)
         return (opened if opened.frames else None), self._owing(self._end_ns)
 
-    def finish(self) -> list[Instant]:
+    def finish(self) -> list[FrameSet]:
         """The instants of all frames that are left, at the end of a recording."""
         if self._end_ns is None:
             self._start()
@@ -126,7 +126,7 @@ class Instants:
         fastest = self._fastest_ns()
         return fastest > 0 and not 0.75 < fastest / period_ns < 1.33
 
-    def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[Instant]:
+    def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[FrameSet]:
         """Cut what is due; without frames to come, go on for `silence_ns` so that robots are known to be lost."""
         closed = []
         while self._end_ns is not None and self.period_ns and is_due(self._end_ns):
@@ -142,14 +142,14 @@ class Instants:
             self._end_ns += self.period_ns
         return closed
 
-    def _cut(self, end_ns: int, period_ns: int) -> Instant:
+    def _cut(self, end_ns: int, period_ns: int) -> FrameSet:
         instant = self._gather(end_ns, period_ns)
         self._waiting = [frame for frame in self._waiting if frame.t_ns >= end_ns]
         return instant
 
-    def _gather(self, end_ns: int, period_ns: int) -> Instant:
+    def _gather(self, end_ns: int, period_ns: int) -> FrameSet:
         frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
-        return Instant(end_ns - period_ns // 2, tuple(frames))
+        return FrameSet(end_ns - period_ns // 2, tuple(frames))
 
     def _complete(self, end_ns: int) -> bool:
         return not self._owing(end_ns)

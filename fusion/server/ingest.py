@@ -12,8 +12,8 @@ import numpy as np
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
-from fusion.model.frames import Frame
-from fusion.server.status import Health
+from fusion.model.frames import CalibratedFrame
+from fusion.server.status import ServerStatistics
 
 FAR_NS = 5_000_000_000  # a capture time so far before now is a fault
 AHEAD_NS = 200_000_000  # and one so far after now: clocks are aligned to milliseconds
@@ -31,7 +31,7 @@ class _Sender:
     seq: int = -1
 
 
-class Intake:
+class Ingest:
     """Turns messages into frames.
 
     Args:
@@ -39,11 +39,13 @@ class Intake:
         health: counts what is refused.
     """
 
-    def __init__(self, keys: Keys, health: Health) -> None:
+    def __init__(self, keys: Keys, health: ServerStatistics) -> None:
         self._keys, self._health = keys, health
         self._senders: dict[str, _Sender] = {}
 
-    def receive(self, data: bytes, key: str, received_ns: int, cameras: dict[str, Camera]) -> Frame | None:
+    def receive(
+        self, data: bytes, key: str, received_ns: int, cameras: dict[str, Camera]
+    ) -> CalibratedFrame | None:
         """The frame of a message that a placed camera sent, or None."""
         try:
             message = decode(data, Detections)
@@ -62,7 +64,7 @@ class Intake:
             return self._refuse("wrong image size")
         if not self._is_new(message):
             return self._refuse("frame that came twice")
-        frame = Frame.of(message, camera, received_ns)
+        frame = CalibratedFrame.of(message, camera, received_ns)
         return replace(frame, roundels=_plausible(frame.roundels))
 
     def _refuse(self, reason: str) -> None:

@@ -12,7 +12,7 @@ log = logging.getLogger("fusion")
 T = TypeVar("T")
 
 
-class Kept(Generic[T]):
+class PersistedFile(Generic[T]):
     """A file that the server writes; faults with it are told and never fatal.
 
     Args:

@@ -22,7 +22,7 @@ from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of
-from fusion.model.frames import Instant
+from fusion.model.frames import FrameSet
 from fusion.model.robots import changed, load_kept_robots, load_robots, save_robots
 from fusion.protocol.messages import (
     Latency,
@@ -30,19 +30,19 @@ from fusion.protocol.messages import (
     Robots,
     RobotsRequest,
     ShardPoses,
-    State,
+    TrackingState,
     robots_key,
     shard_key,
     undo_key,
 )
 from fusion.protocol.shards import Shard
-from fusion.server.active_rig import Calibration
+from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
-from fusion.server.frame_synchronizer import Instants
-from fusion.server.ingest import FAR_NS, Intake
-from fusion.server.persistence import Kept
-from fusion.server.status import Health
-from fusion.server.transport import Link, open_session
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.ingest import FAR_NS, Ingest
+from fusion.server.persistence import PersistedFile
+from fusion.server.status import ServerStatistics
+from fusion.server.transport import Transport, open_session
 from fusion.tracking.result import Move, latency_of
 from fusion.tracking.tracker import Tracker
 
@@ -66,13 +66,13 @@ class Server:
         self.shard = Shard.parse(config.shard)
         self._own_key = shard_key(config.arena, self.shard.index)
         given = Path(config.robots)
-        self._kept_robots = Kept("robots", config.kept_robots, load_kept_robots, save_robots)
+        self._kept_robots = PersistedFile("robots", config.kept_robots, load_kept_robots, save_robots)
         kept = self._kept_robots.newer_than(given)
         self.robots = load_robots(given) if kept is None else kept
-        self.health = Health(config.limits.lateness_ms)
-        self._intake = Intake(self.keys, self.health)
-        kept_rig = Kept("rig", config.kept_rig, load_rig, save_rig)
-        self.calibration = Calibration(Path(config.rig) if config.rig else None, kept_rig)
+        self.health = ServerStatistics(config.limits.lateness_ms)
+        self._intake = Ingest(self.keys, self.health)
+        kept_rig = PersistedFile("rig", config.kept_rig, load_rig, save_rig)
+        self.calibration = ActiveRig(Path(config.rig) if config.rig else None, kept_rig)
         self._tracker: Tracker | None = None
         self._now_ns = 0
         self._start()
@@ -82,7 +82,7 @@ class Server:
     def __enter__(self) -> "Server":
         with self._closing as stack:
             self.session = stack.enter_context(open_session(self.config, self.shard))
-            self.link = Link(self.session, self.health.count, stack)
+            self.link = Transport(self.session, self.health.count, stack)
             self._declare()
             self._closing = stack.pop_all()
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
@@ -180,7 +180,9 @@ class Server:
         placed = self._cameras()
         self._tracker = Tracker(placed, self.robots, self.config.limits, self.shard) if placed else None
         rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
-        self._instants = Instants(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
+        self._instants = FrameSynchronizer(
+            round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6)
+        )
         if placed:
             log.info("calibration in force: %s", ", ".join(placed))
 
@@ -239,7 +241,7 @@ class Server:
         if self._tracker is not None and instant is not None:
             self._tracker.anticipate(instant, owed)
 
-    def _fuse(self, instant: Instant) -> None:
+    def _fuse(self, instant: FrameSet) -> None:
         if self._tracker is None:
             return
         try:
@@ -249,7 +251,7 @@ class Server:
             log.exception("an instant could not be solved; robots are found anew")
             self._start()
 
-    def _follow(self, tracker: Tracker, instant: Instant) -> None:
+    def _follow(self, tracker: Tracker, instant: FrameSet) -> None:
         begun_ns = time.time_ns()
         first = tracker.advance(instant)
         latency = latency_of(instant, begun_ns, time.time_ns())
@@ -263,7 +265,7 @@ class Server:
             self.link.publish(self.keys.markers, fused.markers)
         for move in tracker.inspect():
             self._tell(move)
-        states: dict[str, State] = {pose.robot: pose.state for pose in fused.poses}
+        states: dict[str, TrackingState] = {pose.robot: pose.state for pose in fused.poses}
         self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
 
     def _tell_poses(self, poses: Iterable[RobotPose], latency: Latency | None) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.protocol.messages import CameraHealth, FusionStatus, State
+from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")
@@ -36,7 +36,7 @@ class _Camera:
     squared_px: float = 0.0
 
 
-class Health:
+class ServerStatistics:
     """Counts what the server sees; `count` may be called from any thread, the rest from the server's."""
 
     def __init__(self, limit_ms: float) -> None:
@@ -46,7 +46,7 @@ class Health:
         self._faults: Counter[str] = Counter()
         self._cameras: dict[str, _Camera] = {}
         self._known: set[str] = set()  # those that the rig placed
-        self._robots: dict[str, State] = {}
+        self._robots: dict[str, TrackingState] = {}
         self._latencies: list[float] = []
         self._instants = 0
         self._since_ns = 0
@@ -93,7 +93,7 @@ class Health:
             camera.late = False
 
     def fused(
-        self, cameras: dict[str, CameraUse], robots: dict[str, State], latency_ms: float | None
+        self, cameras: dict[str, CameraUse], robots: dict[str, TrackingState], latency_ms: float | None
     ) -> None:
         """Note an instant."""
         self._instants += 1

@@ -33,7 +33,7 @@ def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
     return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config)
 
 
-class Link:
+class Transport:
     """Of an open session.
 
     Args:

@@ -9,21 +9,19 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion.model.camera_array import Optics
-from fusion.model.observations import Catalogue, Matches, Observations, Sightings
+from camera_node.arrays import Array, Index, Mask
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import POSITION, States
-from fusion.protocol.messages import State
+from fusion.protocol.messages import TrackingState
 from fusion.protocol.shards import Shard
 from fusion.tracking.constellation import Fit, fits_size, identify
 from fusion.tracking.estimator import Estimator, mean_of_bodies, misfit
 from fusion.tracking.multiview import Marker, group
 from fusion.tracking.normals import find_normal, rotation_to
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 BIRTH = (0.2, 0.05, 4.0, 1.5)  # sigmas of a robot just found: rad, m, rad/s, m/s
 BIRTH_SINGLE = (0.3, 0.05, 10.0, 1.5)
 BIRTH_S = 1e-3  # the motion model needs a time to act over, however short
@@ -40,13 +38,13 @@ BODIES = 12  # constellations that are looked for in one instant; the others' tu
 class Followed(Protocol):
     """What a search needs of a tracker."""
 
-    optics: Optics
-    catalogue: Catalogue
+    optics: CameraArray
+    catalogue: MarkerTable
     robots: list[Robot]
     estimator: Estimator
     states: States
-    status: list[State | None]
-    owned: NDArray[np.bool_]
+    status: list[TrackingState | None]
+    owned: Mask
     shard: Shard
 
     def adopt(self, rows: Index, states: States) -> None: ...
@@ -59,7 +57,7 @@ class _Birth:
     robot: int
     R: Array
     p: Array
-    matches: Matches
+    matches: Assignments
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,19 +65,21 @@ class _Trial:
     """Births refined, row by row: where they are then, and of each observation the match and the squared misfit."""
 
     states: States
-    observations: Observations
-    matches: Matches
+    observations: MatchedObservations
+    matches: Assignments
     misfit: Array
 
 
-class Search:
+class Acquisition:
     """Looks for a tracker's missing robots."""
 
     def __init__(self, tracker: Followed) -> None:
         self.tracker = tracker
         self._turn = 0
 
-    def find(self, missing: Index, sightings: Sightings, matches: Matches) -> tuple[Matches, list[Marker]]:
+    def find(
+        self, missing: Index, sightings: DetectionTable, matches: Assignments
+    ) -> tuple[Assignments, list[Marker]]:
         """The matches with those of the robots found, and the markers that stay nobody's: these tells the leader."""
         if not len(missing) and not self.tracker.shard.leads:
             return matches, []
@@ -92,7 +92,7 @@ class Search:
             matches, markers = self._find_singles(singles, markers, sightings, matches)
         return matches, markers
 
-    def _find_bodies(self, missing: Index, sightings: Sightings, matches: Matches) -> Matches:
+    def _find_bodies(self, missing: Index, sightings: DetectionTable, matches: Assignments) -> Assignments:
         """The matches with those of the constellations found, whose markers may have passed for single ones."""
         matches, aside = self._without_singles(matches)
         markers = self._group(sightings, matches)
@@ -115,8 +115,8 @@ class Search:
         return self._with_singles(matches.joined(self._bear(births, sightings, BIRTH)), aside)
 
     def _find_singles(
-        self, missing: Index, markers: list[Marker], sightings: Sightings, matches: Matches
-    ) -> tuple[Matches, list[Marker]]:
+        self, missing: Index, markers: list[Marker], sightings: DetectionTable, matches: Assignments
+    ) -> tuple[Assignments, list[Marker]]:
         births = []
         pairs = self._pair_singles(missing.tolist(), markers)
         for robot, marker in pairs:
@@ -129,7 +129,7 @@ class Search:
         taken = set(born.sighting.tolist())
         return matches.joined(born), [m for m in markers if not taken.intersection(m.sightings.tolist())]
 
-    def _group(self, sightings: Sightings, matches: Matches) -> list[Marker]:
+    def _group(self, sightings: DetectionTable, matches: Assignments) -> list[Marker]:
         """Markers out of the detections that nothing claims."""
         free = np.ones(len(sightings), bool)
         free[matches.sighting] = False
@@ -142,17 +142,17 @@ class Search:
             else []
         )
 
-    def _claim(self, robot: int, numbers: tuple[int, ...], markers: list[Marker]) -> Matches:
+    def _claim(self, robot: int, numbers: tuple[int, ...], markers: list[Marker]) -> Assignments:
         """These markers' sightings are of the robot's markers `numbers`."""
         discs = self.tracker.catalogue.first[robot] + np.array(numbers, np.intp)
         counts = [len(marker.sightings) for marker in markers]
-        return Matches.of(np.concatenate([m.sightings for m in markers]), np.repeat(discs, counts))
+        return Assignments.of(np.concatenate([m.sightings for m in markers]), np.repeat(discs, counts))
 
-    def _without_singles(self, matches: Matches) -> tuple[Matches, Matches]:
+    def _without_singles(self, matches: Assignments) -> tuple[Assignments, Assignments]:
         single = self.tracker.estimator.single[self.tracker.catalogue.robot[matches.disc]]
         return matches.select(~single), matches.select(single)
 
-    def _with_singles(self, matches: Matches, aside: Matches) -> Matches:
+    def _with_singles(self, matches: Assignments, aside: Assignments) -> Assignments:
         """Give back what robots of one marker had, except what a constellation proved to be its own."""
         stolen = np.isin(aside.sighting, matches.sighting)
         robbed = np.unique(aside.disc[stolen])
@@ -192,22 +192,24 @@ class Search:
         error = p - place
         return float(error @ np.linalg.solve(own + covariance, error))
 
-    def _bear(self, births: list[_Birth], sightings: Sightings, sigmas: tuple) -> Matches:
+    def _bear(self, births: list[_Birth], sightings: DetectionTable, sigmas: tuple) -> Assignments:
         """Start robots at these poses, refined by their observations; the matches of those that agree."""
         if not births:
-            return Matches.none()
+            return Assignments.none()
         trial = self._refine(births, sightings, sigmas)
         body = trial.observations.discs.body
         good = mean_of_bodies(trial.misfit, body, len(births)) < MAX_CHI2
         self.tracker.adopt(np.array([birth.robot for birth in births])[good], trial.states.select(good))
         return trial.matches.select(good[body])
 
-    def _refine(self, births: list[_Birth], sightings: Sightings, sigmas: tuple) -> "_Trial":
+    def _refine(self, births: list[_Birth], sightings: DetectionTable, sigmas: tuple) -> "_Trial":
         """Each birth by itself, its robot's body and speed by its observations."""
         at = States.at_rest(np.array([b.R for b in births]), np.array([b.p for b in births]), sigmas)
         parts = [birth.matches for birth in births]
-        matches = Matches(*(np.concatenate([getattr(m, k) for m in parts]) for k in Matches.__slots__))
-        observations = Observations.of(matches, sightings, self.tracker.catalogue)
+        matches = Assignments(
+            *(np.concatenate([getattr(m, k) for m in parts]) for k in Assignments.__slots__)
+        )
+        observations = MatchedObservations.of(matches, sightings, self.tracker.catalogue)
         body = np.repeat(np.arange(len(births)), [len(part) for part in parts])
         observations = replace(observations, discs=replace(observations.discs, body=body))
         estimator = self.tracker.estimator.select(np.array([birth.robot for birth in births]))

@@ -11,17 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from camera_node.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Catalogue, Matches, Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
 MOST = 1 << 32  # detections: more than any frame has
 TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
@@ -31,7 +29,7 @@ TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
 class _Part:
     """Frames that were matched at once: of each match the row of its frame, that of the detection there, the disc."""
 
-    frames: tuple[Frame, ...]
+    frames: tuple[CalibratedFrame, ...]
     frame: Index
     row: Index
     disc: Index
@@ -51,15 +49,15 @@ class Association:
         states: the robots as predicted at `t_ns`.
         active: (N,) those whose markers are looked for.
         t_ns: the instant.
-        floor_px: see `Sightings.of`.
+        floor_px: see `DetectionTable.of`.
     """
 
     def __init__(
         self,
-        optics: Optics,
-        catalogue: Catalogue,
+        optics: CameraArray,
+        catalogue: MarkerTable,
         states: States,
-        active: NDArray[np.bool_],
+        active: Mask,
         t_ns: int,
         floor_px: float,
     ) -> None:
@@ -71,32 +69,32 @@ class Association:
         self._parts: list[_Part] = []
         self._done: set[int] = set()  # the frames' id(): what is in a part lives on
 
-    def missing(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    def missing(self, frames: Sequence[CalibratedFrame]) -> tuple[CalibratedFrame, ...]:
         """Those of the frames that are not matched yet."""
         return tuple(frame for frame in frames if id(frame) not in self._done)
 
-    def add(self, frames: Sequence[Frame]) -> None:
+    def add(self, frames: Sequence[CalibratedFrame]) -> None:
         """Match those of the frames that are not matched yet, all at once."""
         new = self.missing(frames)
         if new:
-            sightings = Sightings.of(Instant(self._t_ns, new), self._optics, self._floor_px)
+            sightings = DetectionTable.of(FrameSet(self._t_ns, new), self._optics, self._floor_px)
             sighting, disc = self._match(sightings)
             frame = sightings.frame[sighting]
             self._parts.append(_Part(new, frame, sighting - _first_rows(new)[frame], disc))
             self._done.update(map(id, new))
 
-    def whole(self, instant: Instant) -> tuple[Sightings, Matches]:
+    def whole(self, instant: FrameSet) -> tuple[DetectionTable, Assignments]:
         """All detections of the instant, and what they are matched to, in order of the detections."""
         self.add(instant.frames)
-        sightings = Sightings.of(instant, self._optics, self._floor_px)
+        sightings = DetectionTable.of(instant, self._optics, self._floor_px)
         first = dict(zip(map(id, instant.frames), _first_rows(instant.frames).tolist(), strict=True))
         rows = [part.rows(first) for part in self._parts]
         sighting = np.concatenate([np.empty(0, np.intp), *rows])
         disc = np.concatenate([np.empty(0, np.intp), *(part.disc for part in self._parts)])
         order = np.argsort(sighting)[np.count_nonzero(sighting < 0) :]
-        return sightings, Matches.of(sighting[order], disc[order])
+        return sightings, Assignments.of(sighting[order], disc[order])
 
-    def _match(self, sightings: Sightings) -> tuple[Index, Index]:
+    def _match(self, sightings: DetectionTable) -> tuple[Index, Index]:
         """Rows of the sightings and of the catalogue."""
         exposures = sightings.exposures
         pairs, cost = self._expected.candidates(
@@ -112,7 +110,7 @@ class Association:
         return sighting, self._markers[marker]
 
 
-def _first_rows(frames: Sequence[Frame]) -> Index:
+def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:
     """Where each frame's detections begin, of all of them one after the other."""
     return np.cumsum([0, *(len(frame.roundels) for frame in frames)])[:-1]
 

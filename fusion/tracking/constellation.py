@@ -5,12 +5,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index
 from fusion.model.robots import Robot, align, distances
 from fusion.tracking.multiview import DIAMETER_TOLERANCE, Marker
 
-Array = NDArray[np.float64]
 SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand
 CLEARLY = 9.0  # by how much the runner-up's chi-square must be worse
@@ -159,7 +158,7 @@ def _longest(mappings: list[dict[int, int]]) -> list[dict[int, int]]:
     return longest
 
 
-def _search(robot: Robot, scene: _Scene, usable: NDArray[np.intp]) -> list[dict[int, int]]:
+def _search(robot: Robot, scene: _Scene, usable: Index) -> list[dict[int, int]]:
     """Mappings of three or more of the robot's markers to points, all distances within the tolerance.
 
     Breadth first: a row of `table` is one way to place the robot's first markers, -1 for one that is not seen. None

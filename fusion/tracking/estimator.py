@@ -15,13 +15,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import Optics
-from fusion.model.observations import Observations
-from fusion.model.states import Motion, States, forget_turn, predict
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import MatchedObservations
+from fusion.model.states import States, Transition, forget_turn, predict
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 ITERATIONS = 8  # at the most
 SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
 STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
@@ -37,7 +36,7 @@ class Prediction:
 
     states: States
     information: Array
-    motion: Motion
+    motion: Transition
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +62,7 @@ class Estimator:
         single: (N,) robots of one marker.
     """
 
-    def __init__(self, optics: Optics, densities: Array, single: NDArray[np.bool_]) -> None:
+    def __init__(self, optics: CameraArray, densities: Array, single: Mask) -> None:
         self.optics = optics
         self.densities = densities
         self.single = single
@@ -76,7 +75,7 @@ class Estimator:
         return Prediction(moved, _core.inverses(moved.P), motion)
 
     def update(
-        self, prediction: Prediction, observations: Observations, small: float = SMALL
+        self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL
     ) -> tuple[States, Array]:
         """Fuse an instant's observations; robots without any stay as predicted.
 
@@ -108,7 +107,7 @@ class Estimator:
 
     def _solve(
         self,
-        observations: Observations,
+        observations: MatchedObservations,
         shaped: Index,
         seen: Index,
         prior: Array,
@@ -132,7 +131,7 @@ class Estimator:
         """The estimator of some of the robots."""
         return Estimator(self.optics, self.densities[rows], self.single[rows])
 
-    def _loosened(self, states: States, observations: Observations) -> Observations:
+    def _loosened(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Late detections, their noise grown by what the body may have done since.
 
         Within `STEADY_S` of the instant a velocity is taken as constant; over longer times white acceleration of
@@ -149,9 +148,9 @@ class Estimator:
         scale = observations.seen.scale
         moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_turn * arm2) * late**3 / 3 / z**2)
         seen = replace(observations.seen, cov=observations.seen.cov + moved)
-        return Observations.seeing(seen, observations.discs)
+        return MatchedObservations.seeing(seen, observations.discs)
 
-    def _linearise(self, states: States, observations: Observations, shaped: Index) -> Array:
+    def _linearise(self, states: States, observations: MatchedObservations, shaped: Index) -> Array:
         """(N + S, 2, 13) rows of the observations, then of the S outlines `shaped`; see `_core.Poses.linearise`."""
         seen = observations.seen
         poses = self.optics.pose(states, seen.exposures)
@@ -165,7 +164,7 @@ class Estimator:
         return np.concatenate([rows, poses.linearise_outlines(*discs.columns, *of_outline)])
 
 
-def misfit(observations: Observations, remainder: Array, slack_px: float) -> Array:
+def misfit(observations: MatchedObservations, remainder: Array, slack_px: float) -> Array:
     """(N,) squared errors of observations in standard deviations, to which `slack_px` is added; inf if unseen."""
     cov = observations.seen.cov
     d2 = np.sum(remainder**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + slack_px**2)
@@ -186,7 +185,7 @@ def _eliminate(information: Array, right: Array) -> Array:
     return graph.eliminateSequential(ordering).optimize().vector().reshape(-1, 12)
 
 
-def _in_pixels(observations: Observations, whitened: Array) -> Array:
+def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:
     """(2, N) of whitened remainders of the observations, which come first (2, N...)."""
     x, y = whitened[:, : len(observations)]
     cov = observations.seen.cov
@@ -196,7 +195,7 @@ def _in_pixels(observations: Observations, whitened: Array) -> Array:
     return np.where(np.isfinite(observations.whiten[0, 0]), error, np.nan)
 
 
-def _shaped(observations: Observations) -> Index:
+def _shaped(observations: MatchedObservations) -> Index:
     """Rows of outlines of bodies of which fewer than three markers are seen: their shapes are needed."""
     discs = observations.discs
     body = np.full(np.max(discs.row, initial=0) + 1, -1)

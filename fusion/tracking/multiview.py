@@ -15,17 +15,15 @@ from itertools import pairwise
 from math import isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from camera_node.arrays import Array, Index, Mask
 from fusion._core import densest_ranges
-from fusion.model.camera_array import Optics
-from fusion.model.observations import Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import DetectionTable
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 SPEED_M_S = 2.0  # of the fastest marker that is looked for
 SIGMAS = 3.5
 SLACK_PX = 0.5  # what a calibration may be off, and an outline's centre from the disc's
@@ -61,7 +59,7 @@ class _Rays:
     camera: Index
 
 
-def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -> list[Marker]:
+def group(optics: CameraArray, sightings: DetectionTable, rows: Index, diameters: Array) -> list[Marker]:
     """Markers that two or more cameras saw, as one grouping in which no detection is of two markers.
 
     Args:
@@ -83,7 +81,7 @@ def group(optics: Optics, sightings: Sightings, rows: Index, diameters: Array) -
     return _markers(rays, owner, centres, rows)
 
 
-def _cast(optics: Optics, sightings: Sightings, rows: Index) -> _Rays:
+def _cast(optics: CameraArray, sightings: DetectionTable, rows: Index) -> _Rays:
     seen = sightings.select(rows)
     camera, d = seen.camera, optics.rays(seen.camera, seen.xy)
     noise = np.sqrt((seen.cov[0, 0] + seen.cov[1, 1]) / 2 + SLACK_PX**2)
@@ -93,7 +91,9 @@ def _cast(optics: Optics, sightings: Sightings, rows: Index) -> _Rays:
     return _Rays(optics.centres[camera], d, noise * depth / focal, size, seen.tau, seen.frame, camera)
 
 
-def _agree(optics: Optics, sightings: Sightings, rays: _Rays, diameters: Array) -> tuple[Index, Array]:
+def _agree(
+    optics: CameraArray, sightings: DetectionTable, rays: _Rays, diameters: Array
+) -> tuple[Index, Array]:
     """The rays that meet others, and the point (K, 3) of each at the range on which most of these agree."""
     exposures = sightings.exposures
     frames = exposures.camera, optics.centres, SPEED_M_S * exposures.tau
@@ -149,7 +149,7 @@ def _number(rays: _Rays, owner: Index, n: int) -> Index:
     return np.where(kept, np.cumsum(kept) - 1, -1)
 
 
-def _crowded(rays: _Rays) -> NDArray[np.bool_]:
+def _crowded(rays: _Rays) -> Mask:
     """(N,) rays so near another of their frame that noise may have exchanged them."""
     reach = 2 * SIGMAS * rays.sigma
     near = KDTree(rays.d + rays.frame[:, None] * 10.0).query_pairs(float(reach.max()), output_type="ndarray")

@@ -2,22 +2,23 @@
 """Which way a single marker faces: the normal that explains the outlines of all views at once."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.sphere import fibonacci_sphere
 from fusion import _core
-from fusion.model.camera_array import Optics
-from fusion.model.observations import Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import DetectionTable
 from fusion.tracking.estimator import AXIS_SIGMA_PX
 from fusion.tracking.multiview import Marker
 
-Array = NDArray[np.float64]
 DIRECTIONS = 600  # over the sphere, about 9 degrees apart: the estimator does the rest
 CLEARLY = 9.0  # chi-square by which a normal elsewhere must be worse
 ELSEWHERE = np.cos(np.radians(40))
 
 
-def find_normal(optics: Optics, sightings: Sightings, marker: Marker, radius: float) -> Array | None:
+def find_normal(
+    optics: CameraArray, sightings: DetectionTable, marker: Marker, radius: float
+) -> Array | None:
     """The unit normal (3,) in the world, or None where the views do not settle it."""
     seen = sightings.select(marker.sightings)
     seen = seen.select(np.flatnonzero(np.isfinite(seen.axes_px[0])))

@@ -10,30 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.pose import wxyz_of
 from fusion._core import ExpectedMarkers
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Instant
-from fusion.model.observations import Catalogue, Matches, Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import FrameSet
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
-from fusion.protocol.messages import Latency, Markers, RobotPose, State
+from fusion.protocol.messages import Latency, Markers, RobotPose, TrackingState
 from fusion.protocol.shards import Shard
 from fusion.tracking.multiview import Marker
-from fusion.tracking.unlabeled import Free
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from fusion.tracking.unlabeled import UnlabeledMarkers
 
 
 class Told(Protocol):
     """What a report needs of a tracker: its robots' names, states and status, and what they are seen by."""
 
     names: tuple[str, ...]
-    optics: Optics
-    catalogue: Catalogue
+    optics: CameraArray
+    catalogue: MarkerTable
     states: States
-    status: list[State | None]
-    owned: NDArray[np.bool_]  # robots whose poses are told
+    status: list[TrackingState | None]
+    owned: Mask  # robots whose poses are told
     shard: Shard
 
 
@@ -68,19 +66,19 @@ class Fused:
 class Seen:
     """What was used of every robot: by robot and camera (B, C), by marker of the catalogue and camera (K, C)."""
 
-    by_robot: NDArray[np.bool_]
-    by_marker: NDArray[np.bool_]
+    by_robot: Mask
+    by_marker: Mask
     n_markers: Index  # (B,)
     residual_px: Array  # (B,) RMS, NaN without observations
 
 
 def report(
     tracker: Told,
-    instant: Instant,
-    sightings: Sightings,
-    matches: Matches,
+    instant: FrameSet,
+    sightings: DetectionTable,
+    matches: Assignments,
     seen: Seen,
-    free: Free,
+    free: UnlabeledMarkers,
     told: dict[int, RobotPose],
 ) -> Fused:
     """What to tell of an instant after its observations; the poses in `told`, by robot, stay as they were told.
@@ -94,7 +92,7 @@ def report(
     return Fused(instant.t_ns, tuple(poses[k] for k in sorted(poses)), markers, usage)
 
 
-def latency_of(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
+def latency_of(instant: FrameSet, begun_ns: int, done_ns: int) -> Latency | None:
     """Where the time went since the newest exposure; None for an instant without frames."""
     newest = max(instant.frames, key=lambda frame: frame.t_ns, default=None)
     if newest is None:
@@ -111,7 +109,7 @@ def latency_of(instant: Instant, begun_ns: int, done_ns: int) -> Latency | None:
     )
 
 
-def look(tracker: Told, sightings: Sightings, matches: Matches) -> Seen:
+def look(tracker: Told, sightings: DetectionTable, matches: Assignments) -> Seen:
     """See `Seen`."""
     robots, cameras = len(tracker.names), len(tracker.optics.names)
     body, camera = tracker.catalogue.robot[matches.disc], sightings.camera[matches.sighting]
@@ -170,7 +168,7 @@ def followed_places(tracker: Told) -> tuple[Array, Array]:
     return tracker.states.p[tracker.catalogue.robot[discs]] + arm, covariance
 
 
-def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
+def _markers(tracker: Told, t_ns: int, seen: Seen, free: UnlabeledMarkers) -> Markers:
     """Labelled markers where their robots put them, then those that are nobody's."""
     discs = np.flatnonzero(seen.by_marker.any(1) & tracker.shard.leads)
     states, none = tracker.states, np.full(len(free.markers), -1)
@@ -196,7 +194,7 @@ def _markers(tracker: Told, t_ns: int, seen: Seen, free: Free) -> Markers:
 
 
 def _usage(
-    tracker: Told, sightings: Sightings, matches: Matches, free: Sequence[Marker]
+    tracker: Told, sightings: DetectionTable, matches: Assignments, free: Sequence[Marker]
 ) -> dict[str, CameraUse]:
     n, camera = len(tracker.optics.names), sightings.camera
     used = np.zeros(len(sightings), bool)
@@ -207,7 +205,7 @@ def _usage(
     return {name: CameraUse(taken[k], unused[k], squares[k]) for k, name in enumerate(tracker.optics.names)}
 
 
-def _packed(seen: NDArray[np.bool_]) -> NDArray[np.uint64]:
+def _packed(seen: Mask) -> NDArray[np.uint64]:
     """(K,) the bits of (K, C)."""
     return seen[:, :64].astype(np.uint64) @ (
         np.uint64(1) << np.arange(min(seen.shape[1], 64), dtype=np.uint64)

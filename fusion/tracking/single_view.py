@@ -11,16 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index, Mask
 from camera_node.detection.disc_pose import decompose
-from fusion.model.camera_array import Optics
-from fusion.model.observations import Matches, Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import Assignments, DetectionTable
 from fusion.tracking.estimator import AXIS_SIGMA_PX
 from fusion.tracking.multiview import SPEED_M_S, Marker
 from fusion.tracking.result import Told, followed_places
-from fusion.tracking.unlabeled import Free
+from fusion.tracking.unlabeled import UnlabeledMarkers
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 CONFIRMED = 3  # instants in which a camera saw it near where it was
 FORGOTTEN_NS = 300_000_000  # without being seen
 NOISE_PX = 2.0  # of a place, from instant to instant
@@ -38,7 +37,7 @@ class _Spots:
     count: Index
 
 
-class SingleViews:
+class SingleViewTracker:
     """Follows what single cameras see.
 
     Args:
@@ -46,13 +45,20 @@ class SingleViews:
         radii: (R,) of the markers in use; one that may be of several sizes is as far as each of them says.
     """
 
-    def __init__(self, optics: Optics, radii: Array) -> None:
+    def __init__(self, optics: CameraArray, radii: Array) -> None:
         self._optics, self._radii = optics, np.unique(radii)
         self._spots = _Spots(
             np.empty(0, np.intp), np.empty((2, 0)), np.empty(0, np.int64), np.empty(0, np.intp)
         )
 
-    def complete(self, tracker: Told, t_ns: int, sightings: Sightings, matches: Matches, free: Free) -> Free:
+    def complete(
+        self,
+        tracker: Told,
+        t_ns: int,
+        sightings: DetectionTable,
+        matches: Assignments,
+        free: UnlabeledMarkers,
+    ) -> UnlabeledMarkers:
         """The markers of nobody that several cameras see, and then these; for the leading shard, which tells them."""
         if not tracker.shard.leads:
             return free
@@ -63,7 +69,9 @@ class SingleViews:
         rows = rows[self._follow(t_ns, sightings.select(rows)) >= CONFIRMED]
         return free.joined(self._tell(tracker, sightings, rows, free)) if len(rows) else free
 
-    def _tell(self, tracker: Told, sightings: Sightings, rows: Index, free: Free) -> Free:
+    def _tell(
+        self, tracker: Told, sightings: DetectionTable, rows: Index, free: UnlabeledMarkers
+    ) -> UnlabeledMarkers:
         """Those of the detections `rows` that can't be of another marker that is told, or of a robot's."""
         seen = sightings.select(rows)
         place, spread, normals = self._locate(seen)
@@ -76,9 +84,9 @@ class SingleViews:
         kept = kept[_best(place[kept], spread[kept], seen.camera[kept])]
         markers = [Marker(place[k], spread[k], rows[[k]], seen.camera[[k]], np.nan) for k in kept.tolist()]
         unknown = np.full((len(kept), 3), np.nan)
-        return Free(markers, place[kept], spread[kept], unknown, unknown, normals[kept])
+        return UnlabeledMarkers(markers, place[kept], spread[kept], unknown, unknown, normals[kept])
 
-    def _follow(self, t_ns: int, seen: Sightings) -> Index:
+    def _follow(self, t_ns: int, seen: DetectionTable) -> Index:
         """(N,) in how many instants each was there, this one included."""
         last, now = self._spots, t_ns + np.rint(seen.tau * 1e9).astype(np.int64)
         focal = self._optics.focal[seen.camera]
@@ -99,7 +107,7 @@ class SingleViews:
         )
         return count
 
-    def _locate(self, seen: Sightings) -> tuple[Array, Array, Array]:
+    def _locate(self, seen: DetectionTable) -> tuple[Array, Array, Array]:
         """Positions (N, 3), covariances (N, 3, 3) and both normals (N, 2, 3), in the world."""
         R = self._optics.R_cam_world[seen.camera].transpose(0, 2, 1)
         c, n = decompose(_conics(seen), 1.0)  # of a disc of radius 1
@@ -117,7 +125,7 @@ class SingleViews:
         return self._optics.centres[seen.camera] + mean, spread, np.einsum("nij,nkj->nki", R, n)
 
 
-def _conics(seen: Sightings) -> Array:
+def _conics(seen: DetectionTable) -> Array:
     """(N, 3, 3) Q with p^T Q p = 0 for outlines' points p = (x, y, 1), undistorted: the lens taken as affine there."""
     c, s = np.cos(seen.angle_rad), np.sin(seen.angle_rad)
     axes = np.array([[c, -s], [s, c]]) * seen.axes_px / 2  # half axes, pixels
@@ -129,7 +137,7 @@ def _conics(seen: Sightings) -> Array:
     return -np.asarray(np.linalg.inv(dual), float)
 
 
-def _may_be(place: Array, spread: Array, position: Array, covariance: Array) -> NDArray[np.bool_]:
+def _may_be(place: Array, spread: Array, position: Array, covariance: Array) -> Mask:
     """(N, K) whether places and positions are the same, by their covariances."""
     off = place[:, None] - position
     near = np.einsum("nki,nki->nk", off, off) < REACH * (

@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import log_so3, wxyz_of
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Tracker
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +28,7 @@ class _Step:
     fused: Fused
     states: States
     prediction: Prediction
-    followed: NDArray[np.bool_]
+    followed: Mask
 
 
 class Smoother:
@@ -77,7 +75,7 @@ class Smoother:
         return replace(fused, poses=poses)
 
 
-def _smooth(states: States, prediction: Prediction, after: States, followed: NDArray[np.bool_]) -> States:
+def _smooth(states: States, prediction: Prediction, after: States, followed: Mask) -> States:
     """The states of an instant, by those `after` it; robots that the prediction is not of stay as they are."""
     rows = np.flatnonzero(followed)
     if not len(rows):

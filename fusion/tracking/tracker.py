@@ -5,27 +5,26 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Instant
-from fusion.model.observations import Catalogue, Matches, Observations, Sightings
+from camera_node.arrays import Index, Mask
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import FrameSet
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import POSITION, THETA, States
-from fusion.monitoring.extrinsics_monitor import Watch
-from fusion.monitoring.geometry_check import Shapes
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsMonitor
+from fusion.monitoring.geometry_check import GeometryCheck
 from fusion.monitoring.inspection import Inspection
-from fusion.protocol.messages import RobotPose, ShardPoses, State
+from fusion.protocol.messages import RobotPose, ShardPoses, TrackingState
 from fusion.protocol.shards import Shard, states_of, told_of
-from fusion.tracking.acquisition import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Search
+from fusion.tracking.acquisition import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.tracking.result import Fused, Move, Seen, look, report, tell_poses
-from fusion.tracking.single_view import SingleViews
-from fusion.tracking.unlabeled import Loose
+from fusion.tracking.single_view import SingleViewTracker
+from fusion.tracking.unlabeled import UnlabeledTracker
 
-Array = NDArray[np.float64]
 MAX_COAST_S = 30.0  # a covariance needs to grow no longer than this
 CONTRADICTED = 0.5  # share of a robot's detections that miss it: more, and they are not its own
 FOLLOWED_M = 0.1  # of a position's standard deviation: one predicted worse is searched for by its shape
@@ -48,7 +47,7 @@ class _Begun:
 
     t_ns: int
     prediction: Prediction
-    followed: NDArray[np.bool_]
+    followed: Mask
     association: Association
 
 
@@ -69,38 +68,38 @@ class Tracker:
         limits: Limits | None = None,
         shard: Shard = Shard(),  # noqa: B008 frozen
     ) -> None:
-        self.optics = Optics(cameras)
+        self.optics = CameraArray(cameras)
         self.names, self.robots = tuple(robots), list(robots.values())
         self._row = {name: k for k, name in enumerate(robots)}
         self.limits, self.shard = limits or Limits(), shard
         self.owned = np.array([shard.owns(name) for name in self.names], bool)
-        self.catalogue = Catalogue.of(self.robots)
+        self.catalogue = MarkerTable.of(self.robots)
         single = np.array([robot.is_single for robot in self.robots])
         densities = np.array([robot.densities for robot in self.robots])
         self.estimator = Estimator(self.optics, densities, single)
         n = len(self.robots)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), BIRTH)
-        self.status: list[State | None] = [None] * n  # None before a robot was ever found
-        self.search = Search(self)
-        self.loose = Loose(self.optics, self.catalogue.radius)
-        self.single_views = SingleViews(self.optics, self.catalogue.radius)
-        self.watch = Watch()
-        self.shapes = Shapes(self.names, single)
+        self.status: list[TrackingState | None] = [None] * n  # None before a robot was ever found
+        self.search = Acquisition(self)
+        self.loose = UnlabeledTracker(self.optics, self.catalogue.radius)
+        self.single_views = SingleViewTracker(self.optics, self.catalogue.radius)
+        self.watch = ExtrinsicsMonitor()
+        self.shapes = GeometryCheck(self.names, single)
         self._inspection = Inspection(self)
-        self._last: tuple[Instant, Sightings, Matches, Seen] | None = None
-        self.predicted: tuple[Prediction, NDArray[np.bool_]]  # of the last instant, and of which robots it is
+        self._last: tuple[FrameSet, DetectionTable, Assignments, Seen] | None = None
+        self.predicted: tuple[Prediction, Mask]  # of the last instant, and of which robots it is
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
         self._t_ns: int | None = None
         self._begun: _Begun | None = None  # the instant that comes next
         self._told: dict[int, RobotPose] = {}  # of the last instant, before it was complete
         self._others: list[ShardPoses] = []  # of other shards, since the last instant was begun
 
-    def fuse(self, instant: Instant) -> Fused:
+    def fuse(self, instant: FrameSet) -> Fused:
         """Follow the robots into this instant, and look for those that are not tracked."""
         self.advance(instant)
         return self.complete()
 
-    def anticipate(self, instant: Instant, owed: int) -> None:
+    def anticipate(self, instant: FrameSet, owed: int) -> None:
         """Do what can be done of an instant of which `owed` frames are still to come.
 
         A round costs as much as some frames: one waits for more frames than are then left, of eight for five, then two.
@@ -109,7 +108,7 @@ class Tracker:
         if len(association.missing(trusted.frames)) > owed > 0:
             association.add(trusted.frames)
 
-    def advance(self, instant: Instant) -> tuple[RobotPose, ...]:
+    def advance(self, instant: FrameSet) -> tuple[RobotPose, ...]:
         """Follow the robots into this instant; the poses that no search can change any more."""
         begun = self._begin(instant.t_ns)
         self._begun, self._t_ns = None, instant.t_ns
@@ -183,13 +182,13 @@ class Tracker:
             self._begun = _Begun(t_ns, prediction, followed, association)
         return self._begun
 
-    def _trusted(self, instant: Instant) -> Instant:
+    def _trusted(self, instant: FrameSet) -> FrameSet:
         """The instant without the frames of cameras that are set aside."""
         if not self.watch.bumped:
             return instant
-        return Instant(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
+        return FrameSet(instant.t_ns, tuple(f for f in instant.frames if f.camera not in self.watch.bumped))
 
-    def _misses_bodies(self, followed: NDArray[np.bool_]) -> bool:
+    def _misses_bodies(self, followed: Mask) -> bool:
         """Whether constellations are looked for, which may prove that a single robot's marker is their own."""
         return bool((~followed & ~self.estimator.single).any())
 
@@ -197,7 +196,7 @@ class Tracker:
         dt = BIRTH_S if self._t_ns is None else max((t_ns - self._t_ns) * 1e-9, BIRTH_S)
         return self.estimator.predict(self.states, np.full(len(self.robots), min(dt, MAX_COAST_S)))
 
-    def _followed(self, states: States) -> NDArray[np.bool_]:
+    def _followed(self, states: States) -> Mask:
         """(N,) robots that are where they are predicted to be, near enough to name their markers by it.
 
         One that was seen just now is, in the camera that saw it, however badly its range is known.
@@ -207,7 +206,7 @@ class Tracker:
         turned = (turn2 > FOLLOWED_RAD**2) & ~self.estimator.single
         return alive & ((place2 < FOLLOWED_M**2) & ~turned | self._seen)
 
-    def _update(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> Matches:
+    def _update(self, prediction: Prediction, sightings: DetectionTable, matches: Assignments) -> Assignments:
         """Take what was matched; a robot that its own markers contradict stays as predicted, and has none."""
         mine = self.owned[self.catalogue.robot[matches.disc]]
         others, matches = matches.select(~mine), matches.select(mine)
@@ -219,8 +218,10 @@ class Tracker:
         self.states = states
         return matches.joined(others)
 
-    def _fit(self, prediction: Prediction, sightings: Sightings, matches: Matches) -> tuple[States, Matches]:
-        observations = Observations.of(matches, sightings, self.catalogue)
+    def _fit(
+        self, prediction: Prediction, sightings: DetectionTable, matches: Assignments
+    ) -> tuple[States, Assignments]:
+        observations = MatchedObservations.of(matches, sightings, self.catalogue)
         states, remainder = self.estimator.update(prediction, observations)
         matches = matches.remaining(remainder)
         misses = misfit(observations, remainder, SLACK_PX) > MAX_CHI2
@@ -232,8 +233,8 @@ class Tracker:
         return states, matches.select(~wrong[observations.discs.body])
 
     def _without_a_camera(
-        self, prediction: Prediction, sightings: Sightings, matches: Matches, states: States
-    ) -> tuple[States, Matches]:
+        self, prediction: Prediction, sightings: DetectionTable, matches: Assignments, states: States
+    ) -> tuple[States, Assignments]:
         """Robots by all cameras but the one that contradicts the others, if there is one."""
         for name in self.watch.suspects(self.optics.names):
             others = sightings.camera[matches.sighting] != self.optics.index[name]
@@ -245,7 +246,7 @@ class Tracker:
         self.watch.learn(matches.squared_px)
         return states, matches
 
-    def _note(self, t_ns: int, matches: Matches) -> None:
+    def _note(self, t_ns: int, matches: Assignments) -> None:
         """Keep the states' names: tracked while seen well, coasting for a while without, then lost."""
         seen = np.zeros(len(self.robots), bool)
         seen[self.catalogue.robot[matches.disc]] = True
@@ -262,7 +263,7 @@ class Tracker:
                 if silent[k]:
                     self.states.v[k] = self.states.omega[k] = 0
 
-    def _is_vague(self) -> NDArray[np.bool_]:
+    def _is_vague(self) -> Mask:
         """(N,) robots whose place is known worse than `tracked_sigma_m` along some direction."""
         place, most = self.states.P[:, POSITION, POSITION], self.limits.tracked_sigma_m**2
         vague = np.einsum("nii->n", place) > most  # or else no eigenvalue is
@@ -293,7 +294,7 @@ class Tracker:
             for k in new.tolist():
                 self.status[at[k]] = one.states[k]
 
-    def adopt(self, rows: NDArray[np.intp], states: States) -> None:
+    def adopt(self, rows: Index, states: States) -> None:
         """Robots that were found stand there from now on."""
         self.states = self.states.with_rows(rows, states)
         for k in rows:

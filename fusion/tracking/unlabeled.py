@@ -11,17 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import Discs, Optics
-from fusion.model.observations import Observations, Sightings
+from fusion.model.camera_array import CameraArray, Discs
+from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.robots import MOTIONS
-from fusion.model.states import POSITION, Motion, States, forget_turn
+from fusion.model.states import POSITION, States, Transition, forget_turn
 from fusion.tracking.estimator import Estimator, Prediction, mean_of_bodies, misfit
 from fusion.tracking.multiview import Marker
 from fusion.tracking.normals import find_normal, rotation_to
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 BIRTH = (0.3, 0.05, 10.0, 1.5)  # sigmas of a marker just seen: rad, m, rad/s, m/s
 MAX_CHI2 = 8.0  # mean squared Mahalanobis error of a marker's detections, with SLACK_PX for the calibration
 SLACK_PX = 0.7
@@ -31,7 +30,7 @@ NORMAL_RAD = 0.2  # standard deviation under which a normal is told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Free:
+class UnlabeledMarkers:
     """An instant's N markers of nobody: position, velocity and normal (N, 3), covariance (N, 3, 3) of the position.
 
     Velocity and normal are NaN where they are unknown. `candidates` (N, 2, 3) are the normals of what one camera alone
@@ -45,15 +44,15 @@ class Free:
     normal: Array
     candidates: Array
 
-    def joined(self, other: "Free") -> "Free":
+    def joined(self, other: "UnlabeledMarkers") -> "UnlabeledMarkers":
         """Both."""
         names = "position", "covariance", "velocity", "normal", "candidates"
         columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
-        return Free((*self.markers, *other.markers), **columns)
+        return UnlabeledMarkers((*self.markers, *other.markers), **columns)
 
 
 NO_ROWS, NO_PAIRS = np.empty((0, 3)), np.empty((0, 2, 3))
-NONE = Free((), NO_ROWS, np.empty((0, 3, 3)), NO_ROWS, NO_ROWS, NO_PAIRS)
+NONE = UnlabeledMarkers((), NO_ROWS, np.empty((0, 3, 3)), NO_ROWS, NO_ROWS, NO_PAIRS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +61,7 @@ class _Tracks:
 
     states: States
     radius: Array
-    clear: NDArray[np.bool_]
+    clear: Mask
     seen_ns: NDArray[np.int64]
 
     def select(self, rows: NDArray) -> "_Tracks":
@@ -76,7 +75,7 @@ class _Tracks:
         return _Tracks(states, *(np.concatenate(pair) for pair in rest))
 
 
-class Loose:
+class UnlabeledTracker:
     """Follows a rig's loose markers.
 
     Args:
@@ -84,11 +83,11 @@ class Loose:
         radii: (R,) of the markers in use, one or more.
     """
 
-    def __init__(self, optics: Optics, radii: Array) -> None:
+    def __init__(self, optics: CameraArray, radii: Array) -> None:
         self._optics, self._radii, self._t_ns = optics, np.unique(radii), 0
         self._tracks = self._born([], np.empty((0, 3)), [], 0)
 
-    def follow(self, t_ns: int, sightings: Sightings, markers: Sequence[Marker]) -> Free:
+    def follow(self, t_ns: int, sightings: DetectionTable, markers: Sequence[Marker]) -> UnlabeledMarkers:
         """The markers of an instant, followed from the last."""
         if not markers and not len(self._tracks.radius):
             return NONE
@@ -124,8 +123,8 @@ class Loose:
         return _Tracks(states, radius, clear, np.full(len(markers), t_ns))
 
     def _updated(
-        self, tracks: _Tracks, sightings: Sightings, markers: Sequence[Marker]
-    ) -> tuple[States, NDArray[np.bool_]]:
+        self, tracks: _Tracks, sightings: DetectionTable, markers: Sequence[Marker]
+    ) -> tuple[States, Mask]:
         """Where the markers are by their own detections, and which of them these agree with."""
         n = len(markers)
         if not n:
@@ -134,8 +133,8 @@ class Loose:
         body = np.repeat(np.arange(n), [len(marker.sightings) for marker in markers])
         centres = np.zeros((3, len(rows)))
         discs = Discs(sightings.frame[rows], body, body, centres, tracks.radius[body])
-        observations = Observations.seeing(sightings.select(rows), discs)
-        still = Motion(np.zeros((n, 3, 3)), np.zeros(n))
+        observations = MatchedObservations.seeing(sightings.select(rows), discs)
+        still = Transition(np.zeros((n, 3, 3)), np.zeros(n))
         prediction = Prediction(tracks.states, _core.inverses(tracks.states.P), still)
         states, rest = self._estimator(n).update(prediction, observations)
         return states, mean_of_bodies(misfit(observations, rest, SLACK_PX), body, n) < MAX_CHI2
@@ -149,7 +148,7 @@ class Loose:
             return float(self._radii[0])
         return float(self._radii[np.argmin(np.abs(self._radii - marker.diameter_m / 2))])
 
-    def _normal(self, sightings: Sightings, marker: Marker) -> Array | None:
+    def _normal(self, sightings: DetectionTable, marker: Marker) -> Array | None:
         return find_normal(self._optics, sightings, marker, self._radius(marker))
 
     def _towards(self, marker: Marker) -> Array:
@@ -171,13 +170,13 @@ def _pair(states: States, there: Array, spread: Array) -> Index:
 
 
 def _told(
-    markers: Sequence[Marker], tracks: _Tracks, good: NDArray[np.bool_], there: Array, spread: Array
-) -> Free:
+    markers: Sequence[Marker], tracks: _Tracks, good: Mask, there: Array, spread: Array
+) -> UnlabeledMarkers:
     """Of the markers that are followed what that tells, of the others where they were grouped."""
     states, known = tracks.states, good[:, None]
     tilt2 = np.einsum("nii->n", states.P[:, :2, :2]) / 2
     faces = good & tracks.clear & (tilt2 < NORMAL_RAD**2)
-    return Free(
+    return UnlabeledMarkers(
         markers,
         np.where(known, states.p, there),
         np.where(known[:, None], states.P[:, POSITION, POSITION], spread),

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
+from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations
@@ -68,7 +68,7 @@ def simulated(
     return rows, cost
 
 
-def offset_error(result: Calibration, recorded: Recorded) -> float:
+def offset_error(result: WandCalibration, recorded: Recorded) -> float:
     """RMS error of the time offsets, ms."""
     cameras = result.rig.placed()
     error = np.array(
@@ -137,7 +137,7 @@ def recording(path: Path) -> tuple[Rig, list[Detections]]:
     return rig, read_observations(path, {n: (c.width, c.height) for n, c in rig.cameras.items()})
 
 
-def corner_errors(rig: Rig, messages: list[Detections], step_s: float = 0.17) -> NDArray[np.float64]:
+def corner_errors(rig: Rig, messages: list[Detections], step_s: float = 0.17) -> Array:
     """Distances between corners that were triangulated at the same moment, less what they are; metres.
 
     Moments are the frames of every camera, once in `step_s`; the other cameras' corners are interpolated between two
@@ -173,7 +173,7 @@ def _tracks(camera: Camera, name: str, messages: list[Detections]):
     return {corner: (table[:, 0], camera.normalise(table[:, 1:])) for corner, table in tables.items()}
 
 
-def _triangulate(rig: Rig, tracks, corner: int, moment: float, gap_s: float) -> NDArray[np.float64] | None:
+def _triangulate(rig: Rig, tracks, corner: int, moment: float, gap_s: float) -> Array | None:
     centres, rays = [], []
     for name, track in tracks.items():
         if corner not in track:
@@ -189,7 +189,7 @@ def _triangulate(rig: Rig, tracks, corner: int, moment: float, gap_s: float) -> 
     return _intersect(np.array(centres), np.array(rays)) if len(rays) >= 2 else None
 
 
-def _intersect(centres: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def _intersect(centres: Array, rays: Array) -> Array:
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None]
     return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.model.frames import Instant
-from fusion.model.observations import Matches, Observations, Sightings
-from fusion.server.frame_synchronizer import Instants
+from fusion.model.frames import FrameSet
+from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Limits, Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
 
@@ -54,9 +54,9 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
     )
 
 
-def instants(load: Load, seconds: float) -> Iterator[Instant]:
+def instants(load: Load, seconds: float) -> Iterator[FrameSet]:
     """A load's whole instants, in order."""
-    gathered, first = Instants(round(1e9 / load.hz)), True
+    gathered, first = FrameSynchronizer(round(1e9 / load.hz)), True
     for frame in load.frames(seconds):
         gathered.add(frame)
         for instant in gathered.take(frame.t_ns):
@@ -74,7 +74,7 @@ class _Told:
         self._t_ns: int | None = None
         self.states = tracker.states
 
-    def fuse(self, instant: Instant) -> None:
+    def fuse(self, instant: FrameSet) -> None:
         """Predict and update."""
         tracker = self._tracker
         if self._t_ns is None:
@@ -83,11 +83,11 @@ class _Told:
         dt = 1e-3 if self._t_ns is None else (instant.t_ns - self._t_ns) * 1e-9
         self._t_ns = instant.t_ns
         prediction = tracker.estimator.predict(self.states, np.full(len(self.states), dt))
-        sightings = Sightings.of(instant, tracker.optics, LIMITS.sigma_floor_px)
+        sightings = DetectionTable.of(instant, tracker.optics, LIMITS.sigma_floor_px)
         number = np.concatenate([frame.roundels.id for frame in instant.frames])
         rows = np.flatnonzero(number >= 0)
-        matches = Matches.of(rows, number[rows].astype(np.intp))
-        observations = Observations.of(matches, sightings, tracker.catalogue)
+        matches = Assignments.of(rows, number[rows].astype(np.intp))
+        observations = MatchedObservations.of(matches, sightings, tracker.catalogue)
         self.states, _ = tracker.estimator.update(prediction, observations)
 
 

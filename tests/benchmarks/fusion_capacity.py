@@ -15,13 +15,13 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.protocol.messages import Detections, decode, encode
-from fusion.model.frames import Frame
+from fusion.model.frames import CalibratedFrame
 from fusion.protocol.messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import collecting_between_instants
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import Load
@@ -91,7 +91,7 @@ class Series:
         self._n = 0
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
+    def numbers(self) -> Array:
         return self._numbers[: self._n]
 
 
@@ -101,7 +101,7 @@ class Queue:
     def __init__(self, load: Load, seconds: float, shard: Shard = Shard()) -> None:  # noqa: B008 frozen
         self.load = load
         self.tracker = Tracker(load.rig, load.bodies, shard=shard)
-        self.instants = Instants(round(1e9 / load.hz))
+        self.instants = FrameSynchronizer(round(1e9 / load.hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
         room = math.ceil((seconds + 1) * load.hz)
         self.latencies_ms, self.tracked = Series(room), Series(room)
@@ -167,7 +167,7 @@ class Queue:
 
     def _add(self, data: bytes) -> None:
         seen = decode(data, Detections)
-        self.instants.add(Frame.of(seen, self.load.rig[seen.camera]))
+        self.instants.add(CalibratedFrame.of(seen, self.load.rig[seen.camera]))
 
     def _tell(self, poses: Sequence[RobotPose]) -> list[bytes]:
         return [encode(msgspec.structs.replace(pose, latency=LATENCY)) for pose in poses]

@@ -6,9 +6,9 @@ from collections import Counter
 
 import numpy as np
 
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Instant
-from fusion.model.observations import Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import FrameSet
+from fusion.model.observations import DetectionTable
 from fusion.tracking.multiview import group
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
 
@@ -26,8 +26,8 @@ def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: flo
     load.paths.place(scattered(points, seed))
     frames = tuple(load.frames(1 / load.hz))
     seen = Counter(int(k) for frame in frames for k in frame.roundels.id)
-    optics = Optics(load.rig)
-    sightings = Sightings.of(Instant(frames[0].t_ns, frames), optics, 0.0)
+    optics = CameraArray(load.rig)
+    sightings = DetectionTable.of(FrameSet(frames[0].t_ns, frames), optics, 0.0)
     if not sized:
         sightings.axes_px[:] = np.nan
     rows, sizes = np.arange(len(sightings)), np.array([DIAMETER_M])

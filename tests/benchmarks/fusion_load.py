@@ -12,9 +12,9 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, exp_so3, look_at
 from camera_node.protocol.messages import Detections
 from fusion.errors import FusionError
-from fusion.model.camera_array import Exposures, Optics
-from fusion.model.frames import Frame
-from fusion.model.observations import Catalogue
+from fusion.model.camera_array import CameraArray, Exposures
+from fusion.model.frames import CalibratedFrame
+from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.model.states import States
 from tests.fusion.equations import outlines
@@ -100,9 +100,9 @@ class Load:
             t_s = float(stamps[seq, camera])
             yield scene.detect(camera, seq, t_s, rng)
 
-    def frames(self, seconds: float) -> Iterator[Frame]:
+    def frames(self, seconds: float) -> Iterator[CalibratedFrame]:
         """The same, received."""
-        return (Frame.of(message, self.rig[message.camera]) for message in self.messages(seconds))
+        return (CalibratedFrame.of(message, self.rig[message.camera]) for message in self.messages(seconds))
 
 
 @dataclass(frozen=True)
@@ -136,8 +136,8 @@ class _Scene:
     """Renders detections of a load."""
 
     def __init__(self, load: Load) -> None:
-        self.load, self.optics = load, Optics(load.rig)
-        self.catalogue = Catalogue.of(list(load.bodies.values()))
+        self.load, self.optics = load, CameraArray(load.rig)
+        self.catalogue = MarkerTable.of(list(load.bodies.values()))
         rng = np.random.default_rng(load.seed + 3)
         self.clutter = np.column_stack(
             [

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.quality.agreement import Placed, compare
+from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
-
-Array = NDArray[np.float64]
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
@@ -47,7 +45,7 @@ class Arena:
         T[:3, 3] = [0.9 * np.sin(0.7 * w), 0.9 * np.cos(0.53 * w), 1.0 + 0.5 * np.sin(0.43 * w + 1)]
         return T
 
-    def see(self, name: str, t_ns: int, sized: bool = True) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    def see(self, name: str, t_ns: int, sized: bool = True) -> tuple[Array, Array, Array, Mask]:
         """Centres (M, 2), full axes (M, 2), angles (M,), and which are in the image of an eye that sees through the
         wand (both sides of a roundel are printed). Centres are those of ellipses if `sized`, else the discs' own."""
         camera = self.truth.cameras[name]
@@ -199,7 +197,7 @@ def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
     return np.asarray(shift, float), np.array([float(np.linalg.norm(turn)) for turn in turns])
 
 
-def joint_error(result: Calibration, truth: Rig) -> tuple[float, int]:
+def joint_error(result: WandCalibration, truth: Rig) -> tuple[float, int]:
     """Squared Mahalanobis error of all poses together, and its degrees of freedom: the choice of the world, which no
     covariance speaks of, is projected out, and its scale, where a distance that is exact carries it."""
     there = np.array([truth.cameras[n].matrix() for n in result.names])

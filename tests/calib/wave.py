@@ -9,17 +9,16 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
+from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import WAND, outlines
 
-Array = NDArray[np.float64]
 EPOCH_S = 1_000.0
 
 

@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

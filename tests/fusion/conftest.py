@@ -10,17 +10,17 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from fusion.model.frames import Frame
+from fusion.model.frames import CalibratedFrame
 from fusion.protocol.messages import RobotPose
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.synthetic import Arena
 
 
-def fuse(arena: Arena, frames: list[Frame], limits: Limits | None = None) -> list[Fused]:
+def fuse(arena: Arena, frames: list[CalibratedFrame], limits: Limits | None = None) -> list[Fused]:
     """All instants of the frames."""
-    tracker, instants = Tracker(arena.cameras, arena.robots, limits), Instants(33_333_333)
+    tracker, instants = Tracker(arena.cameras, arena.robots, limits), FrameSynchronizer(33_333_333)
     closed = []
     for frame in frames:
         instants.add(frame)

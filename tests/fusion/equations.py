@@ -9,22 +9,20 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.pose import exp_so3, turns
-from fusion.model.camera_array import Discs, Exposures, Optics, Views
-from fusion.model.observations import Observations, Sightings
+from fusion.model.camera_array import CameraArray, Discs, Exposures, Views
+from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.states import (
     OMEGA,
     POSITION,
     THETA,
     VELOCITY,
-    Motion,
     States,
+    Transition,
 )
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 NEAR_M = 1e-3
 CAUCHY, NOMINAL_WEIGHT, SETTLED = 4.0, 0.8983, 0.1
 STEP = 1e-4
@@ -47,7 +45,7 @@ class Poses:
         return discs.frame * self.n_bodies + discs.body
 
 
-def pose(optics: Optics, states: States, exposures: Exposures) -> Poses:
+def pose(optics: CameraArray, states: States, exposures: Exposures) -> Poses:
     """Bodies at each frame's own time."""
     tau, R_cw, B = exposures.tau[:, None], optics.R_cam_world[exposures.camera], len(states)
     R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
@@ -80,7 +78,7 @@ def view(poses: Poses, discs: Discs) -> Views:
 
 
 def derive(
-    optics: Optics, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
+    optics: CameraArray, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
 ) -> Array:
     """(2, 12, N) of the outline's centre, times `whiten` (2, 2, N), by the error of the disc's body.
 
@@ -162,7 +160,9 @@ def _take(A: Array, columns: Index) -> Array:
     return np.take(A, columns, axis=-1)
 
 
-def shape_rows(poses: Poses, discs: Discs, views: Views, observations: Observations, sigma: Array) -> Array:
+def shape_rows(
+    poses: Poses, discs: Discs, views: Views, observations: MatchedObservations, sigma: Array
+) -> Array:
     """(N, 2, 13) equations of outlines, by difference quotients of their shears."""
     seen = observations.seen
     R = poses.R_cam[..., poses.columns(discs)]
@@ -204,7 +204,7 @@ def _settled(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], w
 
 
 def candidates(
-    optics: Optics, states: States, seen: Sightings, discs: Discs, covariance: Array
+    optics: CameraArray, states: States, seen: DetectionTable, discs: Discs, covariance: Array
 ) -> dict[tuple[int, int], float]:
     """Costs by disc and sighting of one frame, within the gates; `covariance` (N, 3, 3) of the discs' places."""
     views = view(pose(optics, states, seen.exposures), discs)
@@ -229,12 +229,12 @@ def candidates(
     return found
 
 
-def predict(states: States, dt: Array, densities: Array, single: NDArray[np.bool_]) -> tuple[States, Motion]:
+def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[States, Transition]:
     """See `fusion.model.states.predict`."""
     half = exp_so3(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
     turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
-    motion = Motion(turn, dt)
+    motion = Transition(turn, dt)
     P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
     moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
     return moved, motion

@@ -10,9 +10,9 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Frame
-from fusion.model.observations import Catalogue
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import CalibratedFrame
+from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot
 from tests.fusion.equations import outlines
 
@@ -64,7 +64,7 @@ class Arena:
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
 
-    def frames(self, n: int) -> list[Frame]:
+    def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
         rng = np.random.default_rng(self.seed)
         times = sorted(
@@ -73,7 +73,9 @@ class Arena:
             for k in range(n)
         )
         return [
-            Frame.measure(name, t_ns, self._detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name])
+            CalibratedFrame.measure(
+                name, t_ns, self._detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name]
+            )
             for t_ns, name in times
         ]
 
@@ -94,8 +96,8 @@ class Arena:
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
 
     def _detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
-        optics = Optics({name: self.cameras[name]})
-        catalogue = Catalogue.of(list(self.robots.values()))
+        optics = CameraArray({name: self.cameras[name]})
+        catalogue = MarkerTable.of(list(self.robots.values()))
         seen = [
             k
             for k, (r, m) in enumerate(zip(catalogue.robot, catalogue.number, strict=True))
@@ -107,7 +109,7 @@ class Arena:
         centre = p + np.einsum("nij,jn->ni", R, catalogue.marker[:, seen])
         return self._roundels(optics, centre, R[:, :, 2], catalogue.radius[seen], rng)
 
-    def _roundels(self, optics: Optics, centre, normal, radius, rng: np.random.Generator) -> Roundels:
+    def _roundels(self, optics: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
         """Outlines from sampled circles, an ellipse fitted by moments of its undistorted conic: independent of
         the model under test in its centre."""
         camera = optics.cameras[0]

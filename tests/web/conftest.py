@@ -15,7 +15,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode
 from camera_node.protocol.session import open_client, open_router
-from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, State
+from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, TrackingState
 from tests.conftest import free_port
 from web.feed import Feed
 from web.subscription import Subscription
@@ -40,7 +40,11 @@ class Said:
         raise NotImplementedError
 
     def pose(
-        self, robot: str, position: tuple[float, float, float], state: State = "tracked", key: str = ""
+        self,
+        robot: str,
+        position: tuple[float, float, float],
+        state: TrackingState = "tracked",
+        key: str = "",
     ) -> None:
         message = RobotPose(
             robot=robot,

@@ -6,7 +6,7 @@ import pytest
 from camera_node.protocol.messages import encode
 from tests.web.conftest import Played, wait_for
 from web.feed import MAX_REASONS, Feed
-from web.messages import Progress, progress_key
+from web.messages import DemoProgress, progress_key
 
 
 def test_what_is_published_is_kept(played: Played, feed: Feed):
@@ -53,7 +53,7 @@ def test_a_pose_that_can_not_be_drawn_is_counted(played: Played, feed: Feed):
     """Far beyond any arena, under another robot's key, or another kind of message."""
     played.pose("rover", (1e300, 0.0, 0.0))
     played.pose("drone", (0.0, 0.0, 0.0), key="rover")
-    played.put(played.keys.robot_pose("rover"), encode(Progress(t_ns=0, text="", share=0.5)))
+    played.put(played.keys.robot_pose("rover"), encode(DemoProgress(t_ns=0, text="", share=0.5)))
     wait_for(lambda: feed.latest().faults.total() == 3)
     assert not feed.latest().poses
 

@@ -15,7 +15,7 @@ from tests.web.conftest import Said, four_cameras, wait_for
 from web.__main__ import Options, replay
 from web.feed import Feed
 from web.playback import ReplayControls
-from web.replay import Replay
+from web.replay import RecordingPlayer
 from web.tables import tabulate_robots
 from web.view import View
 
@@ -51,8 +51,8 @@ def recording(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def told(recording: Path) -> Iterator[tuple[Replay, Feed]]:
-    replay, stop = Replay(recording), threading.Event()
+def told(recording: Path) -> Iterator[tuple[RecordingPlayer, Feed]]:
+    replay, stop = RecordingPlayer(recording), threading.Event()
     feed = Feed(replay.arena, clock=replay.seconds)
     thread = threading.Thread(target=replay.run, args=(feed, stop))
     thread.start()
@@ -125,14 +125,14 @@ def test_without_a_page_it_ends_with_the_recording(
 
 def test_what_is_no_recording_is_told(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"none.mcap can't be read: No such file.*check the path"):
-        Replay(tmp_path / "none.mcap")
+        RecordingPlayer(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("no recording")
     with pytest.raises(ConfigError, match="is no MCAP recording"):
-        Replay(tmp_path / "text.mcap")
+        RecordingPlayer(tmp_path / "text.mcap")
     with RecordingWriter(tmp_path / "other.mcap") as writer:
         writer.put("weather", b"rain", START_NS)
     with pytest.raises(ConfigError, match="holds no arena; record with"):
-        Replay(tmp_path / "other.mcap")
+        RecordingPlayer(tmp_path / "other.mcap")
 
 
 def test_the_page_has_controls_that_follow_the_recording(recording: Path):

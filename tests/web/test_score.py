@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
-from fusion.protocol.messages import RobotPose, State
+from fusion.protocol.messages import RobotPose, TrackingState
 from web.score import Score, angle_deg, longest_gap_s, summarise
 
 SECOND = 10**9
@@ -22,7 +22,7 @@ def truth(robot: str, t_ns: int) -> np.ndarray | None:
     return T
 
 
-def pose_of(robot: str, t_ns: int, T: np.ndarray, state: State = "tracked") -> RobotPose:
+def pose_of(robot: str, t_ns: int, T: np.ndarray, state: TrackingState = "tracked") -> RobotPose:
     return RobotPose(
         robot=robot,
         t_ns=t_ns,

@@ -19,7 +19,7 @@ from web.controls import LiveControls, decode_jpeg
 from web.drawing import puck
 from web.errors import WebError
 from web.feed import Feed
-from web.messages import Progress, progress_key
+from web.messages import DemoProgress, progress_key
 from web.subscription import Subscription
 from web.view import View, check_port, frame
 
@@ -173,7 +173,7 @@ def test_progress_and_ghosts_come_and_go(played: Played, feed: Feed):
 
     view = View(feed, port=free_port())
     for ghosts in ({"wand": ((0.0, 0.0, 1.0), (0.2, 0.0, 1.0))}, {}):
-        progress = Progress(t_ns=0, text="*waving* <b>", share=0.5, ghosts=ghosts)
+        progress = DemoProgress(t_ns=0, text="*waving* <b>", share=0.5, ghosts=ghosts)
         played.put(progress_key("test"), encode(progress))
         wait_for(lambda ghosts=ghosts: (p := feed.latest().progress) and p.message.ghosts == ghosts)
         view.update()

@@ -7,14 +7,11 @@ shapes of all ellipses of a moment tell where the wand's printed side looks, as 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.wand.bundle_adjustment.problem import Observations
+from calib.wand.bundle_adjustment.problem import WandObservations
+from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.sphere import fibonacci_sphere
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 DIRECTIONS = 160  # of a sphere, tried before refinement: 9 degrees apart
 SHAPE_SIGMA = 0.04  # of an ellipse's shape, in units of that of a disc seen straight
@@ -23,7 +20,7 @@ STEPS = 4
 
 
 def centre_offsets(
-    lenses: list[Lens], cameras: Array, seen: Observations, points: Array, radius: float
+    lenses: list[Lens], cameras: Array, seen: WandObservations, points: Array, radius: float
 ) -> Array:
     """(n, 2) pixels from where a disc's centre is seen to its ellipse's centre; 0 where no ellipse of its moment tells.
 
@@ -63,7 +60,7 @@ def displacement(lens: Lens, points: Array, normals: Array, radius: float) -> Ar
     return lens.project(np.column_stack([centre, np.ones(len(centre))])) - lens.project(points)
 
 
-def _views(lenses: list[Lens], cameras: Array, seen: Observations, points: Array) -> tuple[Array, Array]:
+def _views(lenses: list[Lens], cameras: Array, seen: WandObservations, points: Array) -> tuple[Array, Array]:
     """Points in their camera's frame (n, 3), and the derivative of pixels by world points (n, 2, 3)."""
     local, P = np.empty((len(seen), 3)), np.empty((len(seen), 2, 3))
     for c, lens in enumerate(lenses):
@@ -73,7 +70,7 @@ def _views(lenses: list[Lens], cameras: Array, seen: Observations, points: Array
     return local, P
 
 
-def _find_normals(cameras: Array, seen: Observations, P: Array, points: Array, radius: float) -> Array:
+def _find_normals(cameras: Array, seen: WandObservations, P: Array, points: Array, radius: float) -> Array:
     """(K, 3) unit normals by moment, world; NaN where no ellipse tells.
 
     A small disc's ellipse is r^2 P (I - n n') P', so what lacks to r^2 P P' is (P n)(P n)', whatever n's sign.

@@ -2,12 +2,9 @@
 """Moments of a wave: frames of different cameras that belong together, and which of many moments are worth while."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.wand.detections import Sightings
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from calib.wand.detections import WandDetections
+from camera_node.arrays import Array, Index, Mask
 
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
 DENSE_S = (
@@ -33,7 +30,7 @@ def group_instants(t_s: Array, camera: Index, period_s: float) -> Index:
     return np.where(several, np.cumsum(several) - 1, -1)[found]
 
 
-def choose_instants(seen: Sightings, instant: Index, sizes: Array, budget: int) -> NDArray[np.bool_]:
+def choose_instants(seen: WandDetections, instant: Index, sizes: Array, budget: int) -> Mask:
     """Which moments (K,) to use, at most about `budget`: all, or runs of them that cover every image evenly.
 
     Greedy: each next run is the one whose sightings fall where the fewest have fallen so far.

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.problem import PER_CAMERA, Problem
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from camera_node.arrays import Array, Index
 
 NUMBERS = 24  # of one variable, at the least: fewer and larger factors, though most of their entries are zero
 

@@ -12,14 +12,12 @@ by without the wave showing it counts in full.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import LENS, Problem
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
 
 # Of log f, the principal point (part of the longer side) and k1, for a lens whose file says nothing: what lies between
 # a data sheet, or a sloppy board, and the lens that is there.
@@ -71,7 +69,7 @@ def settle(problem: Problem, adjusted: Adjusted) -> Problem:
     return replace(problem, lens_sigma=held, lens_doubt=doubt)
 
 
-def _known(problem: Problem, information: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _known(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
     """(S, 4) deviations of the sought lenses, by their figures where these hold, else the usual ones, which are
     `rough`."""
     lenses = [problem.lenses[k] for k in problem.cameras()]
@@ -91,9 +89,7 @@ def _holds(off: Array, covariance: Array) -> bool:
     return bool(chdtrc(len(off), off @ np.linalg.solve(covariance, off)) > WRONG)
 
 
-def _parts(
-    information: Array, gradient: Array, sigma: Array, rough: NDArray[np.bool_], prior: Array
-) -> Array:
+def _parts(information: Array, gradient: Array, sigma: Array, rough: Mask, prior: Array) -> Array:
     """(S, 4) what part of `sigma` the lenses are off by, those of a kind alike: the root of its square's posterior
     mean, one kind after the other, by the `prior` of PARTS; 1 where they are not `rough`."""
     parts = np.ones(len(KINDS))

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import pixel_jacobians
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, SHAPE, Observations, Problem, State
+from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, SHAPE, Problem, State, WandObservations
 from calib.wand.bundle_adjustment.trajectory import Place, hermite_rate, interpolate, locate, whitened_motion
+from camera_node.arrays import Array, Index, Mask
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians, right-hand side
 
 RIGID_M = 2e-4  # by which a wand bends while it is waved
@@ -71,10 +70,8 @@ class Linearisation:
     """The problem with its observations; `relinearise` makes the linear system around a state."""
 
     problem: Problem
-    observations: Observations
-    broken: NDArray[np.bool_] | None = (
-        None  # (L,) intervals over which the hand was not as smooth as elsewhere
-    )
+    observations: WandObservations
+    broken: Mask | None = None  # (L,) intervals over which the hand was not as smooth as elsewhere
     smooth: Array = field(init=False)  # (L, 2, 4) whitened constant velocity between knots; 0 across gaps
     root: Array = field(init=False)  # (n, 2, 2) whitens residuals
     views: Index = field(init=False)  # (V,) link times C plus camera, ascending
@@ -145,7 +142,7 @@ class Linearisation:
             J[rows] = np.nan_to_num(state.lens(c, given).project_with_jacobian(local)[1] @ T[:3, :3].T)
         return J
 
-    def select(self, rows: NDArray[np.bool_], broken: NDArray[np.bool_]) -> "Linearisation":
+    def select(self, rows: Mask, broken: Mask) -> "Linearisation":
         """The observations that a mask names, whitened as they are here, and intervals `broken` (L,)."""
         kept = Linearisation(self.problem, self.observations.select(rows), broken)
         kept.root = self.root[rows]

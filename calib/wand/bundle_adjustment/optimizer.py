@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.gtsam_step import solve
 from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import Observations, Problem, State, unobserved
+from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations, unobserved
 from calib.wand.bundle_adjustment.schur_complement import marginalise
-
-Array = NDArray[np.float64]
+from camera_node.arrays import Array, Mask
 
 CAUCHY = 2.3849  # 95 % efficient on normal residuals
 REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
@@ -51,7 +49,7 @@ class Adjusted:
 
     problem: Problem
     state: State
-    used: NDArray[np.bool_]
+    used: Mask
     residuals: Array
     scale: float
     information: Array
@@ -114,14 +112,14 @@ class Adjusted:
         return full
 
 
-def find_robustly(problem: Problem, observations: Observations, start: State) -> State:
+def find_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
     """The state that most observations agree to, from a rough start."""
     every = Linearisation(problem, observations)
     every.weigh(start)
     return _descend(every, start, robust=True)[0]
 
 
-def adjust(problem: Problem, observations: Observations, start: State, rounds: int = ROUNDS) -> Adjusted:
+def adjust(problem: Problem, observations: WandObservations, start: State, rounds: int = ROUNDS) -> Adjusted:
     """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals,
     until these are the same again, or in so many `rounds`."""
     every, state, iterations = Linearisation(problem, observations), start, 0

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import with_distortion
 from calib.wand.bundle_adjustment.trajectory import AffineWand
+from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
@@ -25,7 +23,7 @@ SLEWED, CRYSTAL = 5e-4, 3e-5  # s/s by which clocks drift: while they are set, a
 
 
 @dataclass(frozen=True, slots=True)
-class Observations:
+class WandObservations:
     """Marker centres, one row each.
 
     Attributes:
@@ -51,9 +49,9 @@ class Observations:
     def __len__(self) -> int:
         return len(self.uv)
 
-    def select(self, rows: NDArray) -> "Observations":
+    def select(self, rows: NDArray) -> "WandObservations":
         """The rows that a mask or an index array names."""
-        return Observations(*(getattr(self, name)[rows] for name in self.__slots__))
+        return WandObservations(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,9 @@ The motion is a chain, so its Hessian is banded and one Cholesky factorisation e
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.linear_system import Linearisation
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from camera_node.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +28,9 @@ class AffineWand:
         lengths: (E,) their distances, metres.
     """
 
-    basis: NDArray[np.intp]
+    basis: Index
     weights: Array
-    pairs: NDArray[np.intp]
+    pairs: Index
     lengths: Array
 
     @classmethod
@@ -71,9 +69,9 @@ class Place:
     of it that a frame extrapolates, where it is not `inside` (n,) the interval; `spread` (n,) is the variance of a
     position there, were both knots known, for an acceleration of power spectral density 1."""
 
-    link: NDArray[np.intp]
-    own: NDArray[np.intp]
-    inside: NDArray[np.bool_]
+    link: Index
+    own: Index
+    inside: Mask
     spread: Array
 
 

@@ -8,12 +8,9 @@ every trial shift the fundamental matrix is fitted by the eight-point algorithm 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.wand.tracks import Track
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from calib.wand.tracks import MarkerTrack
+from camera_node.arrays import Array, Index, Mask
 
 RANGE_S = 0.32  # twice what clocks may be off
 STEP_S = 0.01
@@ -39,7 +36,7 @@ class Common:
 
 
 def common_sightings(
-    tracks: list[Track], rows: Index, label: Index, t_s: Array, xy: Array, shift_s: float, gap_s: float
+    tracks: list[MarkerTrack], rows: Index, label: Index, t_s: Array, xy: Array, shift_s: float, gap_s: float
 ) -> Common:
     """Sightings `rows` with those of another camera, whose `tracks` are by marker and stamped `shift_s` later."""
     other = interpolate(tracks, label, t_s + shift_s, gap_s)
@@ -47,7 +44,7 @@ def common_sightings(
     return Common(rows[good], xy[good], other[good])
 
 
-def interpolate(tracks: list[Track], label: Index, t_s: Array, gap_s: float) -> Array:
+def interpolate(tracks: list[MarkerTrack], label: Index, t_s: Array, gap_s: float) -> Array:
     """(..., n, 2) positions of the markers `label` (n,) at times (..., n)."""
     found = np.full((*t_s.shape, 2), np.nan)
     for marker, track in enumerate(tracks):
@@ -56,7 +53,7 @@ def interpolate(tracks: list[Track], label: Index, t_s: Array, gap_s: float) -> 
     return found
 
 
-def find_shift(tracks: list[Track], label: Index, t_s: Array, xy: Array, gap_s: float) -> float:
+def find_shift(tracks: list[MarkerTrack], label: Index, t_s: Array, xy: Array, gap_s: float) -> float:
     """The time by which camera b's stamps are later than camera a's, seconds; 0 where nothing tells.
 
     Args:
@@ -108,7 +105,7 @@ def misfit(xy_a: Array, xy_b: Array) -> Array:
     return np.where(known.sum(axis=1) >= MIN_COMMON, middle, np.inf)
 
 
-def _masked_median(values: Array, known: NDArray[np.bool_]) -> Array:
+def _masked_median(values: Array, known: Mask) -> Array:
     ordered = np.sort(np.where(known, values, np.inf), axis=1)
     middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
     return np.nan_to_num(ordered[np.arange(len(ordered)), middle], posinf=1.0)

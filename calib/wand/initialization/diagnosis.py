@@ -9,13 +9,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.wand.detections import Frames, Sightings
+from calib.wand.detections import FrameTable, WandDetections
 from calib.wand.initialization.clock_shift import FITTED, interpolate, misfit
-from calib.wand.initialization.two_view import Pairs
-
-Array = NDArray[np.float64]
+from calib.wand.initialization.two_view import TwoViewGeometry
 
 SURE = 0.8  # of the sightings that two cameras share must fit, once the fault is undone,
 MANY = 60  # and so many frames of the two: a short piece of a smooth path fits many geometries
@@ -25,7 +22,9 @@ NOTHING = 1e-6  # of the image plane: no misfit is better
 SAMPLE = 200  # sightings that are tried
 
 
-def find_faults(names: Sequence[str], frames: Frames, pairs: Pairs, placed: Sequence[int]) -> dict[str, str]:
+def find_faults(
+    names: Sequence[str], frames: FrameTable, pairs: TwoViewGeometry, placed: Sequence[int]
+) -> dict[str, str]:
     """The fault of each camera that is not placed, and what to do; cameras without one that is found are missing.
 
     Args:
@@ -58,20 +57,20 @@ def find_faults(names: Sequence[str], frames: Frames, pairs: Pairs, placed: Sequ
     return faults
 
 
-def _apart_s(frames: Frames, k: int, others: Sequence[int]) -> float:
+def _apart_s(frames: FrameTable, k: int, others: Sequence[int]) -> float:
     """By how much camera k's recording lies after (before, if negative) all others'; 0 where by little."""
     mine, theirs = frames.t_s[frames.camera == k], frames.t_s[np.isin(frames.camera, others)]
     after, before = float(mine.min() - theirs.max()), float(theirs.min() - mine.max())
     return after if after > FAR_S else -before if before > FAR_S else 0.0
 
 
-def _together(frames: Frames, pairs: Pairs, k: int, other: int) -> int:
+def _together(frames: FrameTable, pairs: TwoViewGeometry, k: int, other: int) -> int:
     """Sightings of another camera while camera k recorded."""
     mine, t_s = frames.t_s[frames.camera == k], pairs.seen.t_s[pairs.rows[other]]
     return int(((t_s >= mine.min()) & (t_s <= mine.max())).sum())
 
 
-def _relates(pairs: Pairs, k: int, other: int) -> bool:
+def _relates(pairs: TwoViewGeometry, k: int, other: int) -> bool:
     found = pairs.relate(other, k)
     return (
         found is not None
@@ -80,7 +79,7 @@ def _relates(pairs: Pairs, k: int, other: int) -> bool:
     )
 
 
-def _mirrored(pairs: Pairs, k: int) -> Pairs:
+def _mirrored(pairs: TwoViewGeometry, k: int) -> TwoViewGeometry:
     """The same, had camera k not been mirrored left to right."""
     seen, rows, lens = pairs.seen, pairs.rows[k], pairs.lenses[k]
     uv, xy = seen.uv.copy(), seen.xy.copy()
@@ -90,7 +89,7 @@ def _mirrored(pairs: Pairs, k: int) -> Pairs:
     return _again(pairs, replace(seen, uv=uv, xy=xy).select(known))
 
 
-def _shift_s(pairs: Pairs, k: int, other: int) -> float:
+def _shift_s(pairs: TwoViewGeometry, k: int, other: int) -> float:
     """By how much camera k's stamps are late where that makes it fit the other; 0 where no shift does."""
     seen, rows = pairs.seen, pairs.rows[other]
     rows = rows[np.linspace(0, len(rows) - 1, min(SAMPLE, len(rows))).round().astype(np.intp)]
@@ -109,5 +108,5 @@ def _shift_s(pairs: Pairs, k: int, other: int) -> float:
     return shift if _relates(_again(pairs, replace(seen, t_s=t_s)), k, other) else 0.0
 
 
-def _again(pairs: Pairs, seen: Sightings) -> Pairs:
-    return Pairs(seen, pairs.lenses, pairs.wand, pairs.period_s)
+def _again(pairs: TwoViewGeometry, seen: WandDetections) -> TwoViewGeometry:
+    return TwoViewGeometry(seen, pairs.lenses, pairs.wand, pairs.period_s)

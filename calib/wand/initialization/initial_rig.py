@@ -5,17 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.wand.initialization.two_view import MIN_INSTANTS, MIN_SHARE, Pairs, TwoView
-from calib.wand.tracks import Track
+from calib.wand.initialization.two_view import MIN_INSTANTS, MIN_SHARE, TwoView, TwoViewGeometry
+from calib.wand.tracks import MarkerTrack
+from camera_node.arrays import Array, Index
 from camera_node.geometry.pose import invert
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class InitialRig:
     """Cameras by number, roughly: `poses` (4, 4) p_any = T p_camera, and `offset_s`, true time = stamp + offset.
 
     `metric` is False where nothing gave the scale; `refused` holds the pairs of cameras that share enough and whose
@@ -28,16 +26,16 @@ class Start:
     refused: dict[tuple[int, int], float]
 
 
-def find_start(pairs: Pairs, cameras: Sequence[int]) -> Start:
+def find_start(pairs: TwoViewGeometry, cameras: Sequence[int]) -> InitialRig:
     """Place as many of `cameras` as are connected."""
     refused: dict[tuple[int, int], float] = {}
     tree = spanning_tree(pairs, cameras, refused)
     poses, offsets = _unfold(tree)
-    return Start(poses, offsets, bool(tree) and tree[0].metric, refused)
+    return InitialRig(poses, offsets, bool(tree) and tree[0].metric, refused)
 
 
 def spanning_tree(
-    pairs: Pairs, cameras: Sequence[int], refused: dict[tuple[int, int], float]
+    pairs: TwoViewGeometry, cameras: Sequence[int], refused: dict[tuple[int, int], float]
 ) -> list[TwoView]:
     """The maximum spanning tree by shared moments (Kruskal) of the largest group of connected cameras.
 
@@ -91,7 +89,11 @@ def _common_scale(pair: TwoView, depth: dict[int, float]) -> float:
 
 
 def explain_unplaced(
-    names: Sequence[str], placed: Sequence[int], frames: Sequence[int], shared: NDArray[np.intp], start: Start
+    names: Sequence[str],
+    placed: Sequence[int],
+    frames: Sequence[int],
+    shared: Index,
+    start: InitialRig,
 ) -> dict[str, str]:
     """Why each camera that is not placed is not."""
     reasons = {}
@@ -114,13 +116,13 @@ def explain_unplaced(
 
 
 def triangulate(
-    tracks: Sequence[Sequence[Track]],
+    tracks: Sequence[Sequence[MarkerTrack]],
     poses: Array,
     offset_s: Array,
     t_s: Array,
     gap_s: float,
     rounds: int = 8,
-) -> tuple[Array, NDArray[np.intp]]:
+) -> tuple[Array, Index]:
     """Markers (K, M, 3) at times (K,): nearest to all viewing rays, rays that miss by more counting less.
 
     NaN where fewer than two cameras saw the marker about then, or their rays are nearly parallel. Also the number of

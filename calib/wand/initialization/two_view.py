@@ -9,18 +9,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.camera import transform
-from calib.wand.detections import Sightings, ranges
+from calib.wand.detections import WandDetections, ranges
 from calib.wand.initialization.clock_shift import EVIDENCE, FITTED, Common, common_sightings, find_shift
-from calib.wand.tracks import Track, tracks_of
+from calib.wand.tracks import MarkerTrack, tracks_of
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MIN_INSTANTS = 8  # that two cameras must share
 SAMPLE = 1500  # sightings that the essential matrix is fitted to
@@ -61,23 +58,23 @@ class _Motion:
 
     common: Common
     T: Array
-    good: NDArray[np.bool_]
+    good: Mask
     misfit: float
 
 
-class Pairs:
+class TwoViewGeometry:
     """What each two cameras of a recording have in common."""
 
-    def __init__(self, seen: Sightings, lenses: Sequence[Lens], wand: Body, period_s: float) -> None:
+    def __init__(self, seen: WandDetections, lenses: Sequence[Lens], wand: Body, period_s: float) -> None:
         self.seen, self.lenses, self.wand = seen, lenses, wand
         self.rows = [np.flatnonzero(seen.camera == k) for k in range(len(lenses))]
-        self.tracks: list[list[Track]] = tracks_of(seen, len(lenses), len(wand.markers))
+        self.tracks: list[list[MarkerTrack]] = tracks_of(seen, len(lenses), len(wand.markers))
         self.gap_s = min(INTERPOLATED * period_s, SLOWEST_S) if period_s else SLOWEST_S
         self.period_s = period_s
         self._related: dict[tuple[int, int], TwoView | None] = {}
         self.range = ranges(lenses, seen, wand.diameter_m)
 
-    def shared(self) -> NDArray[np.intp]:
+    def shared(self) -> Index:
         """(C, C) about how many moments, a frame period long, each two cameras share."""
         bins = (self.seen.t_s / max(self.period_s, 0.02)).astype(np.intp)
         held = np.zeros((len(self.lenses), int(bins.max(initial=0)) + 1))

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
+from camera_node.arrays import Array
 from camera_node.geometry.pose import adjoint, invert, rigid_motions
-
-Array = NDArray[np.float64]
 
 DOUBT = 1e-3  # probability below which chance is no explanation
 

@@ -2,16 +2,14 @@
 """By how much what is unknown of cameras moves what they see, and whose lens is to blame for it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.rig.triangulation import camera_jacobians
 from calib.wand.bundle_adjustment.problem import LENS
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
+from camera_node.arrays import Array
 
-Array = NDArray[np.float64]
 
-
-def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> float:
+def pose_px(result: WandCalibration, k: int, uv: Array, distance: float, covariance: Array) -> float:
     """RMS, per coordinate, by which a `covariance` (C, d, C, d) of camera k moves points at a distance in its image;
     pixels."""
     if not len(uv):
@@ -21,7 +19,7 @@ def pose_px(result: Calibration, k: int, uv: Array, distance: float, covariance:
     return float(np.sqrt(np.einsum("nii->n", moved).mean() / 2))
 
 
-def lens_to_blame(result: Calibration, k: int, uv: Array, distance: float, covariance: Array) -> str:
+def lens_to_blame(result: WandCalibration, k: int, uv: Array, distance: float, covariance: Array) -> str:
     """The camera by whose lens, were it known, these points would be known best; empty where all lenses together would
     not halve the variance. `covariance` (C, d, C, d) is that of all cameras' parameters."""
     J = _image_jacobians(result, k, uv, distance)
@@ -41,7 +39,7 @@ def _explained(moved: Array, covariance: Array) -> float:
     return float(np.einsum("nip,pq,niq->", scaled, np.linalg.inv(covariance / np.outer(unit, unit)), scaled))
 
 
-def _image_jacobians(result: Calibration, k: int, uv: Array, distance: float) -> Array:
+def _image_jacobians(result: WandCalibration, k: int, uv: Array, distance: float) -> Array:
     """(n, 2, d) how points at a distance, where camera k saw `uv`, move in its image with its parameters."""
     camera = result.rig.cameras[result.names[k]]
     rays = camera.rays(uv)

@@ -5,20 +5,18 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError, CameraFault
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS, Observations
-from calib.wand.detections import Sightings, ranges
+from calib.wand.bundle_adjustment.problem import LENS, WandObservations
+from calib.wand.detections import WandDetections, ranges
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lengths import distances, free_markers
+from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
 
 AGREE = 0.5  # of a camera's sightings must fit the rig, beside those that its pose and clock fit anyway
 SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
@@ -61,7 +59,7 @@ def _apart(found: Lens, given: Lens, cov: Array) -> float:
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
 
 
-def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> None:
+def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) -> None:
     """Raise CameraFault where much of what a camera saw fits nothing that the others saw.
 
     The worst one, as one that is wrong makes others look wrong. The d parameters of a camera's pose and clock
@@ -83,7 +81,7 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: Observations
         raise CameraFault({names[k]: told}, certain=False)
 
 
-def check_motion(wave: Sightings, names: Sequence[str], lenses: Sequence[Lens]) -> None:
+def check_motion(wave: WandDetections, names: Sequence[str], lenses: Sequence[Lens]) -> None:
     """Raise CalibrationError where no camera saw the wand move: a wand at rest fixes little, and nothing of clocks."""
     moved, share = {}, {}
     for k, (name, lens) in enumerate(zip(names, lenses, strict=True)):
@@ -100,7 +98,7 @@ def check_motion(wave: Sightings, names: Sequence[str], lenses: Sequence[Lens]) 
         )
 
 
-def check_spacing(wand: Body, adjusted: Adjusted, seen: Observations) -> None:
+def check_spacing(wand: Body, adjusted: Adjusted, seen: WandObservations) -> None:
     """Raise CalibrationError where the cameras see the wand's markers at other distances than its file has."""
     pairs = np.array(list(combinations(range(len(wand.markers)), 2)), np.intp)
     if len(pairs) < 2:
@@ -120,7 +118,7 @@ def check_spacing(wand: Body, adjusted: Adjusted, seen: Observations) -> None:
         )
 
 
-def check_sizes(wand: Body, adjusted: Adjusted, seen: Observations) -> None:
+def check_sizes(wand: Body, adjusted: Adjusted, seen: WandObservations) -> None:
     """Raise CalibrationError where the wand's lengths put roundels elsewhere than their sizes do."""
     state, problem = adjusted.state, adjusted.problem
     if len(problem.wand.lengths) == 0:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.linear_system import Linearisation
@@ -23,12 +22,11 @@ from calib.wand.bundle_adjustment.problem import (
     OFFSET,
     POSE,
     SLEWED,
-    Observations,
     Problem,
     State,
+    WandObservations,
 )
-
-Array = NDArray[np.float64]
+from camera_node.arrays import Array
 
 # A jump that leaves neither of these has not touched the rig: rejected part of a camera's markers, and drift, s/s.
 REJECTED, DRIFTS = 0.1, 5 * CRYSTAL
@@ -62,7 +60,7 @@ class ClockJump:
         return {"ms": round(self.ms, 2), "sigma": round(self.sigma_ms, 2), "at_s": round(self.at_s, 2)}
 
 
-def find_jump(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> ClockJump | None:
+def find_jump(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) -> ClockJump | None:
     """The clock that jumps; of several, that which spoils most; None where none does.
 
     Args:
@@ -79,7 +77,7 @@ def find_jump(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> C
     return _confirm(names, change, problem, seen, state) if change.gain else None
 
 
-def _suspicious(adjusted: Adjusted, seen: Observations) -> bool:
+def _suspicious(adjusted: Adjusted, seen: WandObservations) -> bool:
     """Whether much of what a camera saw was rejected, or its clock drifts as none does that is left alone."""
     total = np.bincount(seen.camera, minlength=len(adjusted.problem.lenses))
     rejected = np.bincount(seen.camera[~adjusted.used], minlength=len(total)) / np.maximum(total, 1)
@@ -98,7 +96,7 @@ class _Change:
     gain: float
 
 
-def _find_change(problem: Problem, seen: Observations, state: State, camera: int) -> _Change:
+def _find_change(problem: Problem, seen: WandObservations, state: State, camera: int) -> _Change:
     """Where this camera's shift would best change."""
     rows = seen.select(np.flatnonzero(seen.camera == camera))
     rows = rows.select(np.argsort(rows.t_s, kind="stable"))
@@ -114,7 +112,7 @@ def _find_change(problem: Problem, seen: Observations, state: State, camera: int
     return _Change(camera, float(moments[k]), float(SHIFTS[high] - SHIFTS[low]), float(gain))
 
 
-def _deviations(problem: Problem, rows: Observations, state: State, camera: int) -> Array:
+def _deviations(problem: Problem, rows: WandObservations, state: State, camera: int) -> Array:
     """(SHIFTS, n) how far what one camera saw is from what is expected, sigmas, were its stamps shifted."""
     linear = Linearisation(problem, rows)
     linear.weigh(state)
@@ -127,7 +125,7 @@ def _deviations(problem: Problem, rows: Observations, state: State, camera: int)
 
 
 def _confirm(
-    names: Sequence[str], change: _Change, problem: Problem, seen: Observations, state: State
+    names: Sequence[str], change: _Change, problem: Problem, seen: WandObservations, state: State
 ) -> ClockJump | None:
     """Adjust the camera as two, that from the change on being the last."""
     from scipy.special import chdtrc

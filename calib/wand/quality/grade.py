@@ -9,19 +9,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.triangulation import Joint
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.quality.blame import lens_to_blame, pose_px
 from calib.wand.report import CameraReport
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
-
-Array = NDArray[np.float64]
 
 GRADES = "ABCD"
 # A, B and C at most; beyond is D.
@@ -49,7 +47,7 @@ DEPTHS = (0.1, 0.5, 0.9)  # quantiles of the wand's distances, at which another 
 
 
 @dataclass(frozen=True, slots=True)
-class CameraTrust:
+class CameraQuality:
     """What there is to say of one placed camera.
 
     Attributes:
@@ -62,13 +60,13 @@ class CameraTrust:
 
     name: str
     coverage: Coverage
-    useful: NDArray[np.bool_]
+    useful: Mask
     figures: dict[str, float]
     lens: str = ""
     noise_px: float = 0.0
 
     @property
-    def missing(self) -> NDArray[np.bool_]:
+    def missing(self) -> Mask:
         """(rows, columns) useful cells through which the wand was not waved."""
         return self.useful & ~self.coverage.used
 
@@ -107,7 +105,7 @@ class CameraTrust:
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
+class RigQuality:
     """What a person needs to know before relying on a rig.
 
     Attributes:
@@ -117,7 +115,7 @@ class Trust:
         expected: errors of points across the waved arena, at robots' height; None where the rig knows no metres.
     """
 
-    cameras: list[CameraTrust]
+    cameras: list[CameraQuality]
     unplaced: dict[str, str]
     length: float | None
     expected: PrecisionMap | None
@@ -201,7 +199,9 @@ def _describe(criterion: str, value: float) -> str:
     return said[criterion]
 
 
-def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: float = SIGMA_PX) -> Trust:
+def assess(
+    result: WandCalibration, wand: Body, height_m: float = 0.1, sigma_px: float = SIGMA_PX
+) -> RigQuality:
     """Judge a calibration.
 
     Args:
@@ -226,18 +226,18 @@ def assess(result: Calibration, wand: Body, height_m: float = 0.1, sigma_px: flo
         expected = map_precision(placed, low, high, height_m, sigma_px, doubt)
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
-    return Trust(cameras, unplaced, off, expected)
+    return RigQuality(cameras, unplaced, off, expected)
 
 
-def waved_points(result: Calibration) -> Array:
+def waved_points(result: WandCalibration) -> Array:
     """(N, 3) where the wand has been, in the rig's world."""
     T_world_adjusted = result.rig.cameras[result.names[0]].matrix() @ invert(result.adjusted.state.cameras[0])
     return transform(T_world_adjusted, result.adjusted.state.motion[:, 0].reshape(-1, 3))
 
 
 def _assess_camera(
-    result: Calibration, k: int, row: CameraReport, wave: Array, noise: Array, joint: Array
-) -> CameraTrust:
+    result: WandCalibration, k: int, row: CameraReport, wave: Array, noise: Array, joint: Array
+) -> CameraQuality:
     """Camera k, by covariances (C, d, C, d) of all cameras: by the wave's noise alone, and by all that is unknown."""
     camera = result.rig.cameras[row.name]
     seen = result.observations
@@ -255,10 +255,10 @@ def _assess_camera(
     }
     lens = lens_to_blame(result, k, uv, distance, joint)
     noise_px = pose_px(result, k, uv, distance, noise)
-    return CameraTrust(row.name, coverage, useful, figures, lens, noise_px)
+    return CameraQuality(row.name, coverage, useful, figures, lens, noise_px)
 
 
-def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> NDArray[np.bool_]:
+def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> Mask:
     """(rows, columns) the cells of a camera's image in which, at one of these distances, another camera sees too."""
     rays = camera.rays(cell_centres(camera.width, camera.height, CELLS))
     shared = np.zeros(len(rays), bool)

@@ -2,15 +2,13 @@
 """The wand's lengths as the cameras measure them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import Observations
+from calib.wand.bundle_adjustment.problem import WandObservations
+from camera_node.arrays import Array, Index
 
-Array = NDArray[np.float64]
 
-
-def free_markers(adjusted: Adjusted, seen: Observations) -> Array:
+def free_markers(adjusted: Adjusted, seen: WandObservations) -> Array:
     """(K, M, 3) where the cameras alone put the wand's markers; NaN where fewer than two saw one.
 
     Every marker of an instant moves, in one Gauss-Newton step that knows no length, to where its observations want it.
@@ -34,14 +32,14 @@ def free_markers(adjusted: Adjusted, seen: Observations) -> Array:
     return free
 
 
-def measure_lengths(adjusted: Adjusted, seen: Observations) -> Array:
+def measure_lengths(adjusted: Adjusted, seen: WandObservations) -> Array:
     """(n,) what the cameras alone say of the wand's lengths, less what they are; metres."""
     wand = adjusted.problem.wand
     errors = distances(free_markers(adjusted, seen)[:, wand.basis], wand.pairs) - wand.lengths
     return errors[np.isfinite(errors)]
 
 
-def distances(points: Array, pairs: NDArray[np.intp]) -> Array:
+def distances(points: Array, pairs: Index) -> Array:
     """(K, P) distances of P pairs of points (K, N, 3)."""
     ends = points[:, pairs]
     return np.asarray(np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2), float)

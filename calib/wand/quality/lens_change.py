@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import LENS
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
 CLEAR = 2.0  # sigmas, root mean square of the four parameters: below, a lens is as it was given
@@ -22,7 +22,7 @@ class LensChange:
 
     before: Lens
     after: Lens
-    sigma: NDArray[np.float64]
+    sigma: Array
     sigmas: float
 
     def sentence(self) -> str:

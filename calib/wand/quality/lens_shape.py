@@ -10,15 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import SHAPE, Observations
+from calib.wand.bundle_adjustment.problem import SHAPE, WandObservations
 from calib.wand.bundle_adjustment.schur_complement import marginalise
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
-
-Array = NDArray[np.float64]
 
 WRONG = 1e-4  # probability below which a lens is not what its file says
 NAMES = {"pinhole": ("fx / fy", "k2", "p1", "p2"), "fisheye": ("fx / fy", "k2", "k3", "k4")}
@@ -44,7 +42,7 @@ class Misfit:
         )
 
 
-def find_misfit(names: Sequence[str], adjusted: Adjusted, seen: Observations) -> Misfit | None:
+def find_misfit(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) -> Misfit | None:
     """The camera whose lens is least what was given, beyond what a wave adjusts: one that is wrong makes others look
     wrong, so the worst is named alone. None where all are.
 
@@ -68,7 +66,7 @@ def find_misfit(names: Sequence[str], adjusted: Adjusted, seen: Observations) ->
     return Misfit(names[k], NAMES[lens.model][worst], told, float(found), float(scale * sigma[worst]))
 
 
-def _step(adjusted: Adjusted, seen: Observations) -> tuple[Array, Array]:
+def _step(adjusted: Adjusted, seen: WandObservations) -> tuple[Array, Array]:
     """By how much each lens is off, (C, 4), and the covariances (C, 4, 4)."""
     problem = adjusted.problem.freeing(adjusted.problem.free, SHAPE)
     linear = Linearisation(problem, seen.select(adjusted.used))

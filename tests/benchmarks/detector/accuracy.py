@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.console import Console
 
+from camera_node.arrays import Array
 from camera_node.detection.disc_pose import DiscPose, locate
 from tests.benchmarks.detector.bound import Bound, bound
 from tests.benchmarks.detector.cells import Cell, cells, views
 from tests.benchmarks.detector.pictures import expose
 from tests.benchmarks.detector.table import Run, Verdict, table
-from tests.camera_node.tracing import Array, Sight, ellipse_of, trace
+from tests.camera_node.tracing import Sight, ellipse_of, trace
 
 CENTRE, CENTRE_WORST, DISTANCE, BIAS = 1.15, 1.3, 1.5, 5e-4
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
-from tests.camera_node.tracing import Array, Sight, ellipse_of, trace
+from tests.camera_node.tracing import Sight, ellipse_of, trace
 
 AXIS_PX = 20.0  # a step of the optical axis: the inner circle moves by far less than a pixel
 ROUNDING = 1 / 12  # variance that 8 bits add, square grey levels

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from rich.console import Console
 
+from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from tests.benchmarks.detector.negatives import clutter, letters, text_pages
 from tests.benchmarks.detector.photographs import photographs
 from tests.benchmarks.detector.pictures import NOISE, Card, Grey, dead_leaves, expose, flat, paste
 from tests.benchmarks.detector.table import Run, Verdict, table
-from tests.camera_node.tracing import Array
 
 SIZE = (300, 400)
 DIAMETER = 32.0

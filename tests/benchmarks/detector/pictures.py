@@ -7,12 +7,11 @@ from functools import lru_cache
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from camera_node.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
-from tests.camera_node.tracing import Array, Sight, ellipse_of, pixels_across, trace
+from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
 
-Grey = NDArray[np.uint8]
 F = 600.0  # focal length of pictures of which nothing else is said, pixels
 NOISE = 3.0  # grey levels, of pictures of which nothing else is said
 PIECES = 4  # a pixel is cut into so many squared

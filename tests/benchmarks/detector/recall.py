@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 
+from camera_node.arrays import Array
 from tests.benchmarks.detector.pictures import (
     NOISE,
     Card,
@@ -20,7 +21,6 @@ from tests.benchmarks.detector.pictures import (
     paste,
 )
 from tests.benchmarks.detector.table import Run, Verdict, table
-from tests.camera_node.tracing import Array
 
 SIZE = (480, 640)
 GROUNDS = ("white", "clutter", "dark")

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 
+from camera_node.arrays import Array
 from tests.benchmarks.detector.pictures import (
     NOISE,
     Card,
@@ -23,7 +24,6 @@ from tests.benchmarks.detector.pictures import (
 )
 from tests.benchmarks.detector.table import Run, Verdict, milliseconds, milliseconds_anew, table
 from tests.benchmarks.detector.tags import measure_tags, tag_detectors
-from tests.camera_node.tracing import Array
 
 SIZES = ((480, 640), (720, 1280), (1080, 1920))
 COUNTS = (0, 1, 10, 50)

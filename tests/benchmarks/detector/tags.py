@@ -8,9 +8,9 @@ from functools import partial
 import cv2
 import numpy as np
 
+from camera_node.arrays import Array
 from tests.benchmarks.detector.pictures import NOISE, Card, Grey, expose
 from tests.benchmarks.detector.table import milliseconds
-from tests.camera_node.tracing import Array
 
 
 def tagged(ground: Array, there: list[Card], dictionary: int, rng: np.random.Generator) -> Grey:

@@ -22,6 +22,7 @@ from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
+from camera_node.arrays import Array
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
@@ -35,7 +36,7 @@ Pose = tuple[NDArray, NDArray]
 
 
 @cache
-def pixel_rays() -> NDArray[np.float64]:
+def pixel_rays() -> Array:
     """Viewing rays of half pixels, from a coarse grid."""
     v, u = np.mgrid[0:97, 0:129] * 10.0
     coarse = LENS.rays(np.column_stack([(u.ravel() - 0.5) / 2, (v.ravel() - 0.5) / 2])).reshape(97, 129, 3)

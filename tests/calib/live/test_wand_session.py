@@ -17,8 +17,8 @@ from calib.__main__ import execute
 from calib.commands.connection import Connection
 from calib.commands.wand import Wand
 from calib.errors import CalibrationError
-from calib.live.collect import Heard
-from calib.live.wand_session import IDLE_S, Progress, Rule, Trial, progress, thin, wave
+from calib.live.collect import CollectedFrames
+from calib.live.wand_session import IDLE_S, Rule, SessionProgress, Trial, progress, thin, wave
 from calib.rig.recording import read_wave
 from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
@@ -66,7 +66,7 @@ def test_it_ends_by_itself():
 def test_it_is_ended_by_time_or_by_hand():
     arena, ended = ring(2), threading.Event()
 
-    def tell(told: Progress) -> None:
+    def tell(told: SessionProgress) -> None:
         if sum(told.frames.values()):
             ended.set()
 
@@ -81,7 +81,7 @@ def test_it_is_ended_by_time_or_by_hand():
 def test_ctrl_c_keeps_what_came():
     arena = ring(2)
 
-    def interrupt(told: Progress) -> None:
+    def interrupt(told: SessionProgress) -> None:
         if sum(told.frames.values()):
             raise KeyboardInterrupt
 
@@ -94,7 +94,7 @@ def test_ctrl_c_keeps_what_came():
 
 def test_cameras_that_stop_sending_are_named():
     """By when each was heard last, with roundels or without."""
-    heard = Heard()
+    heard = CollectedFrames()
     for message in record(ring(2), 1.0):
         heard.take(encode(message), 5.0 if message.camera == "cam0" else 1.0)
     assert heard.silent(2.9) == []
@@ -115,7 +115,7 @@ def test_the_rule():
     assert rule.judge(thin_, 10.1 + IDLE_S)
     missing = Trial(strain=good.strain, used=good.used, unplaced={"c": "never saw the wand; wave before it"})
     assert not rule.judge(missing, 99.0)
-    heard = Heard(frames=Counter({"a": 1, "b": 1, "c": 1}))
+    heard = CollectedFrames(frames=Counter({"a": 1, "b": 1, "c": 1}))
     advice = [
         progress(heard, 5.0, trial, False).advice
         for trial in (None, thin_, weak, missing, Trial("it failed"))

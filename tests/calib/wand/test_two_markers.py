@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.two_markers import label_ends
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -36,11 +36,11 @@ def unnumbered(messages: list[Detections]) -> list[Detections]:
     return [msgspec.structs.replace(m, id=np.full(len(m), -1, "<i4").tobytes()) for m in messages]
 
 
-def place(recorded: Recorded, messages: list[Detections]) -> Calibration:
+def place(recorded: Recorded, messages: list[Detections]) -> WandCalibration:
     return calibrate(recorded.intrinsics, STICK, messages)
 
 
-def trace(result: Calibration) -> float:
+def trace(result: WandCalibration) -> float:
     return float(np.trace(result.covariance))
 
 

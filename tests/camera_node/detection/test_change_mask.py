@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
+from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from tests.benchmarks.detector.pictures import Card, Grey, dead_leaves, expose, flat, missed, paste
-from tests.camera_node.tracing import Array
 
 SIZE = (240, 320)
 TRUST = 16  # frames in which what does not change is searched once

@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundel
 from tests.benchmarks.detector.negatives import print_letters, rings
 from tests.benchmarks.detector.pictures import Card, flat, grid, paste
 from tests.benchmarks.detector.recall import covered, recall
 from tests.benchmarks.detector.table import Run
-from tests.camera_node.rendering import Array, Disc, expose, outer_conic, render
+from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])
 SHARES = np.arange(-0.1, 0.45, 0.05)  # of the diameter that is covered, from the rim

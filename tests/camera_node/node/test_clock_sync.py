@@ -6,24 +6,24 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from camera_node.node.clock_sync import Clock
+from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys, encode
 
 KEYS = Keys("test")
 HOUR_NS = 3600 * 10**9
-Start = Callable[[Callable[[], ClockReply]], Clock]
+Start = Callable[[Callable[[], ClockReply]], ClockSync]
 
 
 @pytest.fixture
 def started(network) -> Iterator[Start]:
     """Starts a clock beside a server that answers in a given way."""
-    clocks: list[Clock] = []
+    clocks: list[ClockSync] = []
 
-    def start(answer: Callable[[], ClockReply]) -> Clock:
+    def start(answer: Callable[[], ClockReply]) -> ClockSync:
         session = network.router()
         session.declare_queryable(KEYS.clock, lambda query: query.reply(KEYS.clock, encode(answer())))
-        clocks.append(Clock(session, KEYS).start())
+        clocks.append(ClockSync(session, KEYS).start())
         return clocks[-1]
 
     yield start

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
+from camera_node.arrays import Array
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import load_lens
-from camera_node.geometry.pose import Array, invert
+from camera_node.geometry.pose import invert
 from camera_node.simulation.renderer import discs_of
 from camera_node.simulation.scene import Scene, SceneCamera
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene

@@ -15,7 +15,7 @@ from camera_node.commands.source_selection import open_source
 from camera_node.errors import CameraError
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.v4l2 import (
-    DeviceSource,
+    V4l2Source,
     camera_names,
     capture_time,
     find_device,
@@ -122,7 +122,7 @@ def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
             raise CameraError("not yet")
         return cv2.VideoCapture(str(path))
 
-    source = DeviceSource(video, SourceSettings(), open_video, reopen_s=0.01)
+    source = V4l2Source(video, SourceSettings(), open_video, reopen_s=0.01)
     frames = []
     for frame in source:
         frames.append(frame)
@@ -137,7 +137,7 @@ def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
 
 def test_the_newest_frame_is_taken_and_others_are_counted(video: Path, eventually):
     """Who comes late gets the last frame; what nobody took is counted."""
-    source = DeviceSource(video, SourceSettings(), lambda path, _: cv2.VideoCapture(str(path)), reopen_s=100)
+    source = V4l2Source(video, SourceSettings(), lambda path, _: cv2.VideoCapture(str(path)), reopen_s=100)
     assert eventually(lambda: source.dropped == 2)
     frame = next(iter(source))
     assert abs(int(frame.image[0, 0]) - 150) <= 3  # JPEG

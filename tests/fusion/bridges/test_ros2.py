@@ -20,7 +20,7 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.bridges.ros2 import Node, ros2, ros_name
+from fusion.bridges.ros2 import Ros2Node, ros2, ros_name
 from fusion.bridges.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
@@ -211,7 +211,7 @@ def test_robots_whose_names_ros_can_not_tell_apart_are_counted():
         "_re",
     ]
     with open_router([f"tcp/127.0.0.1:{free_port()}"]) as session:
-        node = Node(session)
+        node = Ros2Node(session)
         for name in ("rover-2", "rover_2", "rover_2"):
             node.publish(draw_pose(name), "world")
         assert node.faults == {"poses of 'rover_2', whose name ROS can't tell from 'rover-2'": 2}

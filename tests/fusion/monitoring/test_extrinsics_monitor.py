@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import Pose, rotation_from_vector
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.fusion.conftest import errors
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
@@ -37,7 +37,13 @@ def test_a_bumped_camera_is_named_within_a_second_and_healed(turn_deg, shift_m):
     before, after = bumped(turn_deg, shift_m)
     frames = [f for f in before.frames(110) if before.seconds(f.t_ns) < BUMP_S]
     frames += [f for f in after.frames(110) if before.seconds(f.t_ns) >= BUMP_S]
-    tracker, instants, named, healed, poses = Tracker(before.cameras, ROBOTS), Instants(PERIOD_NS), [], [], []
+    tracker, instants, named, healed, poses = (
+        Tracker(before.cameras, ROBOTS),
+        FrameSynchronizer(PERIOD_NS),
+        [],
+        [],
+        [],
+    )
     for frame in frames:
         instants.add(frame)
         for instant in instants.take(frame.t_ns):
@@ -69,7 +75,7 @@ def test_a_marker_that_was_moved_is_said_of_its_robot_and_of_no_camera(off_m, sa
     (x, y, z), *others = TRIANGLE.markers
     glued = msgspec.structs.replace(TRIANGLE, markers=((x, y + off_m, z), *others))
     arena = Arena({"a": glued}, {"a": around}, sigma_px=0.1)
-    tracker, instants, moves = Tracker(arena.cameras, {"a": TRIANGLE}), Instants(PERIOD_NS), []
+    tracker, instants, moves = Tracker(arena.cameras, {"a": TRIANGLE}), FrameSynchronizer(PERIOD_NS), []
     for frame in arena.frames(80):
         instants.add(frame)
         for instant in instants.take(frame.t_ns):
@@ -86,7 +92,7 @@ def test_a_camera_that_stands_is_left_alone_though_others_see_more(run_arena):
         ROBOTS, MOTIONS, sigma_px=0.1, distractors=6, hidden=lambda robot, marker, t: marker == 1 and t > 0.5
     )
     frames = [f for f in arena.frames(60) if not (f.camera == "cam2" and 0.5 < arena.seconds(f.t_ns) < 1.2)]
-    tracker, instants = Tracker(arena.cameras, ROBOTS), Instants(PERIOD_NS)
+    tracker, instants = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
     for frame in frames:
         instants.add(frame)
         for instant in instants.take(frame.t_ns):

@@ -14,21 +14,21 @@ from scipy.optimize import linear_sum_assignment
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import exp_so3
 from fusion import _core
-from fusion.model.camera_array import Discs, Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Observations, Sightings
+from fusion.model.camera_array import CameraArray, Discs
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.states import States, predict
 from fusion.tracking.association import assign
 from tests.fusion import equations
 from tests.fusion.synthetic import ring
 
 CAMERAS = ring()
-OPTICS = Optics(CAMERAS)
+OPTICS = CameraArray(CAMERAS)
 BODIES, EACH = 7, 60
 assert_near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
 
 
-def scene(seed: int = 2) -> tuple[States, Observations]:
+def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
     """Turning bodies about the middle, and detections that have nothing to do with them; one can't be seen at all."""
     random = np.random.default_rng(seed)
     n = len(CAMERAS) * EACH
@@ -48,17 +48,21 @@ def scene(seed: int = 2) -> tuple[States, Observations]:
         marker=random.uniform(-0.2, 0.2, (3, n)),
         radius=random.uniform(0.02, 0.1, n),
     )
-    return states, Observations.seeing(Sightings.of(Instant(0, tuple(frames)), OPTICS, 0.1), discs)
+    return states, MatchedObservations.seeing(
+        DetectionTable.of(FrameSet(0, tuple(frames)), OPTICS, 0.1), discs
+    )
 
 
-def frame(name: str, random: np.random.Generator) -> Frame:
+def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
     """A camera's, up to 20 ms beside the instant."""
     root = random.normal(size=(EACH, 2, 2))
     axes = np.sort(random.uniform(10, 30, (EACH, 2)))[:, ::-1]
     none, level = np.full(EACH, -1, np.int32), np.ones(EACH)
     uv, angle = random.uniform(100, 500, (EACH, 2)), random.uniform(-1.5, 1.5, EACH)
     roundels = Roundels(uv, root @ root.transpose(0, 2, 1), axes, angle, level, level, none, none)
-    return Frame.measure(name, int(random.integers(-20_000_000, 20_000_000)), roundels, CAMERAS[name])
+    return CalibratedFrame.measure(
+        name, int(random.integers(-20_000_000, 20_000_000)), roundels, CAMERAS[name]
+    )
 
 
 def test_views_are_the_observation_models():

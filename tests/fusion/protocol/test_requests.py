@@ -15,8 +15,8 @@ from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
 from fusion.errors import FusionError
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key
-from fusion.server.active_rig import Calibration
-from fusion.server.persistence import Kept
+from fusion.server.active_rig import ActiveRig
+from fusion.server.persistence import PersistedFile
 from tests.fusion.server.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 from tests.fusion.synthetic import WIDE
 
@@ -97,17 +97,17 @@ def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
 
 def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
     given, path = tmp_path / "rig.yaml", tmp_path / "rig.kept.yaml"
-    kept = Kept("rig", str(path), load_rig, save_rig)
+    kept = PersistedFile("rig", str(path), load_rig, save_rig)
     config(tmp_path)  # writes rig.yaml
     fewer = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
     path.write_text(dump_rig(fewer))
     for age_ns, expected in ((-1, fewer), (1, Rig(cameras=ARENA.cameras))):
         at = path.stat().st_mtime_ns + age_ns * 10**9
         os.utime(given, ns=(at, at))
-        assert Calibration(given, kept).rig == expected
+        assert ActiveRig(given, kept).rig == expected
     path.write_text("cameras: {")
     os.utime(given, (0, 0))
-    assert Calibration(given, kept).rig == Rig(cameras=ARENA.cameras)
+    assert ActiveRig(given, kept).rig == Rig(cameras=ARENA.cameras)
 
 
 def test_robots_that_were_changed_are_in_force_after_a_restart(tmp_path):

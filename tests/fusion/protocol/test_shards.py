@@ -10,11 +10,11 @@ import pytest
 
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
-from fusion.model.frames import Frame, Instant
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors
@@ -72,9 +72,9 @@ def test_crossing_robots_of_different_shards_keep_their_detections():
     assert contested > 20
 
 
-def whole_instants(frames: list[Frame]) -> list[Instant]:
+def whole_instants(frames: list[CalibratedFrame]) -> list[FrameSet]:
     """Of a whole run, in order."""
-    gathered = Instants(PERIOD_NS)
+    gathered = FrameSynchronizer(PERIOD_NS)
     for frame in frames:
         gathered.add(frame)
     return gathered.finish()

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
-from fusion.model.frames import Frame, Instant
-from fusion.server.frame_synchronizer import GONE_NS, Instants
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.server.frame_synchronizer import GONE_NS, FrameSynchronizer
 from fusion.tracking.tracker import Limits
 
 PERIOD = 33_333_333
@@ -17,11 +17,11 @@ TICK = 5 * MS
 START = 10**12
 NOTHING = Roundels.from_points(np.empty((0, 2)), 0.3)
 LATENESS = round(Limits().lateness_ms * MS)
-Arrivals = list[tuple[int, Frame]]
+Arrivals = list[tuple[int, CalibratedFrame]]
 
 
-def frame(camera: str, t_ns: int) -> Frame:
-    return Frame(camera, START + t_ns, NOTHING, np.empty((2, 0)), np.empty((2, 2, 0)))
+def frame(camera: str, t_ns: int) -> CalibratedFrame:
+    return CalibratedFrame(camera, START + t_ns, NOTHING, np.empty((2, 0)), np.empty((2, 2, 0)))
 
 
 def row(camera: str, n: int, phase: float = 0.0, delay: int = 0, period: int = PERIOD) -> Arrivals:
@@ -29,7 +29,7 @@ def row(camera: str, n: int, phase: float = 0.0, delay: int = 0, period: int = P
     return [(START + delay + round(t), frame(camera, round(t))) for t in (np.arange(n) + phase) * period]
 
 
-def play(instants: Instants, arrivals: Arrivals) -> list[tuple[int, Instant]]:
+def play(instants: FrameSynchronizer, arrivals: Arrivals) -> list[tuple[int, FrameSet]]:
     """When each instant closed, if asked at every arrival and tick; the last ones, left to `finish`, at 0."""
     arrivals = sorted(arrivals, key=lambda arrival: arrival[0])
     closed, now = [], arrivals[0][0]
@@ -42,7 +42,7 @@ def play(instants: Instants, arrivals: Arrivals) -> list[tuple[int, Instant]]:
     return closed + [(0, instant) for instant in instants.finish()]
 
 
-def used(closed: list[tuple[int, Instant]]) -> list[tuple[str, int]]:
+def used(closed: list[tuple[int, FrameSet]]) -> list[tuple[str, int]]:
     return sorted((f.camera, f.t_ns) for _, instant in closed for f in instant.frames)
 
 
@@ -50,7 +50,7 @@ def sent(arrivals: Arrivals) -> list[tuple[str, int]]:
     return sorted((f.camera, f.t_ns) for _, f in arrivals)
 
 
-def steps(closed: list[tuple[int, Instant]]) -> np.ndarray:
+def steps(closed: list[tuple[int, FrameSet]]) -> np.ndarray:
     return np.diff([instant.t_ns for _, instant in closed])
 
 
@@ -62,7 +62,7 @@ def steps(closed: list[tuple[int, Instant]]) -> np.ndarray:
 def test_every_frame_is_in_the_nearest_instant_and_in_no_other(phases, period):
     """An instant does not wait for a frame that may as well be of the next: to a tenth of a period."""
     arrivals = [a for k, p in enumerate(phases) for a in row(f"cam{k}", 20, p, period=period)]
-    instants = Instants(period)
+    instants = FrameSynchronizer(period)
     closed = play(instants, arrivals)
     assert used(closed) == sent(arrivals)
     off = [abs(f.t_ns - instant.t_ns) for _, instant in closed for f in instant.frames]
@@ -78,7 +78,7 @@ def test_every_frame_is_in_the_nearest_instant_and_in_no_other(phases, period):
 )
 def test_frames_within_the_bound_are_used_once(phases, delays):
     arrivals = [a for k, p in enumerate(phases) for a in row(f"cam{k}", 30, p, delays[k] * MS)]
-    instants = Instants(PERIOD, LATENESS)
+    instants = FrameSynchronizer(PERIOD, LATENESS)
     assert used(play(instants, arrivals)) == sent(arrivals)
     assert sum(instants.late.values()) == 0
 
@@ -86,7 +86,7 @@ def test_frames_within_the_bound_are_used_once(phases, delays):
 def test_cameras_all_100_ms_behind_are_fused_without_loss():
     """As cheap USB cameras are: every instant has a frame of each, and closes as soon as it does."""
     arrivals = [a for k, p in enumerate((0.0, 0.2, -0.3)) for a in row(f"cam{k}", 40, p, 100 * MS)]
-    instants = Instants(lateness_ns=LATENESS)
+    instants = FrameSynchronizer(lateness_ns=LATENESS)
     closed = play(instants, arrivals)
     assert used(closed) == sent(arrivals)
     assert {len(instant.frames) for _, instant in closed[1:-1]} == {3}
@@ -98,7 +98,7 @@ def test_a_frame_that_missed_its_instant_is_used_at_its_own_time_or_counted(dela
     arrivals = row("a", 40) + row("b", 40, 0.1)
     late_ns, late = arrivals[60]
     arrivals[60] = (late_ns + delay_ms * MS, late)
-    instants = Instants(PERIOD, LATENESS)
+    instants = FrameSynchronizer(PERIOD, LATENESS)
     closed = play(instants, arrivals)
     where = [instant for _, instant in closed if any(f is late for f in instant.frames)]
     assert len(where) == 1 - lost
@@ -109,7 +109,7 @@ def test_a_frame_that_missed_its_instant_is_used_at_its_own_time_or_counted(dela
 def test_a_silent_camera_is_waited_for_to_the_bound_and_not_once_it_is_gone():
     arrivals = row("a", 90) + row("b", 30, 0.1)
     silent_ns = arrivals[-1][1].t_ns
-    closed = play(Instants(PERIOD, LATENESS), arrivals)[:-1]
+    closed = play(FrameSynchronizer(PERIOD, LATENESS), arrivals)[:-1]
     waited = np.array(
         [(instant.t_ns - silent_ns, now - instant.t_ns - PERIOD // 2) for now, instant in closed]
     )
@@ -130,7 +130,7 @@ def test_a_change_of_rate_is_followed(factor):
         (ns + shift, frame(f.camera, f.t_ns - START + shift))
         for ns, f in row("a", 40, 0.0, 0, period) + row("b", 40, 0.1, 0, period)
     ]
-    instants = Instants()
+    instants = FrameSynchronizer()
     closed = play(instants, before + after)
     assert used(closed) == sent(before + after)
     assert np.abs(steps(closed)[:20] - PERIOD).max() <= 1
@@ -142,7 +142,7 @@ def test_after_a_long_silence_there_is_a_new_row():
     """Between the rows only as many empty instants as it takes to know that robots are lost."""
     pause = 3600 * 10**9
     first, second = row("a", 20), row("a", 20, phase=0.3 + pause // PERIOD)
-    instants = Instants(PERIOD)
+    instants = FrameSynchronizer(PERIOD)
     for now, f in first:
         instants.add(f)
         instants.take(now)
@@ -159,7 +159,7 @@ def test_cameras_that_start_with_one_frame_and_a_silence_lose_none(silence_s: fl
     """Their first step is no rhythm: instants that it would foretell must not close before their frames come."""
     first = [arrival for k in range(4) for arrival in row(f"cam{k}", 1, 0.2 * k)]
     then = [a for k in range(4) for a in row(f"cam{k}", 60, 0.2 * k + silence_s * 1e9 / PERIOD, 5 * MS)]
-    instants = Instants(None, LATENESS)
+    instants = FrameSynchronizer(None, LATENESS)
     closed = play(instants, first + then)
     assert used(closed) == sent(first + then)
     assert set(instants.late.values()) == {0}

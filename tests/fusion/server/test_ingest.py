@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
-from fusion.model.frames import Frame
-from fusion.server.frame_synchronizer import Instants
-from fusion.server.ingest import Intake
-from fusion.server.status import MAX_STRANGERS, Health
+from fusion.model.frames import CalibratedFrame
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.ingest import Ingest
+from fusion.server.status import MAX_STRANGERS, ServerStatistics
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
@@ -32,8 +32,8 @@ class Path:
     """A message's way through the server, without a network."""
 
     def __init__(self, arena: Arena = ARENA) -> None:
-        self.arena, self.health = arena, Health(150.0)
-        self.intake, self.instants = Intake(KEYS, self.health), Instants(PERIOD_NS)
+        self.arena, self.health = arena, ServerStatistics(150.0)
+        self.intake, self.instants = Ingest(KEYS, self.health), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 
     def take(self, message: Detections, received_ns: int) -> list[Fused]:
@@ -173,5 +173,5 @@ def test_two_nodes_of_one_name_are_noticed_and_a_restarted_one_is_not(second, sh
 def test_what_cannot_be_an_outline_is_unknown():
     message = strange([[400, 300, 1, 1, 8.0, 9.0, 0.1, 0.6]], camera="cam0", seq=0, t_ns=START_NS)
     frame = Path().intake.receive(encode(message), KEYS.detections("cam0"), START_NS, ARENA.cameras)
-    assert isinstance(frame, Frame)
+    assert isinstance(frame, CalibratedFrame)
     assert np.isnan(frame.roundels.axes_px).all()

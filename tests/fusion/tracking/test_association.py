@@ -7,9 +7,9 @@ import pytest
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import exp_so3
 from fusion._core import ExpectedMarkers
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Catalogue
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.association import Association
@@ -30,7 +30,7 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
     R = exp_so3(np.array([[0.4, -0.8, 1.1]]))
     v, still = random.normal(size=(1, 3)), np.zeros((1, 3))
     states = States(R, random.normal(size=(1, 3)), still, v, root @ root.transpose(0, 2, 1))
-    catalogue = Catalogue.of([WIDE])
+    catalogue = MarkerTable.of([WIDE])
     expected = ExpectedMarkers(states.R, states.P, catalogue.robot, catalogue.marker, catalogue.radius)
     found = expected.covariances(tau)
     steps = 1e-4 * np.eye(12)[:, None]
@@ -49,8 +49,8 @@ def test_of_two_that_stand_in_line_the_one_of_the_measured_size_is_seen(measured
     """One robot hides the other from the camera: what is seen is as large as it is, a third apart, though the other was
     expected where the roundel is and this one 1.5 px aside."""
     camera = ring(1)["cam0"]
-    optics = Optics({"cam0": camera})
-    catalogue = Catalogue.of([Robot(diameter_m=d, markers=((0.0, 0.0, 0.0),)) for d in (0.10, 0.13)])
+    optics = CameraArray({"cam0": camera})
+    catalogue = MarkerTable.of([Robot(diameter_m=d, markers=((0.0, 0.0, 0.0),)) for d in (0.10, 0.13)])
     T = camera.matrix()
     at = np.array([0.0, 0.0, 2.0])
     aside = 1.5 / camera.fx * at[2] * np.eye(3)[0]
@@ -64,5 +64,5 @@ def test_of_two_that_stand_in_line_the_one_of_the_measured_size_is_seen(measured
         seen.uv, seen.cov, np.full((1, 2), major), np.zeros(1), seen.ratio, seen.contrast, seen.id, seen.track
     )
     association = Association(optics, catalogue, states, np.ones(2, bool), 0, 0.1)
-    matches = association.whole(Instant(0, (Frame.measure("cam0", 0, seen, camera),)))[1]
+    matches = association.whole(FrameSet(0, (CalibratedFrame.measure("cam0", 0, seen, camera),)))[1]
     assert catalogue.robot[matches.disc].tolist() == [measured]

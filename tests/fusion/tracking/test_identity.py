@@ -8,9 +8,9 @@ import pytest
 
 from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
-from fusion.model.camera_array import Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Sightings
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.tracking.constellation import Fit, identify
 from fusion.tracking.multiview import Marker, group
@@ -112,9 +112,12 @@ def test_no_detection_is_in_two_markers():
     rng = np.random.default_rng(3)
     cameras = ring(4)
     noise = [Roundels.from_points(rng.uniform([20, 20], [780, 580], (60, 2)), 0.3) for _ in cameras]
-    frames = [Frame.measure(name, 0, seen, cameras[name]) for name, seen in zip(cameras, noise, strict=True)]
-    optics = Optics(cameras)
-    sightings = Sightings.of(Instant(0, tuple(frames)), optics, 0.0)
+    frames = [
+        CalibratedFrame.measure(name, 0, seen, cameras[name])
+        for name, seen in zip(cameras, noise, strict=True)
+    ]
+    optics = CameraArray(cameras)
+    sightings = DetectionTable.of(FrameSet(0, tuple(frames)), optics, 0.0)
     markers = group(optics, sightings, np.arange(len(sightings)), np.array([0.12]))
     taken = np.concatenate([marker.sightings for marker in markers])
     assert len(np.unique(taken)) == len(taken)

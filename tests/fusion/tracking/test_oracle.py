@@ -18,9 +18,9 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import CAUCHY, NOMINAL_WEIGHT
-from fusion.model.camera_array import Discs, Optics
-from fusion.model.frames import Frame, Instant
-from fusion.model.observations import Observations, Sightings
+from fusion.model.camera_array import CameraArray, Discs
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator, Prediction
 from tests.fusion.synthetic import ring
@@ -41,7 +41,7 @@ def test_the_estimator_agrees_with_a_graph_of_gtsams_own_factors(noise_px, outli
     prior = predicted(rng)
     seen = observed(prior.states, rng, noise_px, outliers)
     R, p, P = oracle(prior.states, seen)
-    estimator = Estimator(Optics(CAMERAS), np.full((1, 2), 10.0), np.array([False]))
+    estimator = Estimator(CameraArray(CAMERAS), np.full((1, 2), 10.0), np.array([False]))
     found, _ = estimator.update(prior, seen, 0.0)
     assert np.abs(found.p[0] - p).max() < 3e-7
     assert np.abs(found.R[0] - R).max() < 3e-7
@@ -53,10 +53,14 @@ def predicted(rng: np.random.Generator) -> Prediction:
     """A robot at rest, after a time so short that its pose keeps the prior's round covariance."""
     R, p = rotation_from_vector([0.1, -0.2, 0.7]), np.array([0.2, -0.1, 0.3])
     at = States.at_rest(R[None], p[None], (*SIGMAS, 1.0, 1.0))
-    return Estimator(Optics(CAMERAS), np.full((1, 2), 10.0), np.array([False])).predict(at, np.array([1e-3]))
+    return Estimator(CameraArray(CAMERAS), np.full((1, 2), 10.0), np.array([False])).predict(
+        at, np.array([1e-3])
+    )
 
 
-def observed(predicted: States, rng: np.random.Generator, noise_px: float, outliers: int) -> Observations:
+def observed(
+    predicted: States, rng: np.random.Generator, noise_px: float, outliers: int
+) -> MatchedObservations:
     """Every marker in every camera, of a robot about a sigma beside the prediction; noise along one axis is double."""
     R = predicted.R[0] @ rotation_from_vector(SIGMAS[0] * rng.normal(size=3))
     p = predicted.p[0] + SIGMAS[1] * rng.normal(size=3)
@@ -69,7 +73,7 @@ def observed(predicted: States, rng: np.random.Generator, noise_px: float, outli
     frames = []
     for name, points in zip(CAMERAS, np.split(uv, k), strict=True):
         roundels = replace(Roundels.from_points(points, noise_px), cov=cov)
-        frames.append(Frame.measure(name, 0, roundels, CAMERAS[name]))
+        frames.append(CalibratedFrame.measure(name, 0, roundels, CAMERAS[name]))
     discs = Discs(
         frame=np.repeat(np.arange(k), n),
         body=np.zeros(n * k, np.intp),
@@ -77,7 +81,9 @@ def observed(predicted: States, rng: np.random.Generator, noise_px: float, outli
         marker=np.tile(MARKERS.T, k),
         radius=np.full(n * k, 1e-6),
     )
-    return Observations.seeing(Sightings.of(Instant(0, tuple(frames)), Optics(CAMERAS), 0.0), discs)
+    return MatchedObservations.seeing(
+        DetectionTable.of(FrameSet(0, tuple(frames)), CameraArray(CAMERAS), 0.0), discs
+    )
 
 
 def placed(camera: Camera) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
@@ -86,7 +92,7 @@ def placed(camera: Camera) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
     return gtsam.Pose3(camera.matrix()), lens
 
 
-def oracle(predicted: States, seen: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def oracle(predicted: States, seen: MatchedObservations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, p and the covariance (6, 6) of the turn in the robot's frame and of p in the world."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     T = gtsam.Pose3(gtsam.Rot3(predicted.R[0]), predicted.p[0])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fusion.protocol.messages import Markers
-from fusion.server.frame_synchronizer import Instants
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 
@@ -14,7 +14,7 @@ AXIS_PX = 0.25  # what fusion takes a measured axis to be off by
 
 def told(arena: Arena, n: int, cameras: str, later: str = "", seconds: float = np.inf) -> list[Markers]:
     """The markers of n frames of these cameras, and after some seconds of the later ones too; no robot is there."""
-    tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}), Instants(33_333_333)
+    tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}), FrameSynchronizer(33_333_333)
     for frame in arena.frames(n):
         if frame.camera in cameras or (frame.camera in later and arena.seconds(frame.t_ns) > seconds):
             instants.add(frame)
@@ -61,7 +61,7 @@ def test_false_detections_are_not_told():
 def test_a_robots_own_markers_are_nobodys_to_no_camera(cameras: str):
     """Three markers of a followed robot, one of which a camera sees beside its gate for a while."""
     arena = Arena({"other": TRIANGLE}, {"other": line((0.1, 0.0, 0.2))}, sigma_px=0.1)
-    tracker, instants = Tracker(arena.cameras, arena.robots), Instants(33_333_333)
+    tracker, instants = Tracker(arena.cameras, arena.robots), FrameSynchronizer(33_333_333)
     for frame in arena.frames(20):
         if arena.seconds(frame.t_ns) < 0.3 or frame.camera in cameras:
             instants.add(frame)

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from fusion.model.frames import Frame
-from fusion.server.frame_synchronizer import Instants
+from fusion.model.frames import CalibratedFrame
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors, fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
@@ -171,7 +171,7 @@ def test_a_marker_of_nobody_has_position_velocity_and_normal(speed: float):
     for seed in range(30):
         motion = line((-0.1, 0.1, 0.3), velocity=(speed, -speed / 2, 0.1 * speed), tilt=(0.2, 0.1, 0.0))
         arena = Arena({"x": SINGLE}, {"x": motion}, sigma_px=0.1, seed=seed)
-        tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT), Instants(33_333_333)
+        tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT), FrameSynchronizer(33_333_333)
         for frame in arena.frames(10):
             instants.add(frame)
         *_, last = (tracker.fuse(instant) for instant in instants.finish()[:-1])
@@ -210,7 +210,7 @@ def test_detections_without_axes_are_enough(run_arena):
     for frame in arena.frames(20):
         roundels = frame.roundels
         bare = type(roundels).from_points(roundels.uv, 0.3)
-        frames.append(Frame.measure(frame.camera, frame.t_ns, bare, arena.cameras[frame.camera]))
+        frames.append(CalibratedFrame.measure(frame.camera, frame.t_ns, bare, arena.cameras[frame.camera]))
     fused = fuse(arena, frames)
     tracked = [pose for instant in fused for pose in instant.poses]
     assert len(tracked) >= 17
@@ -225,7 +225,7 @@ def test_late_frames_are_used_and_leave_the_covariance_honest():
     for seed in range(12):
         arena = Arena({"a": TRIANGLE}, {"a": circle}, sigma_px=0.1, seed=seed)
         tracker, closed = Tracker(arena.cameras, arena.robots, TIGHT), []
-        instants = Instants(33_333_333, 60_000_000)
+        instants = FrameSynchronizer(33_333_333, 60_000_000)
         arrivals = [(f.t_ns + (100_000_000 if f.camera == "cam1" else 0), f) for f in arena.frames(14)]
         for now_ns, frame in sorted(arrivals, key=lambda arrival: arrival[0]):
             instants.add(frame)

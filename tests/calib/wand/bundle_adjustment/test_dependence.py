@@ -5,12 +5,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from calib.commands.check import placed, split
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.quality.agreement import Agreement, compare
+from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import Arena, record, ring
@@ -27,16 +27,14 @@ def lasting(messages: list[Detections], seed: int) -> list[Detections]:
     moved = []
     for message in messages:
         k = names.index(message.camera)
-        off: NDArray[np.float64] = (
-            0.3 / np.sqrt(2) * np.sin(rate[k] * message.t_ns * 1e-9 + phase[k]).sum(axis=1)
-        )
+        off: Array = 0.3 / np.sqrt(2) * np.sin(rate[k] * message.t_ns * 1e-9 + phase[k]).sum(axis=1)
         seen = message.unpack()
         header = {name: getattr(message, name) for name in ("camera", "seq", "t_ns", "width", "height")}
         moved.append(Detections.pack(Roundels.from_points(seen.uv + off, 0.1, seen.id), **header))
     return moved
 
 
-def halves(arena: Arena, messages: list[Detections]) -> tuple[list[Calibration], Agreement]:
+def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibration], Agreement]:
     found = [calibrate(arena.intrinsics, arena.wand, half) for half in split(messages)]
     return found, compare(*map(placed, found))
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import told_sigma
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import place_one
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
@@ -25,7 +25,7 @@ def recorded(seed: int) -> Recorded:
     return record(Wave(cameras=6, seconds=12, rate_hz=30, seed=seed))
 
 
-def placed(seed: int, off: tuple[float, float, float], told: bool) -> Calibration:
+def placed(seed: int, off: tuple[float, float, float], told: bool) -> WandCalibration:
     result = calibrate(
         roughly(recorded(seed).intrinsics, off, told, seed), Wave().wand, recorded(seed).messages
     )

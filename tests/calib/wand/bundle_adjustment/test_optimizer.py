@@ -16,7 +16,7 @@ from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, unob
 from calib.wand.bundle_adjustment.trajectory import hermite_rate, interpolate, locate
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
-from calib.wand.initialization.two_view import Pairs
+from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import label
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
@@ -90,7 +90,7 @@ def test_clocks_far_apart_are_found_before_anything_else_is_known(recorded: Reco
     lenses = [recorded.truth.cameras[n] for n in names]
     frames, seen = gather(recorded.messages, names, lenses)
     labelled, _ = label(frames, seen, Wave().wand, lenses)
-    pairs = Pairs(labelled, lenses, Wave().wand, frames.period_s())
+    pairs = TwoViewGeometry(labelled, lenses, Wave().wand, frames.period_s())
     shared = np.triu(pairs.shared(), 1)
     for a, b in np.argwhere(shared > 40):
         pair = pairs.relate(int(a), int(b))

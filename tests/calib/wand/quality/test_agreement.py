@@ -4,7 +4,6 @@
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import kstest
 
 from calib.commands.check import placed, split
@@ -12,10 +11,9 @@ from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Placed, compare
+from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from tests.calib.synthetic import CAREFUL, Arena, record, ring, roughly
-
-Array = NDArray[np.float64]
 
 
 def covariance(cameras: int, rng: np.random.Generator) -> Array:

@@ -5,14 +5,14 @@ import msgspec
 import pytest
 
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
+from calib.wand.outcome import WandCalibration
 from tests.calib.synthetic import OLD, roughly
 from tests.calib.wave import EPOCH_S, Wave, record
 
 
 def waved(
     wave: Wave, camera: str = "", at_s: float = 0.0, ms: float = 0.0, rough: bool = False
-) -> Calibration:
+) -> WandCalibration:
     """Of a wave in which a camera's stamps jump."""
     recorded, at_ns = record(wave), (EPOCH_S + at_s) * 1e9
     messages = [

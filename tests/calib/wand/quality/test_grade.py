@@ -13,8 +13,8 @@ from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_o
 from calib.rig.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
 from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, State
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import Calibration
-from calib.wand.quality.grade import GRADES, LIMITS, CameraTrust, Trust, assess, grade
+from calib.wand.outcome import WandCalibration
+from calib.wand.quality.grade import GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
 from tests.calib.synthetic import record, ring
 from tests.calib.wand.quality.test_agreement import covariance, disturb
 
@@ -22,7 +22,7 @@ ALL = np.ones((4, 6), bool)
 
 
 @cache
-def calibrated() -> Calibration:
+def calibrated() -> WandCalibration:
     arena = ring(4)
     return calibrate(arena.intrinsics, arena.wand, record(arena, 8.0, sigma_px=0.1))
 
@@ -127,9 +127,9 @@ def test_a_good_wave_is_judged():
     assert set(told["trust"]) == {"cam0", "cam1", "cam2", "cam3"}
 
 
-def judged(name: str, **figures: float) -> CameraTrust:
+def judged(name: str, **figures: float) -> CameraQuality:
     good = {"residual_px": 0.1, "rejected": 0.0, "pose_px": 0.02, "unused": 0.1}
-    return CameraTrust(name, Coverage(np.ones((4, 6), np.int64)), ALL, good | figures)
+    return CameraQuality(name, Coverage(np.ones((4, 6), np.int64)), ALL, good | figures)
 
 
 @pytest.mark.parametrize(
@@ -143,15 +143,15 @@ def judged(name: str, **figures: float) -> CameraTrust:
 )
 def test_the_guilty_camera_is_named(criterion: str, says: str):
     for k, limit in enumerate(LIMITS[criterion]):
-        trust = Trust([judged("good"), judged("bad", **{criterion: 1.01 * limit})], {}, 1e-4, None)
+        trust = RigQuality([judged("good"), judged("bad", **{criterion: 1.01 * limit})], {}, 1e-4, None)
         assert trust.grade == GRADES[k + 1]
         assert f"camera 'bad', {says}" in trust.sentence() or says in trust.sentence()
         assert "'good'" not in trust.sentence()
 
 
 def test_grades_of_the_whole():
-    assert Trust([judged("a")], {}, 1e-4, None).sentence() == "grade A: every camera is placed well"
-    told = Trust([judged("a")], {"b": "never saw the wand; wave before it"}, None, None).sentence()
+    assert RigQuality([judged("a")], {}, 1e-4, None).sentence() == "grade A: every camera is placed well"
+    told = RigQuality([judged("a")], {"b": "never saw the wand; wave before it"}, None, None).sentence()
     assert told == "grade D: camera 'b' has no place: never saw the wand; wave before it"
-    assert "wand's length is 3.00% off" in Trust([judged("a")], {}, 0.03, None).sentence()
-    assert Trust([judged("a", pose_px=float("nan"))], {}, None, None).grade == "D"
+    assert "wand's length is 3.00% off" in RigQuality([judged("a")], {}, 0.03, None).sentence()
+    assert RigQuality([judged("a", pose_px=float("nan"))], {}, None, None).grade == "D"
