@@ -5,7 +5,6 @@ import sys
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from calib.commands.check import Check
 from calib.commands.intrinsics import Intrinsics
@@ -14,6 +13,7 @@ from calib.commands.undo import Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
 from camera_node.errors import run
+from camera_node.terminal import console
 
 Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]
@@ -34,7 +34,7 @@ def execute(arguments: list[str]) -> None:
     """Do what the command line asks; `--undo` first is the subcommand `undo`."""
     if arguments[:1] == ["--undo"]:
         arguments = ["undo", *arguments[1:]]
-    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute(Console())
+    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute(console())
 
 
 if __name__ == "__main__":

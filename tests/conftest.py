@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What several folders of tests need, and in which order they run where `make test` runs them on all cores."""
 
+import fcntl
 import os
+import random
 import re
 import shutil
 import signal
 import socket
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -16,6 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 WAVE_S = 8.0  # enough for every camera of the demo to see the wand in most of its image
 
 LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py")
+PORTS = range(20_000, 30_000)  # below those that Linux, macOS and Windows give away by themselves
+_locked_ports: list[IO[str]] = []
 BEHIND = 10  # the niceness of tests that only compute
 
 # A shell that runs the tests in the background has them, and the programs that they start, ignore Ctrl-C.
@@ -43,9 +49,22 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return probe.getsockname()[1]
+    """A TCP port of this process alone, until it ends, and of nobody else on this machine as long as it is in use.
+
+    It is not one that the system gives away by itself, to an outgoing connection for instance. A locked file keeps the
+    tests of other processes off it.
+    """
+    for port in random.Random(os.urandom(8)).sample(PORTS, len(PORTS)):
+        file = (Path(tempfile.gettempdir()) / f"roundel-test-port-{os.getuid()}-{port}").open("w")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            socket.create_server(("127.0.0.1", port)).close()
+        except OSError:
+            file.close()
+            continue
+        _locked_ports.append(file)
+        return port
+    raise RuntimeError(f"no free port in {PORTS}")
 
 
 def wait_for_port(port: int, deadline_s: float = 120.0) -> None:

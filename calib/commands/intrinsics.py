@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress import track
 
 from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
@@ -19,6 +18,7 @@ from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
 from calib.intrinsics.residual_plot import draw_residuals, save_map
 from calib.rig.rig import load_rig
 from camera_node.errors import ConfigError
+from camera_node.terminal import progress_console, track
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +70,14 @@ class Intrinsics:
         for name, path in find_cameras(self.frames, self.camera).items():
             views = BoardViews(name, finder)
             pictures = read_frames(path)
-            for picture, image in track(
-                pictures, f"finding the board for {name}", transient=True, console=console
-            ):
+            for picture, image in track(pictures, f"finding the board for {name}"):
                 views.add(picture, image)
             yield views
 
     def _watch(self, views: BoardViews, console: Console) -> BoardViews:
         with self.server.open() as session:
             pictures = take_snapshots(session, self.server.arena, views.camera, self.seconds)
-            with Live(console=console, transient=True) as live:
+            with Live(console=progress_console(), transient=True) as live:
                 say(console, show_board(views, pictures, self.model, live.update))
         return views
 

@@ -14,6 +14,7 @@ from calib.intrinsics.residual_plot import draw_residuals, save_map
 from calib.rig.rig import Rig, save_rig
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
+from camera_node import terminal
 from camera_node.errors import ConfigError
 
 
@@ -47,7 +48,7 @@ def save_maps(folder: Path, result: WandCalibration, trust: RigQuality, console:
 
 def say(console: Console, text: str) -> None:
     """One line as it stands."""
-    console.print(text, highlight=False, soft_wrap=True, markup=False)
+    terminal.say(text, console)
 
 
 def provenance() -> dict[str, Any]:

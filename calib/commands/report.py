@@ -13,6 +13,7 @@ from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lens_change import describe, find_changes
 from calib.wand.quality.lens_shape import find_misfit
 from calib.wand.report import WandReport
+from camera_node.terminal import say
 
 WIDENED = 1.2  # below, it is not worth a line
 CLEAR = 3.0  # sigmas: below, a drift is not worth one either
@@ -50,7 +51,7 @@ def print_report(result: WandCalibration, trust: RigQuality, console: Console) -
         *trust.spoilt(),
         trust.sentence(),
     ]:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        say(line, console)
 
 
 def _drifts(result: WandCalibration) -> list[str]:

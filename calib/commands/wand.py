@@ -28,6 +28,7 @@ from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from camera_node.terminal import progress_console
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +165,7 @@ class Wand:
     ) -> tuple[CollectedFrames, str]:
         # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
         trials = self.seconds is None or console.is_terminal
-        with Live(console=console, transient=True) as live:
+        with Live(console=progress_console(), transient=True) as live:
             return wave(
                 session,
                 self.server.arena,

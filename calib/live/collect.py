@@ -17,6 +17,7 @@ from calib.rig.coverage import Coverage
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
+from camera_node.terminal import progress_console
 
 DELIVERY_S = 2.0  # for the rig to reach whoever listens
 LOOK_EVERY_S = 0.2
@@ -112,7 +113,7 @@ def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> C
         CalibrationError: nothing came.
     """
     columns = (TextColumn(doing), BarColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, transient=True) as progress:
+    with Progress(*columns, transient=True, console=progress_console()) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
 
         def show(heard: CollectedFrames, passed: float) -> str:

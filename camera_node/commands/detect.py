@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from camera_node.arrays import Grey
@@ -20,6 +19,7 @@ from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens, load_lens
 from camera_node.sources.replay import read_grey
+from camera_node.terminal import console
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class Detect:
         if self.json:
             print(json.dumps({"file": str(path), "roundels": rows}))
         else:
-            Console().print(_table(path, rows))
+            console().print(_table(path, rows))
 
     def _draw(self, image: Grey, roundels: Roundels) -> None:
         if self.draw is None:

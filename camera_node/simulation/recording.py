@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import msgspec
-from rich.progress import track
 
 from camera_node.config import write_atomically
 from camera_node.errors import CameraError, ConfigError
@@ -16,6 +15,7 @@ from camera_node.geometry.pose import invert
 from camera_node.simulation.camera import exposure_middle_s
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import WAND, Scene, SceneCamera
+from camera_node.terminal import track
 
 
 def render_recording(
@@ -47,7 +47,7 @@ def render_recording(
     write_atomically(folder / "rig.yaml", msgspec.yaml.encode({"cameras": entries}).decode())
     for name, indices in exposures.items():
         renderer = Renderer(scene, name)
-        for index in track(indices, f"rendering {name}", transient=True):
+        for index in track(indices, f"rendering {name}"):
             t_s = exposure_middle_s(scene.camera(name), index)
             path = folder / name / f"{epoch_ns + round(t_s * 1e9):015d}.png"
             if not cv2.imwrite(str(path), renderer.render(t_s, index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import CameraError, ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.replay import FolderSource
+from camera_node.terminal import track
 
 SIGMA_PX = 0.3  # of a centre whose file does not say better
 Rows = dict[tuple[int, str], list[tuple[float, float, int]]]
@@ -49,9 +49,7 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
             width=frame.image.shape[1],
             height=frame.image.shape[0],
         )
-        for name, seq, frame in track(
-            frames, f"detecting in {folder}", sum(map(len, sources.values())), transient=True
-        )
+        for name, seq, frame in track(frames, f"detecting in {folder}", sum(map(len, sources.values())))
     ]
     return sorted(found, key=lambda message: message.t_ns)
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from calib.rig.camera import Camera
 from calib.rig.recording import RecordingWriter, iterate
@@ -18,6 +17,7 @@ from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.observations import detect_frames, read_observations
+from camera_node.terminal import track
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.robots import Robot, load_robots
 from fusion.protocol.messages import RobotPose
@@ -183,7 +183,7 @@ def replay(
         recorded.detections, cameras, declared, rate_hz, None, summary.faults, smooth, summary.moves
     )
     if out.suffix == ".mcap":
-        _copy(recording, out, track(fused, "fusing", transient=True), summary)
+        _copy(recording, out, track(fused, "fusing"), summary)
         print("\n".join([*summary.lines(declared), f"wrote {out}"]))
     else:
         _tell(fused, out, summary, declared)
@@ -200,7 +200,7 @@ def _tell(fused: Iterable[Fused], out: Path, summary: Summary, robots: Iterable[
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS.split(","))
-    for instant in track(fused, "fusing", transient=True):
+    for instant in track(fused, "fusing"):
         summary.add(instant)
         writer.writerows(map(_row, instant.poses))
     write_atomically(out, text.getvalue())

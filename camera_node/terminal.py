@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The one place where all programs print: results on stdout, progress on stderr.
+
+Lines are wrapped on a terminal only. What another program reads from a pipe, or a test, does not depend on a width.
+"""
+
+import sys
+from collections.abc import Iterable
+from typing import IO, TypeVar
+
+from rich.console import Console
+from rich.progress import track as _track
+
+T = TypeVar("T")
+UNLIMITED = 10_000  # columns where the output is not a terminal
+
+
+def console() -> Console:
+    """A console on stdout."""
+    return _console_on(sys.stdout)
+
+
+def progress_console() -> Console:
+    """A console on stderr, for progress bars and live displays: they stay out of a pipe."""
+    return _console_on(sys.stderr)
+
+
+def say(text: str, on: Console | None = None) -> None:
+    """Print one line as it is, without markup and without a line break inside."""
+    (on or console()).print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def track(steps: Iterable[T], description: str, total: float | None = None) -> Iterable[T]:
+    """The steps, with a progress bar that disappears at the end."""
+    return _track(steps, description, total, console=progress_console(), transient=True)
+
+
+def _console_on(stream: IO[str]) -> Console:
+    return Console(file=stream, width=None if stream.isatty() else UNLIMITED, emoji=False)
