@@ -21,8 +21,8 @@ def console() -> Console:
 
 
 def progress_console() -> Console:
-    """A console on stderr, for progress bars and live displays: they stay out of a pipe."""
-    return _console_on(sys.stderr)
+    """A console on stderr, for progress bars and live displays; silent where stderr is not a terminal."""
+    return _console_on(sys.stderr, quiet=not sys.stderr.isatty())
 
 
 def say(text: str, on: Console | None = None) -> None:
@@ -35,5 +35,5 @@ def track(steps: Iterable[T], description: str, total: float | None = None) -> I
     return _track(steps, description, total, console=progress_console(), transient=True)
 
 
-def _console_on(stream: IO[str]) -> Console:
-    return Console(file=stream, width=None if stream.isatty() else UNLIMITED, emoji=False)
+def _console_on(stream: IO[str], quiet: bool = False) -> Console:
+    return Console(file=stream, width=None if stream.isatty() else UNLIMITED, emoji=False, quiet=quiet)

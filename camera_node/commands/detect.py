@@ -19,7 +19,7 @@ from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens, load_lens
 from camera_node.sources.replay import read_grey
-from camera_node.terminal import console
+from camera_node.terminal import console, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,9 @@ class Detect:
         if self.json:
             print(json.dumps({"file": str(path), "roundels": rows}))
         else:
-            console().print(_table(path, rows))
+            say(f"{path}: {len(rows)} roundel{'' if len(rows) == 1 else 's'}")
+            if rows:
+                console().print(_table(rows))
 
     def _draw(self, image: Grey, roundels: Roundels) -> None:
         if self.draw is None:
@@ -127,8 +129,8 @@ def _add_poses(rows: list, roundels: Roundels, detector: Detector, lens: Lens, d
         ]
 
 
-def _table(path: Path, rows: list[dict[str, Any]]) -> Table:
-    table = Table(title=f"{path}: {len(rows)} roundel{'' if len(rows) == 1 else 's'}", title_justify="left")
+def _table(rows: list[dict[str, Any]]) -> Table:
+    table = Table()
     for heading in ("u", "v", "sigma px", "major px", "minor px", "angle deg", "ratio", "contrast"):
         table.add_column(heading, justify="right")
     if any(row.get("poses") for row in rows):

@@ -45,7 +45,7 @@ def test_a_rig_adds_both_poses(image: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_a_table_and_a_drawing(image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Detect(images=(image,), draw=tmp_path / "out.png").run()
-    assert "1 roundel" in capsys.readouterr().out
+    assert f"{image}: 1 roundel\n" in capsys.readouterr().out
     drawn = cv2.imread(str(tmp_path / "out.png"))
     assert drawn is not None
     assert (drawn.max(axis=2) != drawn.min(axis=2)).any()
