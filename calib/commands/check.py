@@ -14,8 +14,8 @@ from calib.commands.output import check_folder, provenance, save_maps, say, writ
 from calib.commands.recording import read_recording
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
+from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig, load_rig
-from calib.wand.bundle_adjustment.problem import LENS, POSE
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.agreement import Agreement, Placed, compare

@@ -8,10 +8,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import written
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, WandObservations
+from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.quality.clock_jump import ClockJump, find_jump
 from calib.wand.quality.lengths import measure_lengths
 from calib.wand.quality.lens_change import find_changes

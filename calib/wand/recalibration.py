@@ -8,11 +8,12 @@ import msgspec
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import LENS, OFFSET, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.lens_prior import settle, written
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import LENS, OFFSET, POSE, WandObservations
+from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.calibrate import check_recording, gather_wave, read
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.outcome import clock_values

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import POSE
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import POSE, unobserved
+from calib.wand.bundle_adjustment.problem import unobserved
 
 SIGMA_M = 0.005  # of a tape's reading from one lens to another: where in it the centre is, nobody sees
 CLEAR = 3.0  # sigmas, beyond which measures contradict each other

@@ -6,24 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.disc_centres import centre_offsets
 from calib.wand.bundle_adjustment.lens_prior import settle
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import (
-    CRYSTAL,
-    DRIFT,
-    LENS,
-    OFFSET,
-    POSE,
-    SLEWED,
-    Problem,
-    State,
-    WandObservations,
-)
-from calib.wand.bundle_adjustment.trajectory import acceleration_density
+from calib.wand.bundle_adjustment.problem import CRYSTAL, SLEWED, Problem, State, WandObservations
 from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
+from calib.wand.trajectory import acceleration_density
 from calib.wand.wave import Wave
 from camera_node.arrays import Array
 

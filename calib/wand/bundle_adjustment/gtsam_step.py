@@ -6,8 +6,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from calib.rig.camera import PER_CAMERA
 from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, Problem
+from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Index
 
 NUMBERS = 24  # of one variable, at the least: fewer and larger factors, though most of their entries are zero

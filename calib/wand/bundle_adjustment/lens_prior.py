@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.rig.camera import Camera
+from calib.rig.camera import LENS, Camera
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS, Problem
+from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 

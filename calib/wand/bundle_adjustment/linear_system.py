@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import pixel_jacobians
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, SHAPE, Problem, State, WandObservations
-from calib.wand.bundle_adjustment.trajectory import Place, hermite_rate, interpolate, locate, whitened_motion
+from calib.rig.camera import PER_CAMERA, POSE, SHAPE, pixel_jacobians
+from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
+from calib.wand.trajectory import Place, hermite_rate, interpolate, locate, whitened_motion
 from camera_node.arrays import Array, Index, Mask
 
 Term = tuple[tuple[int, ...], tuple[Array, ...], NDArray]  # cameras, Jacobians, right-hand side

@@ -6,17 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import with_distortion
-from calib.wand.bundle_adjustment.trajectory import AffineWand
+from calib.rig.camera import PER_CAMERA, POSE, SHAPE, with_distortion
+from calib.wand.trajectory import AffineWand
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
-PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
 SHAKES = 4  # rounds in which lengths that depend on each other are set
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-# Taken for known, but tested: log fx / fy, and the three distortion numbers after k1.
-SHAPE = (12, 13, 14, 15)
 SHAPE_SIGMA = [0.02, 0.3, 0.02, 0.02]
 POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]  # before anything is seen
 SLEWED, CRYSTAL = 5e-4, 3e-5  # s/s by which clocks drift: while they are set, and left alone (50 ppm at most)

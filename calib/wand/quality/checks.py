@@ -7,10 +7,11 @@ from itertools import combinations
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
+from calib.rig.camera import LENS
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS, WandObservations
+from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.detections import WandDetections, ranges
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lengths import distances, free_markers

@@ -12,20 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import (
-    CRYSTAL,
-    DRIFT,
-    LENS,
-    OFFSET,
-    POSE,
-    SLEWED,
-    Problem,
-    State,
-    WandObservations,
-)
+from calib.wand.bundle_adjustment.problem import CRYSTAL, SLEWED, Problem, State, WandObservations
 from camera_node.arrays import Array
 
 # A jump that leaves neither of these has not touched the rig: rejected part of a camera's markers, and drift, s/s.

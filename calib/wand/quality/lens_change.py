@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from calib.rig.camera import LENS
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 

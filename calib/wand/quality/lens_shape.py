@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.rig.camera import SHAPE
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import SHAPE, WandObservations
+from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.bundle_adjustment.schur_complement import marginalise
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens

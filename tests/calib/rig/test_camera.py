@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from calib.rig.camera import pixel_jacobians, with_distortion
-from calib.wand.bundle_adjustment.problem import LENS, PER_CAMERA, POSE, State
+from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians, with_distortion
+from calib.wand.bundle_adjustment.problem import State
 from camera_node.geometry.lens import Lens
 
 SIZE = {"width": 1280, "height": 800, "fx": 810.0, "fy": 805.0, "cx": 633.0, "cy": 404.0}

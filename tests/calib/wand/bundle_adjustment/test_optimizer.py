@@ -9,15 +9,16 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.disc_centres import displacement
 from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, unobserved
-from calib.wand.bundle_adjustment.trajectory import hermite_rate, interpolate, locate
+from calib.wand.bundle_adjustment.problem import unobserved
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import label
+from calib.wand.trajectory import hermite_rate, interpolate, locate
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
 from camera_node.protocol.messages import Detections

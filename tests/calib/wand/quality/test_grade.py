@@ -9,9 +9,10 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.plan.precision import map_precision
+from calib.rig.camera import PER_CAMERA, POSE
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.rig.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, State
+from calib.wand.bundle_adjustment.problem import State
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
