@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses as people write them (`position_m`, `wxyz`) and as mathematics uses them (a 4x4 matrix).
+"""Poses as in YAML files (`position_m`, `wxyz`) and as 4x4 matrices, and conversions between forms of rotations.
 
 `p_world = T_world_cam @ p_cam`: adjacent names cancel.
 """
@@ -14,7 +14,7 @@ from camera_node.arrays import Array
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A rigid motion as it stands in a YAML file: metres, and a quaternion w, x, y, z of any length but zero."""
+    """A pose as in a YAML file: position in metres, and a quaternion w, x, y, z of any length except zero."""
 
     position_m: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -102,22 +102,22 @@ def skew(vectors: ArrayLike) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """(6, 6) how a (4, 4) rigid motion carries a twist, rotation first: T Exp(xi) = Exp(Ad xi) T."""
+    """(6, 6) adjoint of a (4, 4) rigid motion, for twists with rotation first: T Exp(xi) = Exp(Ad xi) T."""
     R, p = T[:3, :3], T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
 
 def look_at(position: ArrayLike, target: ArrayLike) -> Array:
-    """T_world_cam (4, 4) of a camera at `position` that looks at `target`, its image upright (world z up).
+    """T_world_cam (4, 4) of a camera at `position` that looks at `target`, with an upright image (world z up).
 
     Raises:
-        ValueError: the target stands straight above or below the camera, where upright has no meaning.
+        ValueError: the target is exactly above or below the camera, where no upright image is defined.
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     z = target - position
     x = np.cross(z, [0.0, 0.0, 1.0])
     if np.linalg.norm(x) < 1e-9:
-        raise ValueError("the target stands straight above or below the camera")
+        raise ValueError("the camera's target is exactly above or below it; move one of them sideways")
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
@@ -126,7 +126,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Array:
 
 
 def rigid_motions(source: Array, target: Array) -> Array:
-    """The motions (..., 4, 4) T that bring `source` (..., N, 3) nearest to `target`: target ~ T source.
+    """(..., 4, 4) rigid motions T with the least squared distances between T `source` and `target`, both (..., N, 3).
 
     Kabsch 1976; Umeyama 1991 without scale.
     """

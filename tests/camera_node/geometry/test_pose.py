@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses form a group, and quaternions lose nothing."""
+"""Poses form a group, and conversions between forms of rotations are exact."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ half_turns = st.tuples(st.just(0.0), *[st.floats(-1, 1)] * 3).filter(lambda q: n
 
 @given(poses, poses, poses)
 def test_poses_form_a_group(a: Pose, b: Pose, c: Pose):
-    """Associative, with inverse on either side; entries reach 50, hence the factor."""
+    """Associative, with an inverse on both sides; entries reach 50, hence the factor."""
     A, B, C = a.matrix(), b.matrix(), c.matrix()
     np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=50 * EPS)
     np.testing.assert_allclose(A @ invert(A), np.eye(4), atol=50 * EPS)
@@ -36,7 +36,7 @@ def test_poses_form_a_group(a: Pose, b: Pose, c: Pose):
 
 
 @given(quaternions | half_turns)
-def test_a_rotation_survives_its_quaternion(q: tuple[float, ...]):
+def test_a_rotation_is_recovered_from_its_quaternion(q: tuple[float, ...]):
     """Also a half turn, where w is 0 and the trace holds no information."""
     R = rotation_from_wxyz(q)
     wxyz = wxyz_from_rotation(R)
@@ -48,7 +48,7 @@ def test_a_rotation_survives_its_quaternion(q: tuple[float, ...]):
 
 
 @given(poses)
-def test_a_pose_survives_its_matrix(pose: Pose):
+def test_a_pose_is_recovered_from_its_matrix(pose: Pose):
     np.testing.assert_allclose(Pose.from_matrix(pose.matrix()).matrix(), pose.matrix(), atol=EPS)
 
 
@@ -64,7 +64,7 @@ def test_stacks_of_rotations_equal_single_ones_and_keep_their_vectors(vectors: l
     np.testing.assert_allclose(vector_from_rotation(R), stack, atol=1e3 * EPS)
 
 
-def test_a_vector_turns_about_its_axis():
+def test_a_vector_is_a_rotation_about_its_axis():
     np.testing.assert_allclose(rotation_from_vector([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=EPS)
     np.testing.assert_allclose(rotation_from_vector([0, 0, 0]), np.eye(3), atol=EPS)
 
@@ -79,7 +79,7 @@ def test_a_camera_looks_at_its_target_upright():
 
 
 def test_a_camera_that_looks_straight_down_is_refused():
-    with pytest.raises(ValueError, match="straight above"):
+    with pytest.raises(ValueError, match="exactly above"):
         look_at([0, 0, 3], [0, 0, 0])
 
 
@@ -91,7 +91,7 @@ def test_impossible_poses_are_refused(pose: tuple):
 
 @given(poses, st.tuples(*[st.floats(-0.5, 0.5)] * 3), st.tuples(coordinate, coordinate, coordinate))
 def test_the_adjoint_transforms_a_twist(pose: Pose, turn: tuple[float, ...], shift: tuple[float, ...]):
-    """T Exp(xi) = Exp(Ad xi) T, by the exponential of 4x4 matrices as SciPy computes it."""
+    """T Exp(xi) = Exp(Ad xi) T, with SciPy's exponential of 4x4 matrices."""
     T, xi = pose.matrix(), np.array([*turn, *shift])
     np.testing.assert_allclose(T @ expm(_hat(xi)), expm(_hat(adjoint(T) @ xi)) @ T, atol=1e4 * EPS)
 

@@ -121,7 +121,7 @@ def test_rig_entries_are_a_rig_without_poses(demo, tmp_path):
         ({"wand": "gone.yaml"}, "gone.yaml does not exist"),
         ({"cameras": {}}, "no camera"),
         ({"cameras": {"cam0": CAMERA | {"fsp": 30}}}, "fsp"),
-        ({"cameras": {"cam0": CAMERA | {"look_at_m": [0.0, -0.6, 0.0]}}}, "straight above"),
+        ({"cameras": {"cam0": CAMERA | {"look_at_m": [0.0, -0.6, 0.0]}}}, "exactly above"),
         ({"cameras": {"cam0": CAMERA | {"exposure_us": 1e6}}}, "exposure_us"),
         ({"cameras": {"cam0": CAMERA | {"fx": -1.0}}}, "focal"),
         ({"robot_motions": {}}, "robot 'disc'"),
