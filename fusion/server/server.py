@@ -22,6 +22,7 @@ from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of
+from camera_node.protocol.session import listening_endpoints
 from fusion.model.frames import FrameSet
 from fusion.model.robots import changed, load_kept_robots, load_robots, save_robots
 from fusion.protocol.messages import (
@@ -55,6 +56,8 @@ BACK_NS = 1_000_000_000  # by which this machine's clock may be set back without
 class Server:
     """One arena's server; a context manager. `run` serves until `stop` or an exception such as Ctrl-C.
 
+    `endpoints` are those at which it is reached; after entry a port in `listen` that was 0 is the real one.
+
     Raises, at entry:
         NetworkError: an endpoint is taken.
         ConfigError, FusionError, CalibrationError: a file is missing, broken, or declares what can't be tracked.
@@ -63,6 +66,7 @@ class Server:
     def __init__(self, config: ArenaConfig) -> None:
         self.config = config
         self.keys = Keys(config.arena)
+        self.endpoints = config.listen
         self.shard = Shard.parse(config.shard)
         self._own_key = shard_key(config.arena, self.shard.index)
         given = Path(config.robots)
@@ -82,11 +86,13 @@ class Server:
     def __enter__(self) -> "Server":
         with self._closing as stack:
             self.session = stack.enter_context(open_session(self.config, self.shard))
+            if self.shard.leads:
+                self.endpoints = listening_endpoints(self.session, self.config.listen)
             self.link = Transport(self.session, self.health.count, stack)
             self._declare()
             self._closing = stack.pop_all()
         verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
-        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
+        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.endpoints))
         if self._tracker is None:
             log.warning("no camera has a place yet: wave the wand, python -m calib wand --live --help")
         return self

@@ -11,9 +11,10 @@ from pathlib import Path
 import msgspec
 import zenoh
 
+from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.requests import respond
-from camera_node.protocol.session import open_client, open_router
+from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
 
@@ -26,10 +27,15 @@ def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
 
     Raises:
         NetworkError: an endpoint is taken.
+        ConfigError: another shard is to connect to port 0.
     """
     zenoh_config = Path(config.zenoh) if config.zenoh else None
     if shard.leads:
         return open_router(config.listen, zenoh_config)
+    if has_assigned_port(config.listen):
+        raise ConfigError(
+            f"shard {config.shard} connects to {' '.join(config.listen)}; give the first shard's port in --listen"
+        )
     return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config)
 
 

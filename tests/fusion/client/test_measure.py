@@ -132,7 +132,7 @@ def running(folder: Path) -> Iterator[tuple[str, Client]]:
         cameras.start()
         try:
             until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-            yield settings.listen[0], client
+            yield server.endpoints[0], client
         finally:
             over.set()
             cameras.join()

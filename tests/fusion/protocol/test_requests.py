@@ -68,14 +68,13 @@ def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
 
 
 def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
-    settings = config(tmp_path)
-    with serving(settings) as (server, client):
+    with serving(config(tmp_path)) as (server, client):
         with pytest.raises(FusionError, match="nothing to undo"):
             client.undo_correction()
         moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
         server.link.put(lambda: server.calibration.correct("cam1", moved))
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
-        words = [sys.executable, "-m", "fusion", "undo", "--connect", settings.listen[0], "--arena", "test"]
+        words = [sys.executable, "-m", "fusion", "undo", "--connect", server.endpoints[0], "--arena", "test"]
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
         assert done.stdout == "cam1 is back where it stood, and is not watched any more\n"
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)

@@ -111,7 +111,10 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
     arena = Arena(robots, {name: line(at) for name, at in places.items()}, sigma_px=0.05)
     first = msgspec.structs.replace(config(tmp_path), shard="1/2", limits=Limits(lateness_ms=200))
     (tmp_path / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": msgspec.to_builtins(robots)}))
-    with serving(first) as (server, client), Server(msgspec.structs.replace(first, shard="2/2")) as second:
+    with contextlib.ExitStack() as stack:
+        server, client = stack.enter_context(serving(first))
+        other_shard = msgspec.structs.replace(first, shard="2/2", listen=server.endpoints)
+        second = stack.enter_context(Server(other_shard))
         thread = threading.Thread(target=second.run)
         thread.start()
         try:

@@ -72,8 +72,7 @@ def test_what_is_no_recording_is_said(tmp_path, content):
 
 
 def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
-    settings = config(tmp_path)
-    with serving(settings) as (server, client):
+    with serving(config(tmp_path)) as (server, client):
         done = threading.Event()
 
         def keep_sending() -> None:
@@ -84,7 +83,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
         sender = threading.Thread(target=keep_sending)
         sender.start()
         try:
-            record(tmp_path / "live.mcap", connect=settings.listen, arena="test", seconds=4.0)
+            record(tmp_path / "live.mcap", connect=server.endpoints, arena="test", seconds=4.0)
         finally:
             done.set()
             sender.join(60.0)

@@ -16,13 +16,13 @@ import pytest
 
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, save_rig
-from camera_node.errors import NetworkError
+from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, Detections, Keys, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits
-from tests.conftest import ROOT, free_port
+from tests.conftest import ROOT
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
@@ -38,7 +38,7 @@ def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
     rig = str(folder / "rig.yaml") if with_rig else None
     return ArenaConfig(
         arena="test",
-        listen=(f"tcp/127.0.0.1:{free_port()}",),
+        listen=("tcp/127.0.0.1:0",),
         rig=rig,
         robots=str(folder / "robots.yaml"),
         limits=Limits(lateness_ms=5000),  # frames are sent in one burst: every instant waits to be complete
@@ -51,7 +51,7 @@ def serving(settings: ArenaConfig) -> Iterator[tuple[Server, Client]]:
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
-            with Client.connect(*settings.listen, arena="test") as client:
+            with Client.connect(*server.endpoints, arena="test") as client:
                 until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
                 yield server, client
         finally:
@@ -154,7 +154,7 @@ def test_what_waits_for_the_server_is_late_only_if_it_is_far_behind(tmp_path, mo
     """Frames came in time, and the server was busy meanwhile with something else."""
     monkeypatch.setattr("fusion.server.server.BEHIND_NS", behind_ns)
     settings = msgspec.structs.replace(config(tmp_path), limits=Limits(lateness_ms=50))
-    with Server(settings) as server, Client.connect(*settings.listen, arena="test") as client:
+    with Server(settings) as server, Client.connect(*server.endpoints, arena="test") as client:
         until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
         poses = []
         client.robot("a").on_pose(poses.append)
@@ -193,7 +193,33 @@ def test_the_clock_is_answered(tmp_path):
 
 def test_a_taken_port_is_said(tmp_path):
     settings = config(tmp_path)
-    with serving(settings), pytest.raises(NetworkError, match="can't listen on"), Server(settings):
+    with serving(settings) as (server, _):
+        taken = msgspec.structs.replace(settings, listen=server.endpoints)
+        with pytest.raises(NetworkError, match="can't listen on"), Server(taken):
+            pass
+
+
+def test_a_server_on_port_0_writes_the_endpoint_that_clients_reach(tmp_path):
+    """`python -m fusion --listen tcp/127.0.0.1:0 --endpoints-file PATH`."""
+    settings, path = config(tmp_path), tmp_path / "endpoints"
+    assert settings.rig is not None
+    files = ["--rig", settings.rig, "--robots", settings.robots, "--endpoints-file", str(path)]
+    words = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
+    pause = threading.Event()
+    with subprocess.Popen(words, cwd=ROOT) as process:
+        try:
+            (endpoint,) = until(lambda: pause.wait(0.05) or (path.exists() and path.read_text().splitlines()))
+            with Client.connect(endpoint, arena="test") as client:
+                rig = client.rig(DEADLINE_S)
+                assert rig is not None
+                assert rig.cameras == ARENA.cameras
+        finally:
+            process.terminate()
+
+
+def test_another_shard_does_not_connect_to_port_0(tmp_path):
+    settings = msgspec.structs.replace(config(tmp_path), listen=("tcp/127.0.0.1:0",), shard="2/2")
+    with pytest.raises(ConfigError, match="2/2 connects to tcp/"), Server(settings):
         pass
 
 
