@@ -208,7 +208,8 @@ def test_a_server_on_port_0_writes_the_endpoint_that_clients_reach(tmp_path):
     pause = threading.Event()
     with subprocess.Popen(words, cwd=ROOT) as process:
         try:
-            (endpoint,) = until(lambda: pause.wait(0.05) or (path.exists() and path.read_text().splitlines()))
+            until(lambda: pause.wait(0.05) or path.exists())
+            (endpoint,) = path.read_text().splitlines()
             with Client.connect(endpoint, arena="test") as client:
                 rig = client.rig(DEADLINE_S)
                 assert rig is not None
