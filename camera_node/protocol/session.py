@@ -14,12 +14,16 @@ from camera_node.errors import ConfigError, NetworkError
 
 log = logging.getLogger("camera_node.network")
 
+REPORT_S = 5.0  # for a router's report on itself
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
+ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
     """Open the server's session, which is the arena's Zenoh router.
+
+    The operating system chooses the port of an endpoint such as tcp/127.0.0.1:0; `listening_endpoints` reads it.
 
     Raises:
         NetworkError: an endpoint is taken or invalid.
@@ -27,6 +31,8 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
     """
     # With a listening timeout other than 0, opening succeeds although the port is taken.
     options = {"listen/endpoints": list(listen), "listen/timeout_ms": 0, "listen/exit_on_failure": True}
+    if has_assigned_port(listen):
+        options |= {"adminspace/enabled": True, "adminspace/permissions/read": True}
     try:
         return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
@@ -34,6 +40,30 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
             f"can't listen on {' '.join(listen)}: another server may use the port; stop it or choose another port "
             f"with --listen, such as tcp/0.0.0.0:7447 ({_brief(error)})"
         ) from None
+
+
+def has_assigned_port(listen: Sequence[str]) -> bool:
+    """Whether the operating system chooses the port of one of the endpoints: it is given as 0."""
+    return any(ASSIGNED_PORT.search(endpoint) for endpoint in listen)
+
+
+def listening_endpoints(router: zenoh.Session, listen: Sequence[str]) -> tuple[str, ...]:
+    """The endpoints at which a router is reached that `open_router` opened with `listen`.
+
+    They are `listen` itself unless a port in it is 0; then they are read from the router's admin space, since Zenoh's
+    Python API 1.10 does not report locators.
+
+    Raises:
+        NetworkError: the router does not report them.
+    """
+    if not has_assigned_port(listen):
+        return tuple(listen)
+    for reply in router.get(f"@/{router.info.zid()}/router", timeout=REPORT_S):
+        if reply.ok is not None and (locators := json.loads(reply.ok.payload.to_bytes()).get("locators")):
+            return tuple(locators)
+    raise NetworkError(
+        f"the Zenoh router does not report the ports of {' '.join(listen)}; give a port instead of 0 in --listen"
+    )
 
 
 def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:

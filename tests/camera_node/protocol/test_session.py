@@ -2,6 +2,7 @@
 """Zenoh sessions open without a router, find it, reconnect after its loss, and the router relays between them."""
 
 import logging
+import re
 import threading
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
-from camera_node.protocol.session import ServerWatch, open_client, open_router
+from camera_node.protocol.session import ServerWatch, listening_endpoints, open_client, open_router
 
 
 class Ticker:
@@ -71,6 +72,21 @@ def test_an_error_names_the_taken_port(network):
         open_router([network.endpoint])
     assert "another server" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_port_0_is_replaced_by_the_port_that_clients_reach(inbox):
+    """Of two endpoints with port 0; a client that connects to the second alone receives what is published."""
+    listen = ["tcp/127.0.0.1:0"] * 2
+    with open_router(listen) as router:
+        endpoints = listening_endpoints(router, listen)
+        assert len(set(endpoints)) == 2
+        assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", endpoint) for endpoint in endpoints)
+        with open_client(endpoints[1:]) as client:
+            received = inbox()
+            router.declare_subscriber("a/b", received.put)
+            ticker = Ticker(client, "a/b")
+            assert received.until(len)
+            ticker.close()
 
 
 @pytest.mark.parametrize("endpoint", ["foo", "", "carrier-pigeon/roof:1"])
