@@ -25,7 +25,7 @@ def shape_of(dual: Array) -> Array:
 def covariance_through(lens: Lens, ellipses: Array, covariance: Array) -> Array:
     """Of the centre, of S and of where the disc's centre projects (N, 7, 7), all in the plane at distance one.
 
-    `ellipses` are (N, 5) u, v, major, minor, angle and `covariance` (N, 7, 7) is as `Detector.disc_offsets` has it. The
+    `ellipses` are (N, 5) u, v, major, minor, angle and `covariance` (N, 7, 7) is `DetectedRoundels.pose_cov`. The
     lens is taken to be affine over a roundel, which is near enough for a covariance.
     """
     J = _lens_slope(lens, ellipses[:, :2])

@@ -40,8 +40,9 @@ class Eye:
 
     @property
     def threshold(self) -> float:
-        """The detector's threshold, grey levels."""
-        return self._detector.threshold
+        """The detector's threshold, grey levels; NaN if it has none."""
+        threshold = self._detector.threshold
+        return float("nan") if threshold is None else threshold
 
     @property
     def settings(self) -> Settings:

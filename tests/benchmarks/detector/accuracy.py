@@ -72,15 +72,13 @@ def _errors(run: Run, image: np.ndarray, sight: Sight, limit: Bound, noise: floa
 
     None where the roundel was not found.
     """
-    detector = run.make()
-    found = detector.detect(image)
+    found = run.make().detect(image)
     if len(found) != 1:
         return None
     true = ellipse_of(sight)[0]
     error = found[0].uv - true
     chi2 = error @ np.linalg.solve(found[0].cov, error)
-    offsets, covs = detector.disc_offsets()
-    poses = locate(found[0], sight.lens, sight.diameter_m, (offsets[0], covs[0]))
+    poses = locate(found[0], sight.lens, sight.diameter_m)
     if poses is None:
         return None
     distance = poses[0].position_m[2] / sight.distance_m - 1

@@ -21,14 +21,8 @@ def judge_views(run: Run, cell: Cell, count: int, draws: int) -> np.ndarray:
     for sight in views(cell, count, rng):
         clean = trace(sight, 6 if cell.diameter < 40 else 4)
         for _ in range(draws):
-            detector = run.make()
-            found = detector.detect(expose(clean, cell.noise, rng))
-            offsets, covs = detector.disc_offsets()
-            poses = (
-                locate(found[0], sight.lens, sight.diameter_m, (offsets[0], covs[0]))
-                if len(found) == 1
-                else None
-            )
+            found = run.make().detect(expose(clean, cell.noise, rng))
+            poses = locate(found[0], sight.lens, sight.diameter_m) if len(found) == 1 else None
             if poses:
                 right, wrong = (pose.normal @ sight.normal for pose in poses)
                 rows.append((poses[0].probability, float(right < wrong)))

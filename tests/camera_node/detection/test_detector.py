@@ -54,9 +54,10 @@ def test_reported_covariance_is_honest():
 def test_the_inner_ellipse_tells_the_discs_own_centre():
     """At 60 px and 45 degrees they are 1 px apart; the measured offset is right within four of its sigmas."""
     disc = Disc((80.2, 60.4), 60, np.radians(45), turn=0.4)
-    detector = Detector()
-    (found,) = detector.detect(expose(render([disc]), 1, rng()))
-    offset, cov = (column[0] for column in detector.disc_offsets())
+    (found,) = Detector().detect(expose(render([disc]), 1, rng()))
+    offset, cov = found.offset_px, found.pose_cov
+    assert offset is not None
+    assert cov is not None
     error = found.uv + offset - disc.uv
     assert np.linalg.norm(offset) > 0.5
     from_centre = cov[:2, :2] + cov[:2, 5:] + cov[5:, :2] + cov[5:, 5:]
@@ -220,7 +221,7 @@ def test_only_grey_images_are_taken():
 
 def test_theta_converges_to_half_between_the_levels():
     """Section III-B: theta = (m_d + m_b) / 2 after one frame, to the fit's own precision; it steps when all is lost."""
-    detector = Detector()
+    detector = Detector(detector="paper")
     detector.detect(expose(render([Disc((80, 60), 40)]), 1, rng()))
     assert detector.threshold == pytest.approx((40 + 190) / 2, abs=1)
     flat = np.full((120, 160), 90, np.uint8)

@@ -22,11 +22,11 @@ def shown(position: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def measured_covariance(diameter: float) -> np.ndarray:
     """(1, 7, 7) of a roundel in a picture, taken to that plane."""
-    detector = Detector()
     image = expose(render([Disc((80.3, 60.6), diameter, 0.6, 1.0)]), 3, np.random.default_rng(1))
-    (found,) = detector.detect(image)
+    (found,) = Detector().detect(image)
     ellipse = np.array([[*found.uv, *found.axes_px, found.angle_rad]])
-    return covariance_through(LENS, ellipse, detector.disc_offsets()[1])
+    assert found.pose_cov is not None
+    return covariance_through(LENS, ellipse, found.pose_cov[None])
 
 
 @pytest.mark.parametrize("tilt", [0.05, 0.5, 1.0])
@@ -58,11 +58,10 @@ def test_the_lens_tells_the_discs_centre():
     rng, disc, errors = np.random.default_rng(2), Disc((80.3, 60.6), 30, 0.6, 1.0), []
     clean = render([disc])
     for _ in range(40):
-        detector = Detector()
-        (found,) = detector.detect(expose(clean, 3, rng))
-        offsets, covs = detector.disc_offsets()
-        poses = locate(found, LENS, 2 * RADIUS, (offsets[0], covs[0]))
+        (found,) = Detector().detect(expose(clean, 3, rng))
+        poses = locate(found, LENS, 2 * RADIUS)
         assert poses is not None
-        errors.append([found.uv + offsets[0] - disc.uv, poses[0].centre_uv - disc.uv])
+        assert found.offset_px is not None
+        errors.append([found.uv + found.offset_px - disc.uv, poses[0].centre_uv - disc.uv])
     detected, located = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 2)))
     assert located < 0.55 * detected

@@ -55,10 +55,8 @@ def test_a_measured_offset_settles_the_normal():
     lens = Lens(width=160, height=120, fx=600, fy=600, cx=79.5, cy=59.5)
     for turn in (0.4, 2.0, 5.0):
         disc = Disc((82, 61), 60, np.radians(40), turn)
-        detector = Detector()
-        (found,) = detector.detect(expose(render([disc]), 2, np.random.default_rng(3)))
-        offsets, covs = detector.disc_offsets()
-        poses = locate(found, lens, 0.1, (offsets[0], covs[0]))
+        (found,) = Detector().detect(expose(render([disc]), 2, np.random.default_rng(3)))
+        poses = locate(found, lens, 0.1)
         assert poses is not None
         assert poses[0].probability > 0.99
         assert poses[0].normal @ disc.normal > np.cos(np.radians(2))
@@ -104,10 +102,8 @@ def test_through_the_demos_lens_nothing_is_biased(at: tuple[float, float], tilt_
         lens = Lens(width=80, height=80, cx=cx, cy=cy, **DEMO)
         uv = (40 + rng.uniform(-0.5, 0.5), 40 + rng.uniform(-0.5, 0.5))
         sight = Sight(lens, uv, pixels_across(lens, 0.1, 40), tilt=np.radians(tilt_deg), turn=turn)
-        detector = Detector()
-        (found,) = detector.detect(expose(trace(sight, 4), 1, rng))
-        offsets, covs = detector.disc_offsets()
-        poses = locate(found, lens, 0.1, (offsets[0], covs[0]))
+        (found,) = Detector().detect(expose(trace(sight, 4), 1, rng))
+        poses = locate(found, lens, 0.1)
         assert poses is not None
         assert poses[0].normal @ sight.normal > np.cos(np.radians(1))
         distance.append(np.linalg.norm(poses[0].position_m) / np.linalg.norm(sight.position) - 1)
@@ -133,9 +129,9 @@ def test_the_normal_is_right_where_it_is_said_to_be():
         )
         clean = trace(sight)
         for _ in range(20):
-            detector = Detector()
-            (found,) = detector.detect(expose(clean, 3, rng))
-            poses = locate_all(columns([found]), lens, 0.1, detector.disc_offsets())[0]
+            found = Detector().detect(expose(clean, 3, rng))
+            assert len(found) == 1
+            poses = locate_all(found, lens, 0.1)[0]
             assert poses is not None
             right, other = (pose.normal @ sight.normal for pose in poses)
             wrong += poses[0].probability > 0.99 and right < other

@@ -105,10 +105,8 @@ def test_a_new_one_is_where_it_seems_although_much_is_hidden():
     squared = []
     for seed in range(300, 308):
         frame, cards = covered(0.3, False)(np.random.default_rng(seed))
-        detector = Detector()
-        found = detector.detect(frame)
-        offsets, cov = detector.disc_offsets()
-        for centre, C in zip(found.uv + offsets, cov, strict=True):
+        found = Detector().detect(frame)
+        for centre, C in zip(found.uv + found.offset_px, found.pose_cov, strict=True):
             error = min((centre - card.uv for card in cards), key=lambda e: float(e @ e))
             both = C[:2, :2] + C[5:, 5:] + C[:2, 5:] + C[5:, :2] + MODEL_PX**2 * np.eye(2)
             squared.append(error @ np.linalg.solve(both, error))
