@@ -12,8 +12,8 @@ from rich.console import Console
 
 from calib.intrinsics.residual_plot import draw_residuals, save_map
 from calib.rig.rig import Rig, save_rig
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
+from calib.wand.result import WandCalibration
 from camera_node import terminal
 from camera_node.errors import ConfigError
 

@@ -8,11 +8,10 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.live.wand_session import SessionProgress
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lens_change import describe, find_changes
 from calib.wand.quality.lens_shape import find_misfit
-from calib.wand.report import WandReport
+from calib.wand.result import WandCalibration, WandReport
 from camera_node.terminal import say
 
 WIDENED = 1.2  # below, it is not worth a line
@@ -48,7 +47,7 @@ def print_report(result: WandCalibration, trust: RigQuality, console: Console) -
         *lenses,
         *foretold,
         *wave,
-        *trust.spoilt(),
+        *trust.lens_warnings(),
         trust.sentence(),
     ]:
         say(line, console)
@@ -70,11 +69,11 @@ def show_progress(told: SessionProgress) -> Group:
 
 
 def _remarks(report: WandReport) -> list[str]:
-    lines = [f"{report.instants} instants, residual {report.residual_px:.3f} px"]
-    if report.widened > WIDENED:
+    lines = [f"{report.wand_poses} wand poses, residual {report.residual_px:.3f} px"]
+    if report.sigma_inflation > WIDENED:
         lines.append(
             f"what neighbouring moments say is off alike (a lens or a clock that fits not quite): all errors below are "
-            f"taken {report.widened:.1f} times as large as noise alone would make them"
+            f"taken {report.sigma_inflation:.1f} times as large as noise alone would make them"
         )
     if report.length_mean_mm is not None and report.length_std_mm is not None:
         lines.append(

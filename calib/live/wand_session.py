@@ -263,7 +263,7 @@ def try_part(
     delivering = {message.camera for message in part}
     return Trial(
         unplaced={name: why for name, why in trust.unplaced.items() if name in delivering},
-        strain={c.name: fewer * c.strain for c in trust.cameras},
+        strain={c.name: fewer * c.noise_ratio for c in trust.cameras},
         used={c.name: 1 - c.figures["unused"] for c in trust.cameras},
         advice={c.name: c.wave_next for c in trust.cameras},
         expected_mm=trust.expected.typical_mm if trust.expected else None,

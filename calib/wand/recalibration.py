@@ -14,9 +14,10 @@ from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.lens_prior import settle, written
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
 from calib.wand.bundle_adjustment.problem import WandObservations
-from calib.wand.calibrate import check_recording, gather_wave, read
+from calib.wand.calibrate import check_recording, select_cameras
+from calib.wand.conclusion import clock_values
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.outcome import clock_values
+from calib.wand.labeling import label_recording
 from calib.wand.quality.checks import check_agreement, check_lenses
 from calib.wand.solution import with_disc_centres
 from camera_node.arrays import Array
@@ -71,13 +72,13 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     placed = set(rig.placed()) - {name}
     messages = [message for message in messages if message.camera in placed | {name}]
     check_recording(rig, messages)
-    recording = read(rig, wand, messages)
+    recording = label_recording(rig, wand, messages)
     if name not in recording.names:
         raise CalibrationError(f"camera '{name}' is not in the recording, or never saw the wand")
     this = recording.names.index(name)
-    pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.frames.period_s())
     cameras, offset_s = _start(rig, recording.names, pairs, this)
-    wave = gather_wave(recording, pairs, wand, list(range(len(recording.names))))
+    wave = select_cameras(recording, pairs, list(range(len(recording.names))))
     found = wave.pose_problem(cameras, offset_s, MOMENTS)
     if found is None:
         raise CalibrationError("the wand's lengths do not fit what the cameras saw: is the wand file right?")
@@ -94,7 +95,7 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
 
 def _start(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) -> tuple[Array, Array]:
     """Poses and time offsets of all cameras; of the one that is sought, by the camera that shares most with it."""
-    shared = pairs.shared()[this]
+    shared = pairs.count_shared()[this]
     for other in np.argsort(-shared).tolist():
         if (
             other == this

@@ -10,8 +10,7 @@ from calib.wand.bundle_adjustment.frame_sets import choose_instants, group_insta
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.detections import WandDetections
-from calib.wand.initialization.initial_rig import triangulate
-from calib.wand.tracks import MarkerTrack
+from calib.wand.tracks import MarkerTrack, triangulate
 from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
@@ -41,7 +40,7 @@ class Wave:
         tracks = [
             [
                 MarkerTrack.of(
-                    track.t_s, new.normalise(old.project(np.column_stack([track.at, np.ones(len(track.at))])))
+                    track.t_s, new.normalise(old.project(np.column_stack([track.xy, np.ones(len(track.xy))])))
                 )
                 for track in mine
             ]

@@ -19,7 +19,7 @@ from rich.table import Table
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

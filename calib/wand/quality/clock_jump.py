@@ -17,6 +17,7 @@ from calib.wand.bundle_adjustment.dependence import widen
 from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
 from calib.wand.bundle_adjustment.problem import CRYSTAL, SLEWED, Problem, State, WandObservations
+from calib.wand.result import ClockJump
 from camera_node.arrays import Array
 
 # A jump that leaves neither of these has not touched the rig: rejected part of a camera's markers, and drift, s/s.
@@ -27,28 +28,6 @@ FAR = 100.0  # sigmas: what is farther off is as wrong
 CHANCE = 1e-4  # probability below which a jump at any moment of any camera is none by chance
 TWICE = 2.0  # by which the two ways to a jump may differ: it is none where they contradict each other
 MOMENTS = 10  # on either side, in which the camera saw the wand: fewer place no camera
-
-
-@dataclass(frozen=True, slots=True)
-class ClockJump:
-    """By how much a camera's stamps jump, ms, with standard deviation, and at which stamp, seconds from the
-    first instant."""
-
-    camera: str
-    ms: float
-    sigma_ms: float
-    at_s: float
-
-    def words(self) -> str:
-        """What happened."""
-        return (
-            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s: see "
-            "that nothing sets it and that no frames are dropped, and wave again"
-        )
-
-    def as_dict(self) -> dict[str, float]:
-        """For the `calibration` map of `rig.yaml`."""
-        return {"ms": round(self.ms, 2), "sigma": round(self.sigma_ms, 2), "at_s": round(self.at_s, 2)}
 
 
 def find_jump(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) -> ClockJump | None:

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
 from calib.wand.two_markers import label_ends
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

@@ -6,10 +6,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calib.commands.check import placed, split
+from calib.commands.check import split
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
-from calib.wand.quality.agreement import Agreement, compare
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
@@ -36,7 +36,7 @@ def lasting(messages: list[Detections], seed: int) -> list[Detections]:
 
 def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibration], Agreement]:
     found = [calibrate(arena.intrinsics, arena.wand, half) for half in split(messages)]
-    return found, compare(*map(placed, found))
+    return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
 
 
 @pytest.mark.parametrize(("wandering", "expected"), [(False, 1.0), (True, 2.5)])

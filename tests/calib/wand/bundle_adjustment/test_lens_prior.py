@@ -11,9 +11,9 @@ from scipy.stats import chi2
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import told_sigma
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import place_one
+from calib.wand.result import WandCalibration
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 
@@ -58,8 +58,8 @@ def test_the_lens_is_named_where_it_spoils_the_rig():
     recorded = record(wave)
     trust = assess(calibrate(roughly(recorded.intrinsics, SHEET), wave.wand, recorded.messages), wave.wand)
     assert trust.grade > "A"
-    assert trust.spoilt()
-    assert "known too roughly" in trust.spoilt()[0]
+    assert trust.lens_warnings()
+    assert "lens of" in trust.lens_warnings()[0]
 
 
 def test_figures_that_a_wave_contradicts_do_not_count():

@@ -92,7 +92,7 @@ def test_clocks_far_apart_are_found_before_anything_else_is_known(recorded: Reco
     frames, seen = gather(recorded.messages, names, lenses)
     labelled, _ = label(frames, seen, Wave().wand, lenses)
     pairs = TwoViewGeometry(labelled, lenses, Wave().wand, frames.period_s())
-    shared = np.triu(pairs.shared(), 1)
+    shared = np.triu(pairs.count_shared(), 1)
     for a, b in np.argwhere(shared > 40):
         pair = pairs.relate(int(a), int(b))
         assert pair is not None

@@ -5,7 +5,7 @@ import msgspec
 import pytest
 
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
 from tests.calib.synthetic import OLD, roughly
 from tests.calib.wave import EPOCH_S, Wave, record
 
