@@ -9,6 +9,8 @@ import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
+from calib.wand.adjustment import RoughRig, Solution, adjust_rig
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.detections import FrameTable, WandDetections, frame_counts, gather
 from calib.wand.initialization.diagnosis import find_faults
 from calib.wand.initialization.initial_rig import InitialRig, explain_unplaced, find_start
@@ -17,8 +19,6 @@ from calib.wand.labeling import label
 from calib.wand.outcome import Told, WandCalibration, conclude
 from calib.wand.quality.checks import check_motion
 from calib.wand.scale import Distance
-from calib.wand.solution import Solution, solve
-from calib.wand.wave import Wave
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -89,9 +89,9 @@ def _solve_majority(
         told = Told([names[k] for k in placed], [counts[k] for k in placed], left_out, unplaced, start.metric)
         told = replace(told, distance=distance, scaled=distance is not None and len(wand.markers) == 1)
         known = distance.between(told.names, unplaced) if distance is not None and told.scaled else None
-        wave = gather_wave(recording, pairs, wand, placed)
+        rough = RoughRig(*_columns(start, placed), start.metric, known)
         try:
-            return told, solve(wave, *_columns(start, placed), start.metric, known)
+            return told, adjust_rig(gather_wave(recording, pairs, wand, placed), rough)
         except CameraFault as fault:
             wrong |= fault.reasons
             sure |= fault.reasons if fault.certain else {}
@@ -159,14 +159,16 @@ def _unplaceable(
     return f"no two cameras could be placed; wave where two see the wand at once ({told})"
 
 
-def gather_wave(recording: WandRecording, pairs: TwoViewGeometry, wand: Body, placed: list[int]) -> Wave:
+def gather_wave(
+    recording: WandRecording, pairs: TwoViewGeometry, wand: Body, placed: list[int]
+) -> LabeledRecording:
     """What the placed cameras saw, numbered anew."""
     number = np.full(len(recording.names), -1)
     number[placed] = np.arange(len(placed))
     seen = recording.seen.select(number[recording.seen.camera] >= 0)
     seen = replace(seen, camera=number[seen.camera])
     t_s = recording.frames.t_s
-    return Wave(
+    return LabeledRecording(
         seen,
         [recording.names[k] for k in placed],
         [recording.lenses[k] for k in placed],

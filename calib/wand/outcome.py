@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.rig.rig import Rig
+from calib.wand.adjustment import Solution
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
 from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
@@ -19,7 +20,6 @@ from calib.wand.quality.lengths import measure_lengths
 from calib.wand.quality.lens_change import find_changes
 from calib.wand.report import CameraReport, Outlier, WandReport
 from calib.wand.scale import Distance, compare, loosen
-from calib.wand.solution import Solution
 from calib.world.world_frame import move, upright
 from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose

@@ -15,6 +15,7 @@ from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors, parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
 from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.bundle_adjustment.problem_setup import build_problem
 from calib.wand.calibrate import check_recording, gather_wave, read
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.outcome import clock_values
@@ -78,10 +79,10 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
     cameras, offset_s = _start(rig, recording.names, pairs, this)
     wave = gather_wave(recording, pairs, wand, list(range(len(recording.names))))
-    found = wave.pose_problem(cameras, offset_s, MOMENTS)
+    found = build_problem(wave, cameras, offset_s, MOMENTS)
     if found is None:
         raise CalibrationError("the wand's lengths do not fit what the cameras saw: is the wand file right?")
-    problem, state, observations = found
+    problem, state, observations = found.problem, found.state, found.observations
     problem = replace(problem.with_free(POSE, OFFSET), estimated=(this,))
     state = optimize_robustly(problem, observations, state)
     observations = with_disc_centres(problem, state, observations, wand.diameter_m)
