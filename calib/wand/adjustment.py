@@ -94,8 +94,8 @@ def _build(recording: LabeledRecording, rough: RoughRig, budget: int) -> Estimat
     start = build_problem(recording, rough.cameras, rough.offset_s, budget)
     if start is None:
         raise CalibrationError(
-            "the wand's lengths do not fit the detections; check the wand file, and that the rig file has the intrinsics "
-            "of these cameras"
+            "the wand's lengths do not fit the detections; check the wand file, and that the rig file has the "
+            "intrinsics of these cameras"
         )
     if len(start.problem.wand.lengths):
         return start

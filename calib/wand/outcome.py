@@ -15,9 +15,9 @@ from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_cov
 from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import State, WandObservations
+from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.clock_jump import ClockJump, find_jump
-from calib.wand.quality.lengths import measure_lengths
-from calib.wand.quality.lens_change import find_changes
+from calib.wand.quality.lenses import find_lens_changes
 from calib.wand.report import CameraReport, Outlier, WandReport
 from calib.wand.scale import Distance, compare, loosen
 from calib.world.world_frame import move, upright
@@ -61,7 +61,7 @@ class WandCalibration:
             "drift_ppm": (self.drift_ppm, self.drift_sigma_ppm),
         }
         clocks = {what: self._by_camera(*column) for what, column in columns.items() if (column[1] > 0).any()}
-        changes = find_changes(self.names, self.adjusted)
+        changes = find_lens_changes(self.names, self.adjusted)
         lenses = {name: change.as_dict() for name, change in changes.items()}
         jump = {"clock_jump": {self.jump.camera: self.jump.as_dict()}} if self.jump else {}
         return {**self.report.as_dict(), **clocks, **jump, "adjusted_lenses": lenses}

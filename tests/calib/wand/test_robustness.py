@@ -60,10 +60,8 @@ def test_a_camera_that_saw_next_to_nothing_is_named_and_spoils_nothing():
     recorded = record(Wave(cameras=4, seconds=12, rate_hz=30, seed=5))
     result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
     assert set(result.report.unplaced) == {"cam03"}
-    assert (
-        "sightings fit what the others saw: if these are few, wave before it"
-        in result.report.unplaced["cam03"]
-    )
+    assert "detections fit those of the other cameras" in result.report.unplaced["cam03"]
+    assert "if it has few, wave the wand" in result.report.unplaced["cam03"]
     squared, degrees = joint_error(result, recorded.truth)
     assert squared < chi2.ppf(0.999, degrees)
 

@@ -38,7 +38,7 @@ def test_a_clock_that_jumps_is_named(seed: int, camera: str, ms: float):
     assert jump.sigma_ms < 0.5
     assert jump.at_s == pytest.approx(20.0, abs=0.5)
     assert set(result.as_dict()["clock_jump"]) == {camera}
-    assert "its clock jumps by" in jump.words()
+    assert "its clock jumps by" in jump.sentence()
 
 
 def test_a_camera_that_is_left_out_for_its_clock_is_told_so():

@@ -7,7 +7,7 @@ import pytest
 
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.lens_shape import Misfit, find_misfit
+from calib.wand.quality.lenses import Misfit, find_misfit
 from tests.calib.synthetic import CAREFUL, OLD, roughly
 from tests.calib.wave import Recorded, Wave, record
 
@@ -40,5 +40,5 @@ def test_a_lens_of_another_shape_is_named(index: int, by: float, named: str):
     assert found is not None
     assert (found.camera, found.parameter) == ("cam02", named)
     right = true.fx / true.fy if index == 1 else true.parameters[index]
-    assert found.found == pytest.approx(right, abs=5 * found.sigma + 0.3 * abs(found.told - right))
+    assert found.estimate == pytest.approx(right, abs=5 * found.sigma + 0.3 * abs(found.given - right))
     assert "run python -m calib intrinsics --camera cam02" in found.sentence()
