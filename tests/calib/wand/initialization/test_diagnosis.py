@@ -72,10 +72,10 @@ def test_a_wand_with_other_spacings_is_named():
     wrong = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.17, 0.0, 0.0), (0.5, 0.0, 0.0)))
     messages = record(arena, 8.0, sigma_px=0.1, sized=False, numbered=True)
     with pytest.raises(
-        CalibrationError, match=r"not as its file says: markers 0 and 1 are 0\.170 m"
+        CalibrationError, match=r"differs from its file: markers 0 and 1 are 0\.170 m"
     ) as caught:
         calibrate(arena.intrinsics, wrong, messages)
-    found = float(str(caught.value).split(" m by what")[0].rsplit(" ", 1)[1])
+    found = float(str(caught.value).split(" m as the cameras")[0].rsplit(" ", 1)[1])
     assert found == pytest.approx(0.2, abs=0.01)  # scale and spacing share the error
     far_off = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.14, 0.0, 0.0), (0.5, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match=r"saw the wand at once \d+ times: .* measure it"):
