@@ -9,8 +9,7 @@ from rich.text import Text
 
 from calib.live.wand_session import SessionProgress
 from calib.wand.quality.grade import RigQuality
-from calib.wand.quality.lens_change import describe, find_changes
-from calib.wand.quality.lens_shape import find_misfit
+from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes, find_misfit
 from calib.wand.result import WandCalibration, WandReport
 from camera_node.terminal import say
 
@@ -36,10 +35,10 @@ def print_report(result: WandCalibration, trust: RigQuality, console: Console) -
     console.print(table)
     foretold = trust.expected.lines() if trust.expected else []
     wave = [f"{camera.name}: {camera.wave_next}" for camera in trust.cameras if camera.wave_next]
-    lenses = describe(find_changes(result.names, result.adjusted))
+    lenses = describe_lens_changes(find_lens_changes(result.names, result.adjusted))
     misfit = find_misfit(result.names, result.adjusted, result.observations)
     lenses += [misfit.sentence()] if misfit else []
-    jump = [f"warning: camera {result.jump.camera}: {result.jump.words()}"] if result.jump else []
+    jump = [f"warning: camera {result.jump.camera}: {result.jump.sentence()}"] if result.jump else []
     for line in [
         *_remarks(report),
         *_drifts(result),

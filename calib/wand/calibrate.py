@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The wand calibration: label the detections, build an initial rig, adjust it, and report.
 
-`calibrate` is the pipeline. Its steps are in `labeling`, `initialization`, `solution` and `conclusion`.
+`calibrate` is the pipeline. Its steps are in `labeling`, `initialization`, `adjustment` and `conclusion`.
 """
 
 from collections import Counter
@@ -12,6 +12,8 @@ import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
+from calib.wand.adjustment import RoughRig, Solution, adjust_rig
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.conclusion import Placement, conclude
 from calib.wand.detections import count_frames
 from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
@@ -21,8 +23,6 @@ from calib.wand.labeling import WandRecording, label_recording
 from calib.wand.quality.checks import check_motion
 from calib.wand.result import NOT_RECORDED, WandCalibration
 from calib.wand.scale import Distance
-from calib.wand.solution import Solution, solve
-from calib.wand.wave import Wave
 from camera_node.arrays import Index
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -107,10 +107,9 @@ def _solve_majority(
         poses, offset_s = (
             np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
         )
+        labeled = select_cameras(recording, pairs, start.placed)
         try:
-            return placement, solve(
-                select_cameras(recording, pairs, start.placed), poses, offset_s, start.metric, known
-            )
+            return placement, adjust_rig(labeled, RoughRig(poses, offset_s, start.metric, known))
         except CameraFault as fault:
             excluded.add(fault)
             if len(start.placed) - len(fault.reasons) <= len(excluded.reasons):
@@ -151,13 +150,15 @@ def _place(
     )
 
 
-def select_cameras(recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]) -> Wave:
+def select_cameras(
+    recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]
+) -> LabeledRecording:
     """Return the input of the adjustment for the cameras `placed`, renumbered in this order."""
     number = np.full(len(recording.names), -1)
     number[placed] = np.arange(len(placed))
     detections = recording.detections.select(number[recording.detections.camera] >= 0)
     t_s = recording.frames.t_s
-    return Wave(
+    return LabeledRecording(
         replace(detections, camera=number[detections.camera]),
         [recording.names[k] for k in placed],
         [recording.lenses[k] for k in placed],

@@ -9,15 +9,16 @@ import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, Camera
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import written
+from calib.wand.adjustment import Solution
+from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.bundle_adjustment.problem import State, WandObservations
+from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.clock_jump import find_jump
-from calib.wand.quality.lengths import measure_lengths
-from calib.wand.quality.lens_change import find_changes
+from calib.wand.quality.lenses import find_lens_changes
 from calib.wand.result import CameraReport, Outlier, WandCalibration, WandReport
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
-from calib.wand.solution import Solution
 from calib.world.world_frame import move, upright
 from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose
@@ -51,17 +52,18 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
     adjusted, observations = solution.adjusted, solution.observations
     if placement.scaled_by is not None:
         adjusted = add_scale_uncertainty(adjusted, placement.scaled_by)
-    offsets, offset_sigma = clock_values(adjusted, OFFSET, 1e3)
-    drift, drift_sigma = clock_values(adjusted, DRIFT, 1e6)
+    covariance = camera_covariance(adjusted)
+    offsets, offset_sigma = clock_values(adjusted.state, covariance, OFFSET, 1e3)
+    drift, drift_sigma = clock_values(adjusted.state, covariance, DRIFT, 1e6)
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
     size = 6 * len(placement.names)
     return WandCalibration(
-        rig=_place(rig, adjusted, placement, offsets),
-        report=_build_report(adjusted, observations, placement),
+        rig=_place(rig, adjusted.state, covariance, placement, offsets),
+        report=_build_report(adjusted, covariance, observations, placement),
         names=placement.names,
         adjusted=adjusted,
         observations=observations,
-        covariance=adjusted.covariance(POSE).reshape(size, size),
+        covariance=covariance.of(POSE).reshape(size, size),
         time_offset_ms=offsets,
         time_sigma_ms=offset_sigma,
         drift_ppm=drift,
@@ -70,41 +72,51 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
     )
 
 
-def clock_values(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tuple[Array, Array]:
+def clock_values(
+    state: State, covariance: CameraCovariance, part: tuple[int, ...], unit: float
+) -> tuple[Array, Array]:
     """Return values and standard deviations (C,) of a clock parameter, OFFSET or DRIFT, times `unit`."""
-    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
-    sigma = np.sqrt(np.einsum("cpcp->c", adjusted.covariance(part)))
+    values = state.clocks[:, part[0] - OFFSET[0]]
+    sigma = np.sqrt(np.einsum("cpcp->c", covariance.of(part)))
     return values * unit, sigma * unit
 
 
-def adjusted_camera(camera: Camera, adjusted: Adjusted, k: int, offset_ms: float) -> Camera:
+def adjusted_camera(
+    camera: Camera, state: State, covariance: CameraCovariance, k: int, offset_ms: float
+) -> Camera:
     """Return the camera with the adjusted lens and pose of index k, their covariances, and a time offset."""
-    lens = adjusted.state.lens(k, camera)
-    lens_sigma = np.sqrt(np.diag(adjusted.covariance(LENS)[k, :, k]))
+    lens = state.lens(k, camera)
+    lens_sigma = np.sqrt(np.diag(covariance.of(LENS)[k, :, k]))
     return msgspec.structs.replace(
         camera.with_parameters(lens.parameters),
-        T_world_cam=Pose.from_matrix(adjusted.state.cameras[k]),
+        T_world_cam=Pose.from_matrix(state.cameras[k]),
         time_offset_ms=offset_ms,
-        covariance=tuple(tuple(row) for row in adjusted.covariance(POSE)[k, :, k].tolist()),
-        lens_sigma=written(lens, camera.lens_sigma, lens_sigma),
+        covariance=tuple(tuple(row) for row in covariance.of(POSE)[k, :, k].tolist()),
+        lens_sigma=parameter_sigma(lens, camera.lens_sigma, lens_sigma),
     )
 
 
-def _place(rig: Rig, adjusted: Adjusted, placement: Placement, offset_ms: Array) -> Rig:
-    state, cameras = adjusted.state, dict(rig.cameras)
+def _place(
+    rig: Rig, state: State, covariance: CameraCovariance, placement: Placement, offset_ms: Array
+) -> Rig:
+    cameras = dict(rig.cameras)
     for name in placement.unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
     for k, name in enumerate(placement.names):
-        cameras[name] = adjusted_camera(cameras[name], adjusted, k, float(offset_ms[k]))
+        cameras[name] = adjusted_camera(cameras[name], state, covariance, k, float(offset_ms[k]))
     T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
     return move(msgspec.structs.replace(rig, cameras=cameras), T_world)
 
 
-def _build_report(adjusted: Adjusted, observations: WandObservations, placement: Placement) -> WandReport:
+def _build_report(
+    adjusted: Adjusted, covariance: CameraCovariance, observations: WandObservations, placement: Placement
+) -> WandReport:
     names, distance = placement.names, placement.compared_with
-    lengths = measure_lengths(adjusted, observations)
+    lengths, cov = measure_lengths(adjusted, observations), covariance.of(POSE)
     return WandReport(
-        cameras=[_report_camera(placement, k, observations, adjusted) for k in range(len(names))],
+        cameras=[
+            _report_camera(placement, k, observations, adjusted, cov[k, :, k]) for k in range(len(names))
+        ],
         unplaced=placement.unplaced,
         wand_poses=len(adjusted.problem.knot_s),
         scale=adjusted.scale,
@@ -112,17 +124,19 @@ def _build_report(adjusted: Adjusted, observations: WandObservations, placement:
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_list_outliers(names, observations, adjusted),
         metric=placement.metric or placement.scaled_by is not None,
-        sigma_inflation=adjusted.dependence**0.5,
+        sigma_inflation=adjusted.inflation**0.5,
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
-        adjusted_lenses={name: change.as_dict() for name, change in find_changes(names, adjusted).items()},
+        adjusted_lenses={
+            name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
+        },
     )
 
 
 def _report_camera(
-    placement: Placement, k: int, observations: WandObservations, adjusted: Adjusted
+    placement: Placement, k: int, observations: WandObservations, adjusted: Adjusted, cov: Array
 ) -> CameraReport:
-    mine, cov = observations.camera == k, adjusted.covariance(POSE)[k, 3:, k, 3:]
+    mine = observations.camera == k
     used = mine & adjusted.used
     rms = float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())) if used.any() else float("nan")
     return CameraReport(
@@ -132,7 +146,7 @@ def _report_camera(
         observations=int(used.sum()),
         outliers=int((mine & ~adjusted.used).sum()),
         residual_px=rms,
-        sigma_mm=float(np.sqrt(np.trace(cov) / 3)) * 1e3,
+        sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
         left_out=dict(placement.left_out[k]),
     )
 

@@ -48,19 +48,19 @@ class Outlier:
 
 @dataclass(frozen=True, slots=True)
 class ClockJump:
-    """A jump of a camera's timestamps: its size and standard deviation, ms, and its time, seconds after the first
-    frame."""
+    """A jump of a camera's timestamps by `ms` with standard deviation `sigma_ms`, at `at_s`, seconds after the first
+    frame of the recording."""
 
     camera: str
     ms: float
     sigma_ms: float
     at_s: float
 
-    def words(self) -> str:
+    def sentence(self) -> str:
         """State the jump and its remedy."""
         return (
-            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s: check "
-            "that nothing sets the clock and that no frames are dropped, and record again"
+            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s: make "
+            "sure that nothing sets it and that no frames are dropped, and wave the wand again"
         )
 
     def as_dict(self) -> dict[str, float]:

@@ -8,8 +8,9 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import unobserved
+from calib.wand.bundle_adjustment.problem import gauge_directions
 
 SIGMA_M = 0.005  # of a tape measure between two lenses: the projection centres inside are not visible
 CLEAR = 3.0  # standard deviations, beyond which two lengths contradict each other
@@ -114,7 +115,7 @@ def compare_distance(
     gap = first[:3, 3] - second[:3, 3]
     length = float(np.linalg.norm(gap))
     J = np.concatenate([gap @ first[:3, :3], -gap @ second[:3, :3]]) / length
-    cov = adjusted.covariance(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
+    cov = camera_covariance(adjusted).of(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
     return DistanceComparison(distance, length, float(np.sqrt(J @ cov @ J + distance.sigma_m**2)))
 
 
@@ -125,14 +126,14 @@ def add_scale_uncertainty(adjusted: Adjusted, distance: Distance) -> Adjusted:
     the cameras by the scale of the world, without its component along the gauge. In the information matrix this is a
     downdate of rank one (Sherman and Morrison).
     """
-    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.dependence**0.5)
+    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.inflation**0.5)
     if relative == 0:
         return adjusted
     free, cameras = adjusted.problem.free, adjusted.state.cameras
     by_scale = np.zeros((len(cameras), len(free)))
     translations = [free.index(p) for p in POSE[3:]]
     by_scale[:, translations] = np.einsum("cji,cj->ci", cameras[:, :3, :3], cameras[:, :3, 3])
-    gauge = np.linalg.qr(unobserved(adjusted.state, free))[0]
+    gauge = np.linalg.qr(gauge_directions(adjusted.state, free))[0]
     g = by_scale.ravel() - gauge @ (gauge.T @ by_scale.ravel())
     weighted = adjusted.information @ g
     weighted -= gauge @ (gauge.T @ weighted)

@@ -76,7 +76,7 @@ class SimulatedRecording:
 
 
 class WandPath:
-    """The path of the wand: sums of sines of up to 1.3 Hz in each coordinate, and a slow rotation about the vertical."""
+    """The path of the wand: sums of sines of up to 1.3 Hz in each coordinate, and a slow rotation."""
 
     def __init__(self, seed: int, speed: float) -> None:
         rng = np.random.default_rng([7, seed])
@@ -87,7 +87,7 @@ class WandPath:
         self.turn = 2 * np.pi * speed / 20
 
     def pose(self, t_s: Array) -> tuple[Array, Array]:
-        """Return rotations (n, 3, 3) and positions (n, 3) of the wand at times (n,); its printed side faces outwards."""
+        """Return rotations (n, 3, 3) and positions (n, 3) of the wand; its printed side faces outwards."""
         waves = (self.reach * np.sin(self.rate * t_s[:, None, None] + self.phase)).sum(axis=1)
         place = waves[:, :3] + [0.0, 0.0, 1.2]
         facing, nod, roll = self.turn * t_s + waves[:, 3], 0.3 + 0.7 * waves[:, 4], waves[:, 5]

@@ -4,15 +4,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
-from camera_node.geometry.pose import adjoint, invert, rigid_motions
+from camera_node.geometry.pose import adjoint, invert, rigid_motions, vector_from_rotation
 
 SIGNIFICANCE = 1e-3  # probability below which a difference is not due to chance
 
@@ -54,10 +54,11 @@ class CameraPoses:
         adjusted = result.adjusted
         free, count = list(adjusted.problem.free), len(result.names)
         pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
-        by_prior = adjusted.by_prior().reshape(count, len(free), count, len(free))[:, pose][:, :, :, lens]
+        by_prior = camera_covariance(adjusted).by_prior.reshape(count, len(free), count, len(free))
+        by_prior = by_prior[:, pose][:, :, :, lens]
         by_lens = by_prior.reshape(6 * count, 4 * count)
         rest = result.covariance - by_lens @ by_lens.T
-        sigma = adjusted.problem.doubt()[:, lens]
+        sigma = adjusted.problem.claimed_prior_sigma()[:, lens]
         lenses = {
             name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
             for k, name in enumerate(result.names)
@@ -222,5 +223,5 @@ def _differences(a: CameraPoses, b: CameraPoses, T_a_b: Array) -> Array:
     differences = []
     for here, there in zip(a.cameras, b.cameras, strict=True):
         D = invert(here) @ T_a_b @ there
-        differences.append(np.concatenate([cv2.Rodrigues(D[:3, :3])[0].ravel(), D[:3, 3]]))
+        differences.append(np.concatenate([vector_from_rotation(D[:3, :3]), D[:3, 3]]))
     return np.array(differences)

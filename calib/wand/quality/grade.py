@@ -14,6 +14,7 @@ from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import LENS, Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.triangulation import Joint, camera_jacobians
+from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
 from calib.wand.result import NOT_RECORDED, WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.body import Body
@@ -211,12 +212,12 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
         height_m: height of the robots' roundels.
     """
     positions = wand_positions(result)
-    noise, joint = result.adjusted.by_noise(), result.adjusted.joint_covariance
-    cameras = [_assess_camera(result, k, positions, noise, joint) for k in range(len(result.names))]
+    covariance = camera_covariance(result.adjusted)
+    cameras = [_assess_camera(result, k, positions, covariance) for k in range(len(result.names))]
     length_mm, extent = result.report.length_mean_mm, np.linalg.norm(np.ptp(wand.points, axis=0))
     error = None if length_mm is None or extent == 0 else abs(length_mm) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
-    expected = _predict(result, positions, height_m) if result.report.metric else None
+    expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
     return RigQuality(cameras, unplaced, error, expected)
 
 
@@ -226,21 +227,21 @@ def wand_positions(result: WandCalibration) -> Array:
     return transform(T_world_adjusted, result.adjusted.state.motion[:, 0].reshape(-1, 3))
 
 
-def _predict(result: WandCalibration, positions: Array, height_m: float) -> PrecisionMap:
+def _predict(
+    result: WandCalibration, positions: Array, covariance: CameraCovariance, height_m: float
+) -> PrecisionMap:
     """Predict the errors of points across the area where the wand was."""
-    joint = result.adjusted.joint_covariance
-    size = joint.shape[0] * joint.shape[1]
+    size = len(covariance.joint) * len(covariance.free)
     low, high = np.quantile(positions[:, :2], [0.02, 0.98], axis=0)
     cameras = [result.rig.cameras[name] for name in result.names]
-    covariance = Joint(result.adjusted.problem.free, joint.reshape(size, size))
-    return map_precision(cameras, low, high, height_m, SIGMA_PX, covariance)
+    joint = Joint(covariance.free, covariance.joint.reshape(size, size))
+    return map_precision(cameras, low, high, height_m, SIGMA_PX, joint)
 
 
 def _assess_camera(
-    result: WandCalibration, k: int, positions: Array, noise: Array, joint: Array
+    result: WandCalibration, k: int, positions: Array, covariance: CameraCovariance
 ) -> CameraQuality:
-    """Assess camera k, by covariances (C, d, C, d) of all cameras: by image noise alone, and in total."""
-    row, free = result.report.cameras[k], result.adjusted.problem.free
+    row, joint, free = result.report.cameras[k], covariance.joint, covariance.free
     camera = result.rig.cameras[row.name]
     uv = result.observations.uv[(result.observations.camera == k) & result.adjusted.used]
     coverage = Coverage.of(uv, camera.width, camera.height, CELLS)
@@ -258,7 +259,7 @@ def _assess_camera(
     }
     lens = find_limiting_lens(J, joint, k, [free.index(p) for p in LENS])
     name = "" if lens is None else result.names[lens]
-    return CameraQuality(row.name, coverage, shared, figures, name, _rms_px(J, noise[k, :, k]))
+    return CameraQuality(row.name, coverage, shared, figures, name, _rms_px(J, covariance.noise[k, :, k]))
 
 
 def _rms_px(J: Array, covariance: Array) -> float:

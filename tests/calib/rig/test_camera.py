@@ -26,7 +26,7 @@ def test_derivatives_are_those_of_a_step_of_the_state(lens: Lens):
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def see(step, shift):
-        moved = state.moved(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12))
         T = moved.cameras[0]
         return moved.lens(0, lens).project((points + shift - T[:3, 3]) @ T[:3, :3])
 

@@ -125,7 +125,7 @@ def test_errors_name_the_fault():
         run(arena, [m for m in messages if m.camera == "cam0"])
     with pytest.raises(CalibrationError, match=r"'north'.* not in the rig.*--camera north"):
         run(arena, [msgspec.structs.replace(m, camera="north") for m in messages])
-    with pytest.raises(CalibrationError, match="800 x 601 .*800 x 600"):
+    with pytest.raises(CalibrationError, match=r"800 x 601 .*800 x 600"):
         run(arena, [msgspec.structs.replace(m, height=601) for m in messages])
     alone = [m for m in messages if (m.t_ns // 1_000_000_000) % 4 == int(m.camera[3])]
     with pytest.raises(CalibrationError, match=r"no two cameras .*cam0 \d+, cam1 \d+"):

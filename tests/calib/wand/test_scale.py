@@ -19,9 +19,9 @@ from calib.wand.scale import Distance, compare_distance
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.observations import write_observations
+from tests.calib.recordings import WandScenario
+from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly
-from tests.calib.wave import Wave
-from tests.calib.wave import record as record_wave
 
 LIGHT = Body(diameter_m=0.1)
 
@@ -69,8 +69,10 @@ def test_halves_of_a_light_are_compared_by_their_shape(off: tuple[float, float, 
 
 def test_halves_of_a_light_that_differ_in_shape_are_told():
     """A camera that was moved by 2 cm between the halves of its wave."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21)
-    recorded = record_wave(wave)
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21
+    )
+    recorded = record_wave(scenario)
     first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split(recorded.messages))
     moved = CameraPoses.of_calibration(second)
     moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # of 6 m, that are 1 here
@@ -81,8 +83,10 @@ def test_halves_of_a_light_that_differ_in_shape_are_told():
 
 def shape_apart(seed: int, off: tuple[float, float, float]) -> Agreement:
     """How the halves of 6 s differ."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed)
-    recorded = record_wave(wave)
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed
+    )
+    recorded = record_wave(scenario)
     rig = roughly(recorded.intrinsics, off, seed=seed)
     return compare_calibrations(
         *(CameraPoses.of_calibration(calibrate(rig, LIGHT, half)) for half in split(recorded.messages))

@@ -58,7 +58,7 @@ def test_halves_of_a_wave_agree_and_a_knock_between_them_is_found():
     """The solver's own covariances: 10 s of a wave in halves; then one camera is knocked by 10 mm after 5 s. Lenses
     have figures: three cameras see in 5 s too little to tell them from such a knock."""
     arena = ring(3)
-    messages, lenses = record(arena, 10.0, sigma_px=0.1), roughly(arena.intrinsics, CAREFUL, told=True)
+    messages, lenses = record(arena, 10.0, sigma_px=0.1), roughly(arena.intrinsics, CAREFUL, with_sigma=True)
     first, second = (
         CameraPoses.of_calibration(calibrate(lenses, arena.wand, half)) for half in split(messages)
     )

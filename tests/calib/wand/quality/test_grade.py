@@ -63,7 +63,7 @@ def test_the_camera_s_jacobians_are_those_of_the_adjustment():
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def see(step):
-        moved = state.moved(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12))
         T = moved.cameras[0]
         return moved.lens(0, camera).project((points - T[:3, 3]) @ T[:3, :3])
 
