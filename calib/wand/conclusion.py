@@ -19,7 +19,7 @@ from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lenses import find_lens_changes
 from calib.wand.result import CameraReport, Outlier, WandCalibration, WandReport
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
-from calib.world.world_frame import move, upright
+from calib.world.world_frame import move_rig, upright_frame
 from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose
 
@@ -104,8 +104,8 @@ def _place(
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
     for k, name in enumerate(placement.names):
         cameras[name] = adjusted_camera(cameras[name], state, covariance, k, float(offset_ms[k]))
-    T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
-    return move(msgspec.structs.replace(rig, cameras=cameras), T_world)
+    T_world = upright_frame(state.cameras, state.motion[:, 0].reshape(-1, 3))
+    return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 
 
 def _build_report(

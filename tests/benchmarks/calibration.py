@@ -2,8 +2,8 @@
 """Accuracy and speed of the wand calibration: `python -m tests.benchmarks.calibration [ROW ...]`.
 
 Rows are simulated recordings (`tests.calib.recordings`), and the real recordings of ../shared/data if they are beside
-the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the same
-run.
+the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the
+same run.
 """
 
 import sys

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import LENS, Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
-from calib.rig.triangulation import Joint, camera_jacobians
+from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
+from calib.rig.triangulation import JointCovariance, camera_jacobians
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
 from calib.wand.result import NOT_RECORDED, WandCalibration
 from camera_node.arrays import Array, Mask
@@ -173,7 +173,7 @@ class RigQuality:
         figures = {
             "median": self.expected.typical_mm,
             "worst": self.expected.worst_mm,
-            "height": self.expected.z,
+            "height": self.expected.grid.z,
         }
         return {"expected_mm": {name: round(value, 3) for name, value in figures.items()}}
 
@@ -234,8 +234,8 @@ def _predict(
     size = len(covariance.joint) * len(covariance.free)
     low, high = np.quantile(positions[:, :2], [0.02, 0.98], axis=0)
     cameras = [result.rig.cameras[name] for name in result.names]
-    joint = Joint(covariance.free, covariance.joint.reshape(size, size))
-    return map_precision(cameras, low, high, height_m, SIGMA_PX, joint)
+    joint = JointCovariance(covariance.free, covariance.joint.reshape(size, size))
+    return map_precision(cameras, FloorGrid.covering(low, high, height_m), SIGMA_PX, joint)
 
 
 def _assess_camera(
