@@ -22,7 +22,7 @@ from calib.rig.recording import save_wave, wave_beside
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import place_one
+from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
@@ -110,7 +110,7 @@ class Wand:
         self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str, console: Console
     ) -> Rig:
         with console.status(f"placing {name}"):
-            result = place_one(rig, wand, messages, name)
+            result = recalibrate_camera(rig, wand, messages, name)
         moved = (
             ""
             if result.moved_mm is None

@@ -13,7 +13,7 @@ from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import place_one
+from calib.wand.recalibration import recalibrate_camera
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 from tests.calib.wave import Recorded, Wave, record
 
@@ -88,7 +88,7 @@ def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_ri
             roughly(recorded(seed).intrinsics, off, seed=seed).cameras["cam02"],
         )
         rig = Rig(cameras={**truth.cameras, "cam02": rough})
-        here = place_one(rig, Wave().wand, recorded(seed).messages, "cam02").rig.cameras["cam02"]
+        here = recalibrate_camera(rig, Wave().wand, recorded(seed).messages, "cam02").rig.cameras["cam02"]
         D = np.linalg.inv(here.matrix()) @ truth.cameras["cam02"].matrix()
         error = np.array([D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]])
         squared += error @ np.linalg.solve(np.array(here.covariance), error)
