@@ -88,8 +88,8 @@ def _remarks(report: WandReport) -> list[str]:
     lines = [f"{report.wand_poses} wand poses, residual {report.residual_px:.3f} px"]
     if report.sigma_inflation > MIN_INFLATION:
         lines.append(
-            f"residuals are correlated in time; standard deviations are inflated by {report.sigma_inflation:.1f} (check the "
-            "lenses and the clocks)"
+            f"residuals are correlated in time; standard deviations are inflated by {report.sigma_inflation:.1f} "
+            "(check the lenses and the clocks)"
         )
     if report.length_mean_mm is not None and report.length_std_mm is not None:
         lines.append(
