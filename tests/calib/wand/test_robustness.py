@@ -11,8 +11,8 @@ from calib.wand.calibrate import calibrate
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import anywhere, in_a_mirror, in_runs, nothing, onto_a_feature, swap_ends
+from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import joint_error
-from tests.calib.wave import Recorded, Wave, record
 
 STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 TOGETHER = {"offset_ms": 0.0, "drift_ppm": 0.0, "free_running": False}
@@ -20,10 +20,10 @@ PLAIN = {"numbered": True, "sized": False, "both_sides": True, "wand": STICK}
 Mishap = Callable[[list[Detections]], list[Detections]]
 
 
-def clicked(seconds: float, rate_hz: float) -> Recorded:
+def clicked(seconds: float, rate_hz: float) -> SimulatedRecording:
     """Three cameras on one side; somebody clicked the ends of a stick, to a pixel and a half."""
     clicks = {"sigma_px": 1.5, "outliers": 0.0, "missing": 0.05, "arc": 0.5}
-    return record(Wave(cameras=3, seconds=seconds, rate_hz=rate_hz, **clicks, **TOGETHER, **PLAIN))
+    return record(WandScenario(cameras=3, seconds=seconds, rate_hz=rate_hz, **clicks, **TOGETHER, **PLAIN))
 
 
 MISHAPS: dict[str, Mishap] = {
@@ -57,13 +57,11 @@ def test_sixty_frames_far_apart_are_enough():
 def test_a_camera_that_saw_next_to_nothing_is_named_and_spoils_nothing():
     """The wand before it for half a second, a clock that is 150 ms off: 21 of 36 sightings fit it where it stands wrong
     by half a metre, four of them whatever its pose and its clock."""
-    recorded = record(Wave(cameras=4, seconds=12, rate_hz=30, seed=5))
-    result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
+    recorded = record(WandScenario(cameras=4, seconds=12, rate_hz=30, seed=5))
+    result = calibrate(recorded.intrinsics, WandScenario().wand, recorded.messages)
     assert set(result.report.unplaced) == {"cam03"}
-    assert (
-        "sightings fit what the others saw: if these are few, wave before it"
-        in result.report.unplaced["cam03"]
-    )
+    assert "detections fit those of the other cameras" in result.report.unplaced["cam03"]
+    assert "if it has few, wave the wand" in result.report.unplaced["cam03"]
     squared, degrees = joint_error(result, recorded.truth)
     assert squared < chi2.ppf(0.999, degrees)
 
@@ -74,7 +72,7 @@ def test_a_light_whose_reflections_persist(cameras: int):
     Distances between cameras, up to scale, are right to two thousandths: the lenses have no figures, and three cameras
     see too little of a light to tell that they are exact."""
     light = Body(diameter_m=0.1)
-    wave = Wave(
+    scenario = WandScenario(
         cameras=cameras,
         seconds=40,
         rate_hz=40,
@@ -83,7 +81,7 @@ def test_a_light_whose_reflections_persist(cameras: int):
         **TOGETHER,
         **{**PLAIN, "wand": light},
     )
-    recorded = record(wave)
+    recorded = record(scenario)
     messages = in_runs(in_runs(recorded.messages, 0.1, 20, in_a_mirror), 0.3, 80, nothing, seed=5)
     result = calibrate(recorded.intrinsics, light, messages)
     assert len(result.names) == cameras
@@ -98,7 +96,7 @@ def test_webcams(rate_hz: float):
     """Clocks 300 ms and 200 ppm apart, stamps that jitter, rows exposed one after the other over 15 ms, dropped
     frames. A rolling shutter shifts points by up to half of its time at half a metre a second, 4 mm, and is not
     modelled: places are right to that."""
-    wave = Wave(
+    scenario = WandScenario(
         cameras=4,
         seconds=60 if rate_hz < 10 else 20,
         rate_hz=rate_hz,
@@ -111,7 +109,7 @@ def test_webcams(rate_hz: float):
         speed=0.6,
         **PLAIN,
     )
-    recorded = record(wave)
+    recorded = record(scenario)
     result = calibrate(recorded.intrinsics, STICK, in_runs(recorded.messages, 0.1, 2, nothing))
     assert len(result.names) == 4
     assert largest_gap_error(result.rig, recorded.truth) < 4e-3

@@ -9,20 +9,19 @@ import pytest
 from scipy.stats import chi2
 
 from calib.__main__ import execute
-from calib.commands.check import placed, split
+from calib.commands.check import split_halves
 from calib.errors import CalibrationError
 from calib.live.wand_session import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.agreement import Agreement
-from calib.wand.quality.agreement import compare as compare_rigs
-from calib.wand.scale import Distance, compare
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
+from calib.wand.scale import Distance, compare_distance
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.observations import write_observations
+from tests.calib.recordings import WandScenario
+from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly
-from tests.calib.wave import Wave
-from tests.calib.wave import record as record_wave
 
 LIGHT = Body(diameter_m=0.1)
 
@@ -46,7 +45,7 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
     assert_near(exact.rig, arena.truth, 2e-3, 1e-3)
     for a, b in combinations(exact.names, 2):
         wanted = Distance(a, b, apart(arena, a, b), 0.0)
-        sure, loose = (compare(wanted, told.names, told.adjusted) for told in (exact, rough))
+        sure, loose = (compare_distance(wanted, told.names, told.adjusted) for told in (exact, rough))
         assert sure is not None
         assert loose is not None
         added = np.sqrt(loose.sigma_m**2 - sure.sigma_m**2)
@@ -70,22 +69,28 @@ def test_halves_of_a_light_are_compared_by_their_shape(off: tuple[float, float, 
 
 def test_halves_of_a_light_that_differ_in_shape_are_told():
     """A camera that was moved by 2 cm between the halves of its wave."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21)
-    recorded = record_wave(wave)
-    first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split(recorded.messages))
-    moved = placed(second)
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21
+    )
+    recorded = record_wave(scenario)
+    first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split_halves(recorded.messages))
+    moved = CameraPoses.of_calibration(second)
     moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # of 6 m, that are 1 here
-    told = compare_rigs(placed(first), moved)
+    told = compare_calibrations(CameraPoses.of_calibration(first), moved)
     assert not told.holds
-    assert told.guilty == "cam02"
+    assert told.moved == "cam02"
 
 
 def shape_apart(seed: int, off: tuple[float, float, float]) -> Agreement:
     """How the halves of 6 s differ."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed)
-    recorded = record_wave(wave)
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed
+    )
+    recorded = record_wave(scenario)
     rig = roughly(recorded.intrinsics, off, seed=seed)
-    return compare_rigs(*(placed(calibrate(rig, LIGHT, half)) for half in split(recorded.messages)))
+    return compare_calibrations(
+        *(CameraPoses.of_calibration(calibrate(rig, LIGHT, half)) for half in split_halves(recorded.messages))
+    )
 
 
 def test_a_wand_that_knows_metres_is_compared():
@@ -99,7 +104,7 @@ def test_a_wand_that_knows_metres_is_compared():
         assert told is not None
         assert told.sentence().startswith("warning: ") == warned
         assert_near(result.rig, plain.rig, 1e-12, 1e-7)  # what rounding leaves
-        assert told.off_m / given == pytest.approx(true / given - 1, abs=1e-3)
+        assert told.difference_m / given == pytest.approx(true / given - 1, abs=1e-3)
 
 
 def test_faults_are_named(tmp_path: Path):
@@ -123,7 +128,7 @@ def test_faults_are_named(tmp_path: Path):
         ("cam0 cam1 nan", "is nan m; it must be above 0"),
         ("cam0 cam0 1", "names camera 'cam0' twice"),
         ("cam0 cam1 2 --distance-sigma -1", "must be 0 or more"),
-        ("cam0 cam3 3", "gives no scale, as camera 'cam3' has no place"),
+        ("cam0 cam3 3", "gives no scale, because camera 'cam3'"),
     ):
         with pytest.raises(CalibrationError, match=fault):
             execute([*options, "--distance", *words.split()])

@@ -11,16 +11,16 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
 from calib.wand.two_markers import label_ends
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, joint_error, roughly
-from tests.calib.wave import Recorded, Wave, record
 
 STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 # Seen from both sides, a stick is turned end-on again and again: its image alone then does not tell its ends apart.
-LIGHTS = Wave(
+LIGHTS = WandScenario(
     cameras=5,
     seconds=12.0,
     rate_hz=30.0,
@@ -36,7 +36,7 @@ def unnumbered(messages: list[Detections]) -> list[Detections]:
     return [msgspec.structs.replace(m, id=np.full(len(m), -1, "<i4").tobytes()) for m in messages]
 
 
-def place(recorded: Recorded, messages: list[Detections]) -> WandCalibration:
+def place(recorded: SimulatedRecording, messages: list[Detections]) -> WandCalibration:
     return calibrate(recorded.intrinsics, STICK, messages)
 
 
@@ -52,7 +52,7 @@ def test_as_good_as_with_numbers():
     squared, degrees = [], 0
     for seed in range(2):
         recorded = record(replace(LIGHTS, seed=seed))
-        lenses = roughly(recorded.intrinsics, CAREFUL, told=True, seed=seed)
+        lenses = roughly(recorded.intrinsics, CAREFUL, with_sigma=True, seed=seed)
         waves = recorded.messages, unnumbered(recorded.messages)
         told, blind = (calibrate(lenses, STICK, wave) for wave in waves)
         assert blind.names == told.names == sorted(recorded.truth.cameras)
@@ -75,15 +75,15 @@ def test_as_good_as_with_numbers():
     ],
     ids=["in step", "webcams", "two cameras", "roundels"],
 )
-def test_ends_are_told_apart(wave: Wave):
+def test_ends_are_told_apart(scenario: WandScenario):
     """But for a few frames, all of which hold a wrong detection, 99.5 % right of at least 90 % of those that show both;
     up to a swap in all cameras at once, which may come again where for a while nobody saw the wand: so each is
     compared with the thirty around it."""
-    recorded = record(wave)
+    recorded = record(scenario)
     names = sorted(recorded.truth.cameras)
     lenses = [recorded.truth.cameras[name] for name in names]
     frames, seen = gather(recorded.messages, names, lenses)
-    labels = label_ends(frames, replace(seen, label=np.full(len(seen), -1)), wave.wand, lenses)
+    labels = label_ends(frames, replace(seen, label=np.full(len(seen), -1)), scenario.wand, lenses)
     both = (np.bincount(seen.frame) == 2)[seen.frame]
     assert (labels >= 0).sum() > 0.9 * both.sum()
     true_s = seen.t_s + 1e-3 * np.array([lens.time_offset_ms for lens in lenses])[seen.camera]

@@ -15,10 +15,9 @@ from calib.rig.precision_plot import draw_precision
 from calib.rig.triangulation import JointCovariance, camera_jacobians, point_covariances, triangulate_point
 from calib.wand.bundle_adjustment.problem import State
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
-from tests.calib.synthetic import record, ring
-from tests.calib.wand.quality.test_agreement import covariance, disturb
+from calib.wand.result import WandCalibration
+from tests.calib.synthetic import disturb, random_covariance, record, ring
 
 ALL = np.ones((4, 6), bool)
 
@@ -34,7 +33,7 @@ def test_expected_errors_are_honest():
     in each of 200 rigs follow chi-square with 3 degrees."""
     rng, total, runs = np.random.default_rng(0), 0.0, 200
     cameras = list(ring(4).truth.cameras.values())
-    C = covariance(4, rng)
+    C = random_covariance(4, rng)
     for _ in range(runs):
         point = rng.uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.0])
         off = (np.linalg.cholesky(C) @ rng.standard_normal(24)).reshape(-1, 6)
@@ -121,13 +120,13 @@ def test_a_good_wave_is_judged():
             "unused",
             "pose_px",
         }
-        assert grade("pose_px", camera.figures["pose_px"]) == "A" or camera.lens
+        assert grade("pose_px", camera.figures["pose_px"]) == "A" or camera.limiting_lens
         assert camera.figures["residual_px"] == pytest.approx(0.1 * np.sqrt(2), rel=0.3)
     assert trust.expected is not None
     assert 0.2 < trust.expected.typical_mm < 4
     told = trust.as_dict()
     assert told["grade"] in "ABC"
-    assert set(told["trust"]) == {"cam0", "cam1", "cam2", "cam3"}
+    assert set(told["quality"]) == {"cam0", "cam1", "cam2", "cam3"}
 
 
 def judged(name: str, **figures: float) -> CameraQuality:
@@ -140,8 +139,8 @@ def judged(name: str, **figures: float) -> CameraQuality:
     [
         ("residual_px", "residual"),
         ("rejected", "rejected"),
-        ("pose_px", "its place"),
-        ("unused", "not waved"),
+        ("pose_px", "pose"),
+        ("unused", "unused"),
     ],
 )
 def test_the_guilty_camera_is_named(criterion: str, says: str):
@@ -153,8 +152,8 @@ def test_the_guilty_camera_is_named(criterion: str, says: str):
 
 
 def test_grades_of_the_whole():
-    assert RigQuality([judged("a")], {}, 1e-4, None).sentence() == "grade A: every camera is placed well"
+    assert RigQuality([judged("a")], {}, 1e-4, None).sentence() == "grade A: all cameras meet the limits"
     told = RigQuality([judged("a")], {"b": "never saw the wand; wave before it"}, None, None).sentence()
-    assert told == "grade D: camera 'b' has no place: never saw the wand; wave before it"
+    assert told == "grade D: camera 'b' is not placed: never saw the wand; wave before it"
     assert "wand's length is 3.00% off" in RigQuality([judged("a")], {}, 0.03, None).sentence()
     assert RigQuality([judged("a", pose_px=float("nan"))], {}, None, None).grade == "D"
