@@ -53,7 +53,7 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
 def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
     twin = msgspec.structs.replace(ARENA.robots["a"], start_m=None)
     faults = {
-        b"\x00\xff": "no RobotsRequest",
+        b"\x00\xff": "RobotsRequest",
         b'{"colour": 1}': "colour",
         encode(RobotsRequest(remove=("b",))): "there is no robot 'b'",
         encode(RobotsRequest(define={"b/c": WIDE})): "can't name a robot",
