@@ -53,7 +53,7 @@ class Picking:
         """Know the markers that there are now, and show those that are picked."""
         seen = latest.markers
         if seen is not None and latest.age(seen) < 1.0:
-            self._free = seen.message.positions()[seen.message.free()]
+            self._free = seen.message.positions()[seen.message.unlabeled()]
         self._cloud.visible = bool(self.picked)
         if self.picked:
             self._cloud.points = np.array(self.picked, np.float32)

@@ -104,7 +104,7 @@ def robot_from_markers(
 
 def _unlabeled(message: Markers) -> Array:
     """(K, 6) positions and normals of unlabeled markers that more than one camera sees."""
-    rows = np.hstack([message.positions(), message.normals().astype(float)])[message.free()]
+    rows = np.hstack([message.positions(), message.normals().astype(float)])[message.unlabeled()]
     return rows[np.isfinite(rows[:, :3]).all(1)]
 
 

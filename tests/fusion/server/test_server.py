@@ -130,7 +130,8 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
         try:
             until(
                 lambda: (
-                    client.status(DEADLINE_S).next() and any(status.instants_per_s > 0 for status in statuses)
+                    client.status(DEADLINE_S).next()
+                    and any(status.frame_sets_per_s > 0 for status in statuses)
                 )
             )
             assert (sum(server.pipeline.synchronizer.late.values()) > 0) == drops
