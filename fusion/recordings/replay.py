@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import load_rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Keys, encode
@@ -41,7 +41,7 @@ def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dic
 
 def write_recording(source: Path, out: Path, fused: Iterable[Fused]) -> None:
     """Copy a recording with other poses and markers, which are logged at the times of their frame sets."""
-    entries = [e for e in iterate(source, Counter()) if not e[0].endswith(("/pose", "/markers"))]
+    entries = [e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers"))]
     arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]
     keys = Keys(arena)
     for frame_set in fused:
