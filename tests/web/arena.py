@@ -71,7 +71,6 @@ class ArenaMessages:
             dropped=2,
             detect_ms=0.71,
             roundels=8.0,
-            threshold=float("nan"),
             saturated=0.0,
             clock_offset_ms=0.02,
             advice=advice,

@@ -53,7 +53,6 @@ def test_an_unused_camera_has_a_note():
         dropped=0,
         detect_ms=0.5,
         roundels=0.0,
-        threshold=128.0,
         saturated=0.0,
         advice="too dark",
     )

@@ -18,7 +18,7 @@ from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors
-from tests.fusion.server.test_server import DEADLINE_S, config, live, send, serving, until
+from tests.fusion.serving import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 
 NAMES = [f"robot_{k}" for k in range(200)]
@@ -136,10 +136,10 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
                 }
 
             until(all_are_told)
-            assert server._tracker is not None
-            assert second._tracker is not None
-            assert server._tracker.owned.tolist() == [True, False, False]
-            assert second._tracker.owned.tolist() == [False, True, True]
+            assert server.pipeline.tracker is not None
+            assert second.pipeline.tracker is not None
+            assert server.pipeline.tracker.owned.tolist() == [True, False, False]
+            assert second.pipeline.tracker.owned.tolist() == [False, True, True]
         finally:
             second.stop()
             thread.join(DEADLINE_S)

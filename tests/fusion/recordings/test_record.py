@@ -20,7 +20,7 @@ from fusion.recordings.run import fuse_recording, replay
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Limits
 from tests.fusion.conftest import errors, poses_of
-from tests.fusion.server.test_server import ARENA, KEYS, config, live, send, serving
+from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 MOVING = Arena(
@@ -91,7 +91,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert {message.camera for _, message in recording.detections} == ARENA.cameras.keys()
     assert recording.rig is not None
     assert recording.rig.cameras == ARENA.cameras
-    assert recording.robots == server.robots
+    assert recording.robots == server.pipeline.robots
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
 
 
