@@ -14,7 +14,7 @@ from camera_node.errors import ConfigError, NetworkError
 
 log = logging.getLogger("camera_node.network")
 
-REPORT_S = 5.0  # for a router's report on itself
+REPORT_S = 5.0  # timeout of the query for a router's endpoints
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
@@ -43,15 +43,15 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
 
 
 def has_assigned_port(listen: Sequence[str]) -> bool:
-    """Whether the operating system chooses the port of one of the endpoints: it is given as 0."""
+    """Whether the port of one of the endpoints is 0, so that the operating system chooses it."""
     return any(ASSIGNED_PORT.search(endpoint) for endpoint in listen)
 
 
 def listening_endpoints(router: zenoh.Session, listen: Sequence[str]) -> tuple[str, ...]:
-    """The endpoints at which a router is reached that `open_router` opened with `listen`.
+    """The endpoints of a router that `open_router` opened with `listen`.
 
-    They are `listen` itself unless a port in it is 0; then they are read from the router's admin space, since Zenoh's
-    Python API 1.10 does not report locators.
+    They are `listen` itself unless a port in it is 0. In that case they are read from the router's admin space, because
+    Zenoh's Python API 1.10 does not report locators.
 
     Raises:
         NetworkError: the router does not report them.
