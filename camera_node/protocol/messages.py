@@ -46,7 +46,7 @@ class Keys:
 
 
 class MessageError(ValueError):
-    """Bytes that are no valid message. Receivers count them and continue."""
+    """Invalid bytes in place of a message. Receivers count them and continue."""
 
 
 class Detections(msgspec.Struct, frozen=True, kw_only=True):
@@ -197,7 +197,7 @@ def decode(data: bytes, kind: type[T]) -> T:
     """Decode and check bytes from the network.
 
     Raises:
-        MessageError: they are no message of this kind and version, or a value is invalid.
+        MessageError: the bytes are not a message of this kind and version, or a value is invalid.
     """
     try:
         message = msgspec.msgpack.decode(data, type=kind)

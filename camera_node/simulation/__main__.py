@@ -34,7 +34,7 @@ def _render(
         cameras: the cameras to render; all unless given.
     """
     if not (math.isfinite(start) and 0 < seconds < math.inf):
-        raise ConfigError(f"--start {start} --seconds {seconds} is no time span; give seconds above 0")
+        raise ConfigError(f"--start {start} --seconds {seconds} is not a time span; give seconds above 0")
     render_recording(Scene.load(scene), out, start, start + seconds, cameras or None)
     print(f"{out}: frames of each camera, truth.json, and rig.yaml with the intrinsics")
 

@@ -13,7 +13,7 @@ from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body, Vector
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import look_at, rotation_from_vector, vector_from_rotation
+from camera_node.geometry.pose import look_at, rotation_from_vector
 
 WAND = "wand"  # the name of the wand among the bodies
 
@@ -203,18 +203,6 @@ class Scene:
         if name not in self._motions:
             raise ConfigError(f"the scene has no robot '{name}'; it has {', '.join(sorted(self._motions))}")
         return None if t_s < self.wave_s else self._motions[name].pose(t_s)
-
-    def robot_twist(self, name: str, t_s: float) -> tuple[Array, Array] | None:
-        """Linear (3,) m/s and angular (3,) rad/s velocity of a robot in the world, or None while it is absent.
-
-        Central differences over 1 ms have relative errors of the order of 1e-6 for motions with periods of seconds.
-        """
-        if self.robot_pose(name, t_s) is None:
-            return None
-        h = 5e-4
-        before, after = (self._motions[name].pose(t_s + dt) for dt in (-h, h))
-        turn = vector_from_rotation(after[:3, :3] @ before[:3, :3].T)
-        return (after[:3, 3] - before[:3, 3]) / (2 * h), turn / (2 * h)
 
     def bodies_at(self, t_s: float) -> dict[str, tuple[Body, Array]]:
         """The bodies in the arena with their T_world_body (4, 4), by name; the wand has the name "wand"."""

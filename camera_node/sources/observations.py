@@ -26,11 +26,11 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
         settings: keyword arguments of `Detector`.
 
     Raises:
-        CameraError: the folder is missing or holds no frames, or a frame is no image.
+        CameraError: the folder is missing or holds no frames, or a frame is not an image.
     """
     if not folder.is_dir():
         raise CameraError(
-            f"{folder} is no folder; frames are expected as {folder}/<camera>/<t_ns>.png or .jpg"
+            f"{folder} is not a folder; frames are expected as {folder}/<camera>/<t_ns>.png or .jpg"
         )
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())
     if not names:
@@ -74,7 +74,7 @@ def read_observations(path: Path, sizes: dict[str, tuple[int, int]] | None = Non
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
     except UnicodeDecodeError:
         raise ConfigError(
-            f"{path} is no text file; it needs the columns t_ns,camera,u,v and optionally marker"
+            f"{path} is not a text file; it needs the columns t_ns,camera,u,v and optionally marker"
         ) from None
     if not rows:
         raise ConfigError(f"{path} holds no observations; add rows of t_ns,camera,u,v")

@@ -25,7 +25,7 @@ class FrameFolder:
     def __init__(self, folder: Path) -> None:
         """Raises CameraError where the folder is missing or holds no frames named by their capture time."""
         if not folder.is_dir():
-            raise CameraError(f"{folder} is no folder; frames are expected as {folder}/<t_ns>.png or .jpg")
+            raise CameraError(f"{folder} is not a folder; frames are expected as {folder}/<t_ns>.png or .jpg")
         files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
         if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,19}", path.stem)]:
             raise CameraError(
@@ -63,7 +63,7 @@ class VideoFile:
         video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not video.isOpened():
             raise CameraError(
-                f"{self.path} is no video that OpenCV can read; give a video, a folder of frames or a camera"
+                f"{self.path} is not a video that OpenCV can read; give a video, a folder of frames or a camera"
             )
         return video
 
@@ -148,12 +148,12 @@ def read_grey(path: Path) -> Grey:
     """Read an image file of 8 to 16 bits as grey levels (h, w), uint8.
 
     Raises:
-        CameraError: the file is missing or is no image.
+        CameraError: the file is missing or is not an image.
     """
     if not path.is_file():
         raise CameraError(f"{path} does not exist; check the path")
     depth = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     image = cv2.imdecode(np.fromfile(path, np.uint8), depth) if path.stat().st_size else None
     if image is None:
-        raise CameraError(f"{path} is no image that OpenCV can read; give a PNG or JPEG file")
+        raise CameraError(f"{path} is not an image that OpenCV can read; give a PNG or JPEG file")
     return to_grey(image)

@@ -22,7 +22,7 @@ log = logging.getLogger("camera_node.device")
 SYS = Path("/sys/class/video4linux")
 REOPEN_S = 1.0
 CLOSE_S = 5.0  # longest wait for the thread, which may be waiting for a frame
-MANUAL_EXPOSURE, AUTOMATIC_EXPOSURE = 1, 3  # V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY
+MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 
 
 def find_device(text: str, sys: Path = SYS) -> Path:
@@ -151,7 +151,7 @@ def open_capture(device: Path, settings: SourceSettings) -> cv2.VideoCapture:
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")
     capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
     if not capture.isOpened():
-        raise CameraError(f"{device} is no camera, or another program uses it; close that program")
+        raise CameraError(f"{device} is not a camera, or another program uses it; close that program")
     apply(capture, properties(settings), device)
     return capture
 

@@ -62,5 +62,5 @@ def test_contradictory_options_are_refused(image: Path, tmp_path: Path):
 
 def test_an_error_names_the_file_that_is_no_image(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("no image")
-    with pytest.raises(CameraError, match=r"notes\.txt is no image"):
+    with pytest.raises(CameraError, match=r"notes\.txt is not an image"):
         Detect(images=(tmp_path / "notes.txt",)).run()

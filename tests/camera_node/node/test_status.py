@@ -12,19 +12,21 @@ CENTRE = np.array([[80.0, 60.0]])
 
 
 @pytest.mark.parametrize(
-    ("bright", "says"),
+    ("bright", "kind", "change"),
     [
-        (255.0, "saturated: halve the exposure or the gain"),
-        (220.0, ""),
-        (120.0, ""),
-        (80.0, "too dark: 2.5 times the exposure or the gain"),
-        (40.0, "too dark: 5.0 times the exposure or the gain"),
+        (255.0, "saturated", "halve"),
+        (220.0, "", ""),
+        (120.0, "", ""),
+        (80.0, "too dark", "2.5 times"),
+        (40.0, "too dark", "5.0 times"),
     ],
 )
-def test_advice_depends_on_the_white_of_the_roundels(bright: float, says: str):
+def test_advice_depends_on_the_white_of_the_roundels(bright: float, kind: str, change: str):
     """For any background: here a dark one for bright paper and the reverse."""
     roundel = render([Disc((80, 60), 40)], dark=bright / 8, bright=bright, ground=255.0 - bright)
-    assert advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE) == says
+    advice = advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE)
+    assert advice.partition(":")[0] == kind
+    assert change in advice
 
 
 def test_without_roundels_advice_depends_on_the_histogram():

@@ -39,6 +39,14 @@ def view_minor_px(camera: SceneCamera, body: Body, T_world_body: Array) -> float
     return float(smallest)
 
 
+def velocity_of(scene: Scene, robot: str, t_s: float) -> Array:
+    """(3,) m/s in the world, by central differences over 1 ms."""
+    before, after = (scene.robot_pose(robot, t_s + dt) for dt in (-5e-4, 5e-4))
+    assert before is not None
+    assert after is not None
+    return (after[:3, 3] - before[:3, 3]) / 1e-3
+
+
 def test_robots_are_large_in_three_cameras_at_all_times(demo):
     """12 px is enough for the detectors of all peers; with three cameras a robot stays visible when one is occluded."""
     for t_s in np.arange(demo.wave_s, demo.wave_s + 90, 0.25):
@@ -56,7 +64,7 @@ def test_robots_do_not_collide(demo):
 
 def test_robots_drive_at_a_walking_pace(demo):
     speeds = [
-        np.linalg.norm(demo.robot_twist(name, t)[0]) for name in demo.robots for t in np.arange(15, 45, 0.5)
+        np.linalg.norm(velocity_of(demo, name, t)) for name in demo.robots for t in np.arange(15.1, 45, 0.5)
     ]
     assert min(speeds) > 0.15
     assert max(speeds) < 0.6
@@ -80,23 +88,11 @@ def test_robots_replace_the_wand(demo):
     assert set(demo.bodies_at(after)) == set(demo.robots)
     assert demo.wand_pose(after) is None
     assert all(demo.robot_pose(name, before) is None for name in demo.robots)
-    assert all(demo.robot_twist(name, before) is None for name in demo.robots)
-
-
-def test_the_twist_is_the_derivative_of_the_pose(demo):
-    """A step of h along the twist leads to the pose after h, up to h^2 / 2 times the acceleration (below 2 m/s^2)."""
-    h, t_s = 0.01, 21.3
-    for name in demo.robots:
-        before, after = demo.robot_pose(name, t_s), demo.robot_pose(name, t_s + h)
-        velocity, omega = demo.robot_twist(name, t_s)
-        assert np.linalg.norm(before[:3, 3] + h * velocity - after[:3, 3]) < h**2
-        turned = before[:3, :3] + h * np.cross(omega, before[:3, :3].T).T
-        assert np.abs(turned - after[:3, :3]).max() < 2 * h**2
 
 
 def test_a_robot_that_faces_its_travel_points_along_its_velocity(demo):
     for t_s in np.arange(20, 32, 0.7):
-        velocity, _ = demo.robot_twist("rover", t_s)
+        velocity = velocity_of(demo, "rover", t_s)
         assert demo.robot_pose("rover", t_s)[:3, 0] @ velocity == pytest.approx(
             np.linalg.norm(velocity), rel=1e-4
         )

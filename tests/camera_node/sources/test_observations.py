@@ -65,14 +65,14 @@ def test_files_that_can_not_be_read_or_written_are_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match="can't be read"):
         read_observations(tmp_path / "none.csv")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match=r"bytes\.csv is no text"):
+    with pytest.raises(ConfigError, match=r"bytes\.csv is not a text"):
         read_observations(tmp_path / "bytes.csv")
     with pytest.raises(ConfigError, match="can't be written"):
         write_observations(tmp_path / "no" / "o.csv", [])
 
 
 def test_folders_without_cameras_are_refused(tmp_path: Path):
-    with pytest.raises(CameraError, match="is no folder"):
+    with pytest.raises(CameraError, match="is not a folder"):
         detect_frames(tmp_path / "none")
     with pytest.raises(CameraError, match="no camera's folder"):
         detect_frames(tmp_path)

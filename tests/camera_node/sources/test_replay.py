@@ -139,13 +139,13 @@ def test_an_error_names_the_source_that_does_not_open(tmp_path: Path):
     (named / "first.png").write_bytes(b"")
     for text, says in [
         ("nowhere", "no folder, video or camera 'nowhere'"),
-        (str(tmp_path / "text.mp4"), "is no video"),
+        (str(tmp_path / "text.mp4"), "is not a video"),
         (str(empty), "holds no frames"),
         (str(named), r"first\.png .* capture time"),
     ]:
         with pytest.raises(CameraError, match=says):
             open_source(text, SourceSettings())
-    with pytest.raises(CameraError, match="is no folder"):
+    with pytest.raises(CameraError, match="is not a folder"):
         FrameFolder(tmp_path / "none")
     with pytest.raises(ConfigError, match="--scene"):
         open_source("sim", SourceSettings())
@@ -154,7 +154,7 @@ def test_an_error_names_the_source_that_does_not_open(tmp_path: Path):
 def test_an_error_names_the_file_that_is_no_image(tmp_path: Path):
     for name, data in (("empty.png", b""), ("text.png", b"text")):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(CameraError, match=f"{name} is no image"):
+        with pytest.raises(CameraError, match=f"{name} is not an image"):
             read_grey(tmp_path / name)
     with pytest.raises(CameraError, match="does not exist"):
         read_grey(tmp_path / "none.png")

@@ -61,7 +61,7 @@ def test_an_error_lists_the_cameras_when_a_name_is_unknown_or_ambiguous(sys_root
 def test_an_error_names_the_missing_device():
     with pytest.raises(CameraError, match="/dev/video99 does not exist"):
         open_source("99", SourceSettings())
-    with pytest.raises(CameraError, match="is no camera"):
+    with pytest.raises(CameraError, match="is not a camera"):
         open_capture(Path("/dev/null"), SourceSettings())
 
 
