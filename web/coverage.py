@@ -8,50 +8,51 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.coverage import Coverage
 from camera_node.protocol.messages import Detections
 
 WIDTH = 160  # pixels of one picture
 MAX_ASPECT = 4.0  # height over width of one picture
-CELLS = 8  # per direction, of the grid for the covered share
+CELLS = (8, 8)  # of the grid for the covered share
 TITLE = 18  # pixels above each picture for the camera's name
 GAP = 8  # pixels between two pictures
 EMPTY, COVERED = np.array([24, 28, 38], np.uint8), np.array([64, 200, 170], np.uint8)
 BACKGROUND, TEXT = 36, (205, 210, 220)
 
 
-class CoverageGrid:
-    """The part of one camera's image in which roundels were detected."""
+class CoveragePicture:
+    """A picture of one camera's image that shows where roundels were detected."""
 
     def __init__(self, width: int, height: int) -> None:
         self.size = (width, height)
-        self.covered = np.zeros((max(1, round(WIDTH * min(height / width, MAX_ASPECT))), WIDTH), bool)
-        self.cells = np.zeros((CELLS, CELLS), bool)
+        self._mask = np.zeros((max(1, round(WIDTH * min(height / width, MAX_ASPECT))), WIDTH), bool)
+        self._coverage = Coverage(np.zeros(CELLS, np.int64))
 
     def add(self, detections: Detections) -> None:
         """Mark the roundels of one frame."""
         uv = np.frombuffer(detections.uv, "<f8").reshape(-1, 2)
+        self._coverage += Coverage.of(uv, *self.size, CELLS)
         relative = (uv + 0.5) / self.size
         relative = relative[((relative >= 0) & (relative < 1)).all(axis=1)]
-        rows, columns = self.covered.shape
+        rows, columns = self._mask.shape
         v, u = (relative[:, 1] * rows).astype(int), (relative[:, 0] * columns).astype(int)
         for dv in (-1, 0, 1):
             for du in (-1, 0, 1):
-                self.covered[np.clip(v + dv, 0, rows - 1), np.clip(u + du, 0, columns - 1)] = True
-        self.cells[(relative[:, 1] * CELLS).astype(int), (relative[:, 0] * CELLS).astype(int)] = True
+                self._mask[np.clip(v + dv, 0, rows - 1), np.clip(u + du, 0, columns - 1)] = True
 
     @property
     def share(self) -> float:
         """The covered share of the image, 0 to 1, counted in 8 x 8 cells."""
-        return float(self.cells.mean())
+        return self._coverage.share()
 
-    def picture(self) -> NDArray[np.uint8]:
+    def pixels(self) -> NDArray[np.uint8]:
         """Return the picture, (rows, 160, 3) RGB."""
-        return np.where(self.covered[..., None], COVERED, EMPTY)
+        return np.where(self._mask[..., None], COVERED, EMPTY)
 
 
-def montage(grids: Mapping[str, CoverageGrid]) -> NDArray[np.uint8]:
+def montage(pictures: Mapping[str, CoveragePicture]) -> NDArray[np.uint8]:
     """Return the pictures of all cameras, two in a row, with names and shares: (h, 2 * 160 + 8, 3) RGB."""
-    tiles = [_titled_picture(name, grids[name]) for name in sorted(grids)]
+    tiles = [_tile(name, pictures[name]) for name in sorted(pictures)]
     height = max((len(tile) for tile in tiles), default=1)
     rows = []
     nothing = np.full((1, 1, 3), BACKGROUND, np.uint8)
@@ -63,9 +64,10 @@ def montage(grids: Mapping[str, CoverageGrid]) -> NDArray[np.uint8]:
     return np.concatenate(rows) if rows else np.zeros((1, 2 * WIDTH + GAP, 3), np.uint8)
 
 
-def _titled_picture(name: str, grid: CoverageGrid) -> NDArray[np.uint8]:
-    tile = np.full((TITLE + len(grid.covered), WIDTH, 3), BACKGROUND, np.uint8)
-    tile[TITLE:] = grid.picture()
-    text = f"{name[:16]} {100 * grid.share:.0f} %"
+def _tile(name: str, picture: CoveragePicture) -> NDArray[np.uint8]:
+    pixels = picture.pixels()
+    tile = np.full((TITLE + len(pixels), WIDTH, 3), BACKGROUND, np.uint8)
+    tile[TITLE:] = pixels
+    text = f"{name[:16]} {100 * picture.share:.0f} %"
     cv2.putText(tile, text, (2, TITLE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, TEXT, 1, cv2.LINE_AA)
     return tile

@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import web
-from calib.live.collect import publish
+from calib.live.collect import publish_rig
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
-from calib.world.world_frame import align
+from calib.world.world_frame import align_cameras
 from camera_node.errors import ConfigError
 from camera_node.protocol.session import open_client
 from camera_node.simulation.scene import Scene
@@ -156,8 +156,8 @@ class Demo:
         if missing := set(self.scene.cameras) - set(rig.placed()):
             raise ProgramFailed(f"the calibration has no pose for {', '.join(sorted(missing))}")
         positions = {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
-        aligned, errors_m = align(rig, positions)
-        publish(self.session, ARENA, aligned)
+        aligned, errors_m = align_cameras(rig, positions)
+        publish_rig(self.session, ARENA, aligned)
         error = f"position errors up to {1e3 * max(errors_m.values()):.2f} mm"
         print(f"calibrated: {len(errors_m)} cameras, {error}", flush=True)
 

@@ -15,7 +15,7 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
-from web.coverage import CoverageGrid
+from web.coverage import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
@@ -39,7 +39,7 @@ class ArenaState:
     now_s: float = 0.0
     poses: dict[str, TimedMessage] = field(default_factory=dict)  # by robot
     cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
-    coverage: dict[str, CoverageGrid] = field(default_factory=dict)  # by camera
+    coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
@@ -143,10 +143,10 @@ class Feed:
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
         _check_name(self._state.coverage, camera, key)
-        grid = self._state.coverage.get(camera)
-        if grid is None or grid.size != size:
-            grid = self._state.coverage[camera] = CoverageGrid(*size)
-        grid.add(detections)
+        picture = self._state.coverage.get(camera)
+        if picture is None or picture.size != size:
+            picture = self._state.coverage[camera] = CoveragePicture(*size)
+        picture.add(detections)
         self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:

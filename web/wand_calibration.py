@@ -10,9 +10,9 @@ from typing import Any
 
 import viser
 
-from calib.live.collect import publish
-from calib.live.wand_session import MOST_S, SessionProgress, wave
-from calib.rig.recording import save_wave, wave_beside
+from calib.live.collect import publish_rig
+from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
+from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import load_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
@@ -88,16 +88,17 @@ class WandSessionPanel:
     def _calibrate(self) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
         rig, wand = load_rig(files.rig), load_yaml(files.wand, Body)
-        heard, why = wave(session, arena, rig, wand, MOST_S, self._show, self._end_requested)
+        settings = WandSession(rig=rig, wand=wand)
+        collected, reason = run_wand_session(session, arena, settings, self._show, self._end_requested)
         self._button.disabled = True
-        recording = wave_beside(files.rig)
-        save_wave(recording, arena, heard.messages)
+        recording = wand_recording_path(files.rig)
+        save_wand_recording(recording, arena, collected.messages)
         if self._closed:
             return ""
-        self._answer_with(f"wand session ended: {why}; calibrating")
+        self._answer_with(f"wand session ended: {reason}; calibrating")
         calibrate_cameras(recording, files)
         rig = load_rig(files.rig)
-        publish(session, arena, rig)
+        publish_rig(session, arena, rig)
         outcome = describe_calibration(rig.calibration)
         if self._subscription.feed.state().server_alive:
             return outcome
@@ -107,7 +108,7 @@ class WandSessionPanel:
         rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]
         table = HtmlTable(("camera", "frames", "image", "shared part"), rows, "no roundel yet")
         set_content(self._cameras, table.html())
-        self._answer_with(f"{progress.standing}: {progress.advice}")
+        self._answer_with(f"{progress.summary}: {progress.advice}")
 
     def _answer_with(self, text: str) -> None:
         set_content(self._answer, escape_markdown(text))

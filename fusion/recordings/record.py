@@ -18,7 +18,7 @@ import tyro
 import zenoh
 
 from calib.rig.messages import RigMessage
-from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
@@ -63,7 +63,7 @@ def read_recording(path: Path) -> ArenaRecording:
         ConfigError: the file is missing, or no recording of an arena.
     """
     recording = ArenaRecording()
-    for key, data, received_ns in iterate(path, recording.faults):
+    for key, data, received_ns in read_messages(path, recording.faults):
         recording.take(key, data, received_ns)
     if not recording.detections:
         raise ConfigError(f"{path} holds no detections; record with python -m fusion record {path}")

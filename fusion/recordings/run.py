@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.rig.camera import Camera
-from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import load_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
@@ -209,7 +209,7 @@ def _tell(fused: Iterable[Fused], out: Path, summary: Summary, robots: Iterable[
 
 def _copy(recording: Path, out: Path, fused: Iterable[Fused], summary: Summary) -> None:
     """A recording with the same messages but other poses and markers, which stand at their instants."""
-    entries = [e for e in iterate(recording, Counter()) if not e[0].endswith(("/pose", "/markers"))]
+    entries = [e for e in read_messages(recording, Counter()) if not e[0].endswith(("/pose", "/markers"))]
     arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]
     keys = Keys(arena)
     for instant in fused:

@@ -11,7 +11,7 @@ from camera_node.protocol.messages import CameraStatus
 from fusion.protocol.messages import CameraHealth, FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from web.coverage import CoverageGrid, montage
+from web.coverage import CoveragePicture, montage
 from web.feed import ArenaState, Feed, TimedMessage
 from web.tables import (
     STALE_S,
@@ -137,19 +137,19 @@ def test_coverage_counts_cells_and_ignores_the_outside(arena: LiveArena, feed: F
     coverage = feed.state().coverage
     assert coverage["north"].share == 1.0
     assert coverage["east"].share == 0.0
-    assert coverage["north"].picture().shape == (120, 160, 3)
+    assert coverage["north"].pixels().shape == (120, 160, 3)
 
 
 def test_coverage_of_a_row_or_a_column_of_pixels():
-    assert CoverageGrid(32768, 1).picture().shape == (1, 160, 3)
-    assert CoverageGrid(1, 32768).picture().shape == (640, 160, 3)
+    assert CoveragePicture(32768, 1).pixels().shape == (1, 160, 3)
+    assert CoveragePicture(1, 32768).pixels().shape == (640, 160, 3)
 
 
 def test_a_montage_contains_all_pictures():
     """Two in a row, of any shapes; without cameras it is a line."""
     assert montage({}).shape == (1, 328, 3)
     assert montage(
-        {"a": CoverageGrid(640, 480), "b": CoverageGrid(480, 640), "c": CoverageGrid(640, 480)}
+        {"a": CoveragePicture(640, 480), "b": CoveragePicture(480, 640), "c": CoveragePicture(640, 480)}
     ).shape == (
         2 * (18 + 213),
         328,

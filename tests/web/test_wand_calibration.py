@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from calib.rig.recording import read_wave, save_wave
+from calib.rig.recording import read_detections, save_wand_recording
 from calib.rig.rig import load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.errors import ConfigError
@@ -57,12 +57,12 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
             session.put(key, encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
         for name in ARENA.truth.cameras:
             page.get_by_text(name).first.wait_for(timeout=20_000)
-        wait_for(lambda: sum(grid.share for grid in view.feed.state().coverage.values()))
+        wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
         page.get_by_role("button", name="End wand session").click()
         page.get_by_text("; no server is running").wait_for(timeout=CALIBRATION_MS)
         page.get_by_text("grade").first.wait_for(timeout=20_000)
         page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
-    saved = {(m.camera, m.t_ns) for m in read_wave(files.rig.with_name("rig.wave.mcap"))}
+    saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
     assert saved <= {(m.camera, m.t_ns) for m in sent}
     assert len(saved) > len(sent) / 2
     rig = load_rig(files.rig)
@@ -73,7 +73,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
 def test_a_failed_calibration_names_the_recording(tmp_path: Path, files: CalibrationFiles):
     """With the reason; the rig file does not change."""
     recording = tmp_path / "rig.wave.mcap"
-    save_wave(recording, "test", record(ARENA, 2.0))
+    save_wand_recording(recording, "test", record(ARENA, 2.0))
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
     before = files.rig.read_bytes()
     with pytest.raises(WebError, match=r"symmetric.*rig\.wave\.mcap"):

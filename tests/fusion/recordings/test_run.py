@@ -54,7 +54,7 @@ def test_observations_become_poses(recording, capsys):
     ("fault", "said"),
     [
         ("no rig", "does not exist"),
-        ("unplaced", "places no camera"),
+        ("unplaced", "no camera in"),
         ("broken", "not valid YAML"),
         ("no input", "either --frames"),
     ],
