@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from camera_node import _core
 from camera_node.arrays import Array
 from camera_node.detection.disc_adjustment import adjust, covariance_through, shape_of
-from camera_node.detection.roundels import Roundel, Roundels
+from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
 from camera_node.geometry.lens import Lens
 
 BOUNDARY = 24  # points of an ellipse that are undistorted
@@ -66,37 +65,38 @@ class DiscPoses:
         return first, second
 
 
-def locate(
-    roundel: Roundel,
-    lens: Lens,
-    diameter_m: float,
-    offset: tuple[ArrayLike, ArrayLike] | None = None,
-) -> tuple[DiscPose, DiscPose] | None:
-    """Both poses of one disc, the likelier first, as `locate_all` has them; None where the lens has no inverse."""
-    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
-    offsets = None if offset is None else (np.asarray([offset[0]], float), np.asarray([offset[1]], float))
-    return _locate(ellipse, lens, diameter_m, offsets)[0]
+@dataclass(frozen=True, slots=True)
+class _Outlines:
+    """What poses are computed from: (N, 5) u, v, major, minor, angle, and the measured offsets if there are any."""
+
+    ellipses: Array
+    offset_px: Array | None = None
+    pose_cov: Array | None = None
 
 
-def locate_all(
-    roundels: Roundels,
-    lens: Lens,
-    diameter_m: float,
-    offsets: tuple[Array, Array] | None = None,
-) -> DiscPoses:
+def locate(roundel: Roundel, lens: Lens, diameter_m: float) -> tuple[DiscPose, DiscPose] | None:
+    """Both poses of one disc, the likelier first, as in `locate_all`; None where the lens has no inverse."""
+    outline = _Outlines(np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]]))
+    if roundel.offset_px is not None and roundel.pose_cov is not None:
+        outline = _Outlines(outline.ellipses, roundel.offset_px[None], roundel.pose_cov[None])
+    return _locate(outline, lens, diameter_m)[0]
+
+
+def locate_all(roundels: Roundels, lens: Lens, diameter_m: float) -> DiscPoses:
     """Both poses of each disc of outer diameter `diameter_m`, the likelier first.
 
     The ellipse's boundary goes through the lens, point by point: that a circle's image through distortion is no
     ellipse then costs nothing to first order. The conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et al.
     1992).
 
-    The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: `offsets` are those from
-    the ellipses' centres (N, 2) and the covariance (N, 7, 7) of all that was measured, as `Detector.disc_offsets` gives
-    them. Both poses are then adjusted to ellipse and offset, and the probability is that of the chi-square with two
-    degrees that is left, widened by `SCATTER`. Without them all are 0.5.
+    The outer ellipse does not distinguish the two poses. The image of the disc's own centre does. Of
+    `DetectedRoundels`, both poses are adjusted to the ellipse and to the measured offset, and the probability is that
+    of the remaining chi-square with two degrees of freedom, scaled by `SCATTER`. Otherwise both are 0.5.
     """
     ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
-    return _locate(ellipses, lens, diameter_m, offsets)
+    if not isinstance(roundels, DetectedRoundels):
+        return _locate(_Outlines(ellipses), lens, diameter_m)
+    return _locate(_Outlines(ellipses, roundels.offset_px, roundels.pose_cov), lens, diameter_m)
 
 
 def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
@@ -123,8 +123,8 @@ def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) 
     return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
 
 
-def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array, Array] | None) -> DiscPoses:
-    """Both poses of ellipses (N, 5): u, v, major, minor, angle."""
+def _locate(outlines: _Outlines, lens: Lens, diameter_m: float) -> DiscPoses:
+    ellipses = outlines.ellipses
     n = len(ellipses)
     xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
     seen = np.isfinite(xy).all(axis=(1, 2))
@@ -133,9 +133,13 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array
     if seen.any():
         Q, radius = _fit_conics(xy[seen]), diameter_m / 2
         position[seen], normal[seen] = decompose(Q, radius)
-        if offsets is not None:
-            parts = position[seen], normal[seen], ellipses[seen], offsets[0][seen], offsets[1][seen]
-            position[seen], normal[seen], odds[seen] = _adjust(Q, radius, lens, *parts)
+        if outlines.offset_px is not None and outlines.pose_cov is not None:
+            disc_centres = lens.normalise(ellipses[seen, :2] + outlines.offset_px[seen])
+            shapes = shape_of(np.asarray(np.linalg.inv(Q), float))
+            measured = np.concatenate([shapes, disc_centres], axis=1)
+            cov = covariance_through(lens, ellipses[seen], outlines.pose_cov[seen])
+            poses = _adjust((position[seen], normal[seen]), radius, measured, cov)
+            position[seen], normal[seen], odds[seen] = poses
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
     order = np.argsort(-odds, axis=1, kind="stable")
     pick = np.arange(n)[:, None], order
@@ -143,22 +147,12 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array
 
 
 def _adjust(
-    Q: Array,
-    radius: float,
-    lens: Lens,
-    position: Array,
-    normal: Array,
-    ellipses: Array,
-    offset: Array,
-    covariance: Array,
+    poses: tuple[Array, Array], radius: float, measured: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Positions and normals (N, 2, 3) adjusted to ellipse and offset at once, and their odds (N, 2)."""
-    centre = lens.normalise(ellipses[:, :2] + offset)
-    dual = np.asarray(np.linalg.inv(Q), float)
-    seen = np.concatenate([shape_of(dual), centre], axis=1)
-    cov = covariance_through(lens, ellipses, covariance)
-    seen, cov = np.repeat(seen, 2, axis=0), np.repeat(cov, 2, axis=0)  # of both poses
-    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, seen, cov)
+    """Adjust positions and normals (N, 2, 3) to what was measured (N, 7), as `adjust` does; also their odds (N, 2)."""
+    position, normal = poses
+    measured, covariance = np.repeat(measured, 2, axis=0), np.repeat(covariance, 2, axis=0)  # of both poses
+    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, measured, covariance)
     return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a detector sees in one frame: columns for programs, objects for people."""
+"""The roundels of one frame: as columns for computation, as objects for display."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ class Roundel:
         contrast: bright level less dark level, grey levels of 255.
         id: the number printed in the roundel or given by a file, or None.
         track: a number that stays with the roundel from frame to frame, or None.
+        offset_px, pose_cov: as in `DetectedRoundels`; None unless a detector measured them.
     """
 
     uv: Array
@@ -33,6 +34,8 @@ class Roundel:
     contrast: float
     id: int | None = None
     track: int | None = None
+    offset_px: Array | None = None
+    pose_cov: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +71,7 @@ class Roundels:
 
     def select(self, rows: NDArray) -> "Roundels":
         """The rows that a mask or an index array names."""
-        return Roundels(*(getattr(self, name)[rows] for name in self.__slots__))
+        return Roundels(*(getattr(self, name)[rows] for name in Roundels.__slots__))
 
     def __getitem__(self, k: int) -> Roundel:
         number, track = int(self.id[k]), int(self.track[k])
@@ -85,3 +88,32 @@ class Roundels:
 
     def __iter__(self) -> Iterator[Roundel]:
         return (self[k] for k in range(len(self)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedRoundels(Roundels):
+    """The N roundels that a detector found in one image, with what only a fit to the image measures.
+
+    Attributes:
+        offset_px: (N, 2) vectors from the outer ellipses' centres `uv` to the images of the discs' own centres,
+            measured by the position of the inner ellipse in the outer one.
+        pose_cov: (N, 7, 7) covariance of what a pose is computed from: of `uv`, of the ellipse's shape xx, xy, yy (it
+            is `uv` + A q, |q| = 1, A symmetric) and of the offset; pixels.
+        n_postponed: positions in the image that may hold a roundel and were not fitted, because the work for a frame
+            is bounded. The next frame begins with them. It is 0 unless the image has hundreds of untracked ring-like
+            shapes.
+    """
+
+    offset_px: Array
+    pose_cov: Array
+    n_postponed: int = 0
+
+    def select(self, rows: NDArray) -> "DetectedRoundels":
+        """The rows that a mask or an index array names."""
+        names = (*Roundels.__slots__, "offset_px", "pose_cov")
+        columns = {name: getattr(self, name)[rows] for name in names}
+        return DetectedRoundels(**columns, n_postponed=self.n_postponed)
+
+    def __getitem__(self, k: int) -> Roundel:
+        # Dataclasses with slots do not support super() without arguments.
+        return replace(Roundels.__getitem__(self, k), offset_px=self.offset_px[k], pose_cov=self.pose_cov[k])

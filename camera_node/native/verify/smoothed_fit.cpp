@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-#include "verify/soften.hpp"
+#include "verify/smoothed_fit.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -9,10 +9,10 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMargin = 4;                        // pixels: the fit's band, the card and the mean's reach
-constexpr double kHidden = (16.0 / 6) * (16.0 / 6);  // noise variance over that of the binomial mean
+constexpr double kMargin = 4;  // pixels: the band of the fit, the card and the reach of the mean
+constexpr double kInflation = (16.0 / 6) * (16.0 / 6);  // noise variance over that of the binomial mean
 
-/// The 3 x 3 binomial mean; the image's outermost pixels are repeated.
+/// The 3 x 3 binomial mean; the pixels on the image's border are repeated.
 std::vector<uint8_t> binomial_mean(const ImageView& image) {
     std::vector<uint8_t> mean(size_t(image.width) * size_t(image.height));
     for (int y = 0; y < image.height; ++y) {
@@ -31,20 +31,20 @@ std::vector<uint8_t> binomial_mean(const ImageView& image) {
 
 }  // namespace
 
-std::optional<Fit> refine_softened(const ImageView& image, const Start& start) {
-    const double reach = start.outer.major / 2 + kMargin;
-    const int left = std::max(0, int(start.outer.x - reach)), top = std::max(0, int(start.outer.y - reach));
-    const int width = std::min(image.width, int(start.outer.x + reach) + 1) - left;
-    const int height = std::min(image.height, int(start.outer.y + reach) + 1) - top;
+std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGuess& guess) {
+    const double reach = guess.outer.major / 2 + kMargin;
+    const int left = std::max(0, int(guess.outer.x - reach)), top = std::max(0, int(guess.outer.y - reach));
+    const int width = std::min(image.width, int(guess.outer.x + reach) + 1) - left;
+    const int height = std::min(image.height, int(guess.outer.y + reach) + 1) - top;
     if (width < 3 || height < 3) return std::nullopt;
-    const std::vector<uint8_t> soft = binomial_mean(image.window(left, top, width, height));
-    Start moved = start;
+    const std::vector<uint8_t> smooth = binomial_mean(image.window(left, top, width, height));
+    InitialGuess moved = guess;
     moved.outer.x -= left, moved.outer.y -= top;
-    std::optional<Fit> fit = refine({soft.data(), width, height, width}, moved);
+    std::optional<RoundelFit> fit = fit_photometric({smooth.data(), width, height, width}, moved);
     if (!fit) return fit;
     fit->outer.x += left, fit->outer.y += top;
-    for (auto& row : fit->C)
-        for (double& value : row) value *= kHidden;
+    for (auto& row : fit->pose_cov)
+        for (double& value : row) value *= kInflation;
     return fit;
 }
 

@@ -9,21 +9,19 @@
 
 namespace roundel {
 
-/// The ratio of the print that a measured ratio is nearest to; there is one at least.
-inline double nearest_ratio(std::span<const double> prints, double measured) {
-    return *std::min_element(prints.begin(), prints.end(), [&](double a, double b) {
+/// The element of `ratios` (at least one) that is nearest to `measured`.
+inline double nearest_ratio(std::span<const double> ratios, double measured) {
+    return *std::min_element(ratios.begin(), ratios.end(), [&](double a, double b) {
         return std::abs(a - measured) < std::abs(b - measured);
     });
 }
 
-/// What counts as a roundel.
-struct Settings {
+/// The limits within which a ring counts as a roundel.
+struct RoundelLimits {
     std::vector<double> inner_ratios{0.6, 0.41};  // inner over outer diameter of the prints in use
     double ratio_tolerance = 0.08;
-    double min_diameter = 8, max_diameter = 400;  // of the outer ellipse's major axis, pixels
-    double min_contrast = 25;                     // bright less dark, grey levels
-    double search_share = 1;                      // of a frame's rows that are searched for new roundels
-    bool by_paper = false;                        // search by the paper's segments instead of chords
+    double min_diameter = 8, max_diameter = 400;  // major axis of the outer ellipse, pixels
+    double min_contrast = 25;                     // bright minus dark level, grey levels
 
     /// The smallest and the largest ratio of the prints in use.
     std::pair<double, double> ratio_range() const {

@@ -3,17 +3,20 @@
 #include <algorithm>
 
 #include "numeric/lanes.hpp"
-#include "fit/roundel_model.hpp"
 
 namespace roundel {
 
-/// `N` columns of a chunk of pixels, and the products of all pairs of them, lane by lane: the upper triangle.
+/// Lanes per chunk of pixels. A chunk's columns fit into the first-level cache; the number is odd so that
+/// columns do not share a cache bank.
+constexpr int kChunk = 31;
+
+/// `N` columns of a chunk of pixels, and the upper triangle of their products in pairs, lane by lane.
 template <int N>
 using Columns = Lanes[N][kChunk];
 template <int N>
 using Gram = Lanes[N][N];
 
-/// Products of columns i .. i + m with columns j .. j + n.
+/// Adds the products of columns i .. i + m with columns j .. j + n.
 template <int i, int j, int m, int n, int N>
 ROUNDEL_INLINE void multiply_tile(const Columns<N>& columns, int count, Gram<N>& gram) {
     Lanes s[m][n];
@@ -26,7 +29,7 @@ ROUNDEL_INLINE void multiply_tile(const Columns<N>& columns, int count, Gram<N>&
         for (int b = 0; b < n; ++b) gram[i + a][j + b] = s[a][b];
 }
 
-/// Adds the products of `count` lanes, tile by tile: 2 x 4 columns stay in registers.
+/// Adds the products from tile (i, j) on. The products of 2 x 4 columns fit into registers.
 template <int i, int j, int N>
 ROUNDEL_INLINE void multiply_from(const Columns<N>& columns, int count, Gram<N>& gram) {
     constexpr int m = std::min(2, N - i), n = std::min(4, N - j);
@@ -37,6 +40,7 @@ ROUNDEL_INLINE void multiply_from(const Columns<N>& columns, int count, Gram<N>&
         multiply_from<i + m, i + m, N>(columns, count, gram);
 }
 
+/// Adds the products of `count` lanes.
 template <int N>
 ROUNDEL_INLINE void multiply_all(const Columns<N>& columns, int count, Gram<N>& gram) {
     multiply_from<0, 0, N>(columns, count, gram);

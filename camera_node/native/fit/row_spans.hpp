@@ -4,8 +4,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "numeric/lanes.hpp"
 #include "fit/roundel_model.hpp"
+#include "numeric/lanes.hpp"
 
 namespace roundel {
 
@@ -16,14 +16,14 @@ ROUNDEL_INLINE Bits floor_of(const Lanes& x) {
     return near + (__builtin_convertvector(near, Lanes) > x);  // a comparison that is true is -1
 }
 
-/// An ellipse to be cut by rows; without height where it is empty.
-struct Oval {
+/// An ellipse in a form that makes its intersection with a row cheap; its height is negative if it is empty.
+struct RowEllipse {
     float x = 0, y = 0, per_height = 1e6f, width = 0, lean = 0;
     double top = 1e9, bottom = -1e9;
 
-    Oval() = default;
-    /// `e` with both half axes a and b longer by `more`; empty where one vanishes.
-    Oval(const CircleImage& e, double more) {
+    RowEllipse() = default;
+    /// `e` with both half axes a and b longer by `more`; empty if one vanishes.
+    RowEllipse(const CircleImage& e, double more) {
         const double ab = std::sqrt(std::max(e.shape.det(), 0.0)),
                      sum = std::sqrt(e.shape.xx + e.shape.yy + 2 * ab);
         const double product = ab + more * (sum + more);  // (a + more) (b + more)
@@ -37,20 +37,20 @@ struct Oval {
     }
 };
 
-/// Columns [begin, end) that lie inside.
+/// The columns [begin, end) inside of an ellipse.
 struct Spans {
     Bits begin, end;
     bool has(int k) const { return begin[k] < end[k]; }
 };
 
-/// Eight ovals, each to be cut by its own row.
-struct Ovals {
+/// Eight ellipses, each cut by its own row.
+struct RowEllipses {
     Lanes x, y, per_height = all(1e6f), width, lean;
-    void set(int k, const Oval& oval) {
-        x[k] = oval.x, y[k] = oval.y, per_height[k] = oval.per_height;
-        width[k] = oval.width, lean[k] = oval.lean;
+    void set(int k, const RowEllipse& e) {
+        x[k] = e.x, y[k] = e.y, per_height[k] = e.per_height;
+        width[k] = e.width, lean[k] = e.lean;
     }
-    static Ovals all_of(const Oval& o) {
+    static RowEllipses all_of(const RowEllipse& o) {
         return {all(o.x), all(o.y), all(o.per_height), all(o.width), all(o.lean)};
     }
     ROUNDEL_INLINE Spans cut(const Lanes& rows) const {
