@@ -103,11 +103,11 @@ def main(
         mm = [float(text) for text in re.findall(r"position ([0-9.]+|nan) mm RMS", told)]
         errors += mm
         placed = re.search(r"([0-9.]+) mm from their true places", told)
-        widened = re.search(r"taken ([0-9.]+) times as large", told)
-        drifts = re.search(r"clocks drift apart, in ppm: (.*)", told)
+        inflated = re.search(r"inflated by ([0-9.]+)", told)
+        drifts = re.search(r"clock drift, ppm: (.*)", told)
         print(
             f"{run + 1}: robots {' '.join(f'{x:.2f}' for x in mm)} mm RMS; cameras {placed and placed[1]} mm; "
-            f"widened {widened[1] if widened else 'no'}; drifts {drifts[1] if drifts else 'none'}; {stamps}",
+            f"inflated {inflated[1] if inflated else 'no'}; drifts {drifts[1] if drifts else 'none'}; {stamps}",
             flush=True,
         )
     print(f"robots off: median {np.median(errors):.2f}, most {max(errors):.2f} mm RMS")
