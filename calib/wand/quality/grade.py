@@ -170,12 +170,12 @@ class RigQuality:
     def _expected(self) -> dict[str, Any]:
         if self.expected is None or not np.isfinite(self.expected.typical_mm):
             return {}
-        figures = {
-            "median": self.expected.typical_mm,
-            "worst": self.expected.worst_mm,
-            "height": self.expected.grid.z,
+        values = self.expected.typical_mm, self.expected.worst_mm, self.expected.grid.z
+        return {
+            "expected_mm": dict(
+                zip(("median", "worst", "height"), (round(v, 3) for v in values), strict=True)
+            )
         }
-        return {"expected_mm": {name: round(value, 3) for name, value in figures.items()}}
 
 
 def grade(criterion: str, value: float) -> str:
@@ -270,16 +270,15 @@ def _rms_px(J: Array, covariance: Array) -> float:
 
 
 def find_limiting_lens(J: Array, joint: Array, k: int, lens: list[int]) -> int | None:
-    """Return the index of the camera whose lens, if known, would reduce the image errors of camera k most.
+    """Return the camera whose lens, if known, would reduce the image errors of camera k most.
 
     Args:
         J: (n, 2, d) Jacobians of points in the image of camera k.
         joint: (C, d, C, d) covariance of all cameras.
-        k: index of the camera.
         lens: columns of the lens parameters.
 
     Returns:
-        the index; None if all lenses together would not halve the variance.
+        its index; None if all lenses together would not halve the variance.
     """
     cov_lenses = joint[:, lens][:, :, :, lens]
     cross = np.einsum("nip,pcl->nicl", J, joint[k][:, :, lens])
@@ -291,12 +290,8 @@ def find_limiting_lens(J: Array, joint: Array, k: int, lens: list[int]) -> int |
 
 
 def _explained(cross: Array, covariance: Array) -> float:
-    """Return the variance, summed over pixels, that knowing parameters removes.
-
-    Args:
-        cross: (n, 2, l) covariances of the pixels with the parameters.
-        covariance: (l, l) of the parameters.
-    """
+    """Return the variance, summed over pixels, that knowing parameters would remove, from their covariance (l, l) and
+    the covariances `cross` (n, 2, l) of the pixels with them."""
     unit = np.sqrt(np.diag(covariance))
     scaled = cross / unit
     return float(np.einsum("nip,pq,niq->", scaled, np.linalg.inv(covariance / np.outer(unit, unit)), scaled))
