@@ -87,7 +87,7 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
         name.fill("wide")
         wait_for(lambda: picker._name.value == "wide")
         define = page.get_by_role("button", name="Define robot")
-        click(define.click, page, "the server looks for wide, of 3 markers")
+        click(define.click, page, "the server now tracks wide, with 3 markers")
     wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
     robot = client.change_robots()["wide"]
     assert robot.diameter_m == 0.12
