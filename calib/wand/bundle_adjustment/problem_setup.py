@@ -17,7 +17,7 @@ from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
-MIN_SIGMA_PX = 0.02  # error of every lens model, in addition to what the detector claims
+MIN_SIGMA_PX = 0.02  # error of every lens model, in addition to the covariance of the detector
 MIN_KNOTS = 2
 
 

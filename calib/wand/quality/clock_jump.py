@@ -117,7 +117,7 @@ def _confirm(
         problem.with_free(problem.free, DRIFT),
         lenses=[problem.lenses[k] for k in split],
         lens_sigma=problem.lens_sigma[split],
-        lens_sigma_claimed=None,
+        covariance_lens_sigma=None,
         estimated=problem.estimated and (*problem.estimated, after),
         drift_sigma=SLEWED_DRIFT,
     )
