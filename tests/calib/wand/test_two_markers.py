@@ -67,7 +67,7 @@ def test_the_covariance_is_that_with_numbers():
 
 
 @pytest.mark.parametrize(
-    "wave",
+    "scenario",
     [
         replace(LIGHTS, cameras=3, arc=0.5, offset_ms=0, drift_ppm=0, free_running=False),
         replace(LIGHTS, cameras=4, seconds=60, rate_hz=6, speed=0.6, outliers=0.02, missing=0.05),
