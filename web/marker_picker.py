@@ -9,7 +9,7 @@ from camera_node.arrays import Array
 from camera_node.config import is_name
 from camera_node.errors import RoundelError
 from fusion.client.define import describe
-from fusion.client.measure import Standing, find_standing, robot_of
+from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
 from web.drawing import SELECTED
 from web.feed import ArenaState
@@ -54,7 +54,7 @@ class MarkerPicker:
         """Store the current unlabeled markers, and draw the selected ones."""
         timed = state.markers
         if timed is not None and state.age_s(timed) < MARKERS_S:
-            self._unlabeled = timed.message.positions()[timed.message.free()]
+            self._unlabeled = timed.message.positions()[timed.message.unlabeled()]
         self._cloud.visible = bool(self.selected)
         if self.selected:
             self._cloud.points = np.array(self.selected, np.float32)
@@ -81,9 +81,9 @@ class MarkerPicker:
                 raise FusionError(f"'{name}' is not a valid robot name; use letters, digits, - and _")
             if not self.selected:
                 raise FusionError("no marker is selected")
-            measured = find_standing(self._subscription.collect_markers(MEASURE_S))
+            measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
             standing = _match_selected(measured, np.array(self.selected))
-            robot = robot_of(standing, self._diameter.value / 1e3, self._motion.value)
+            robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
             self._subscription.define(name, robot)
         except RoundelError as error:
             return str(error)
@@ -101,7 +101,7 @@ class MarkerPicker:
         set_content(self._answer, escape_markdown(text))
 
 
-def _match_selected(measured: Standing, selected: Array) -> Standing:
+def _match_selected(measured: StationaryMarkers, selected: Array) -> StationaryMarkers:
     """Return the measured markers at the selected positions (N, 3), in their order.
 
     Raises:
@@ -115,4 +115,4 @@ def _match_selected(measured: Standing, selected: Array) -> Standing:
             f"the marker at {x:.2f}, {y:.2f}, {z:.2f} m moves or is not visible; hold the robot still"
         )
     nearest = distance.argmin(1)
-    return Standing(measured.position[nearest], measured.normal[nearest])
+    return StationaryMarkers(measured.position[nearest], measured.normal[nearest])

@@ -6,7 +6,7 @@ from typing import Any
 import zenoh
 
 from camera_node.errors import RoundelError
-from fusion.client.measure import watch
+from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import Markers, RobotsRequest
 from fusion.protocol.requests import change_robots, undo_correction
@@ -42,7 +42,7 @@ class Subscription:
 
     def collect_markers(self, seconds: float) -> list[Markers]:
         """Collect the server's marker messages for some seconds; raise FusionError if there are none."""
-        return watch(self.session, self.feed.keys.arena, seconds)
+        return collect_markers(self.session, self.feed.keys.arena, seconds)
 
     def define(self, name: str, robot: Robot) -> None:
         """Have the server track a new robot; raise FusionError or NetworkError if it refuses or does not answer."""

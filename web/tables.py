@@ -67,7 +67,7 @@ def robot_state(state: ArenaState, robot: str) -> str:
 
 def tabulate_robots(state: ArenaState) -> HtmlTable:
     """One row per robot: state, position, speed, standard deviation of the position, number of markers."""
-    misfits = state.status.message.misfits if state.status else {}
+    misfits = state.status.message.geometry_residuals_px if state.status else {}
     rows = [_robot_row(state, name, misfits.get(name)) for name in sorted(state.poses)]
     return HtmlTable(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, "no robot yet")
 
@@ -129,9 +129,9 @@ def _advise(state: ArenaState, timed: TimedMessage | None, health: CameraHealth 
         return "offline"
     if health is not None and not health.calibrated:
         return "not calibrated"
-    if health is not None and health.aside:
+    if health is not None and health.excluded:
         return "moved: excluded until it is recalibrated"
-    if health is not None and health.shared:
+    if health is not None and health.duplicate_publisher:
         return "two nodes use this name"
     return timed.message.advice
 
@@ -142,7 +142,7 @@ def describe_server(state: ArenaState) -> str:
         return "no server found yet" if state.status is None else "the server is offline"
     status: FusionStatus = state.status.message
     return (
-        f"{status.instants_per_s:.0f} poses/s, latency {_number(status.latency_ms, 1)} ms, "
+        f"{status.frame_sets_per_s:.0f} poses/s, latency {_number(status.latency_ms, 1)} ms, "
         f"processor {100 * status.cpu:.0f} %, {status.memory_mb:.0f} MB"
     )
 

@@ -12,13 +12,11 @@ from calib.commands.inputs import read_recording, require_one
 from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
-from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig, load_rig
-from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
-from calib.wand.quality.agreement import Agreement, Placed, compare
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.quality.grade import assess
+from calib.wand.result import WandCalibration
 from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
@@ -93,7 +91,7 @@ def _compare_halves(
     try:
         with progress_console().status("calibrating camera poses from each half"):
             first, second = (calibrate(rig, wand, half, exact) for half in split(messages))
-            agreement = compare(placed(first), placed(second))
+            agreement = compare_calibrations(*(CameraPoses.of_calibration(half) for half in (first, second)))
     except CalibrationError as error:
         say(f"warning: the halves of the recording can't be compared: {error}")
         return None
@@ -102,11 +100,11 @@ def _compare_halves(
 
 
 def _compare_with_rig(rig: Rig, result: WandCalibration) -> Agreement | None:
-    known = Placed.of_rig(rig)
+    known = CameraPoses.of_rig(rig)
     if len([name for name in known.names if name in result.names]) < 2:
         say("the rig has no poses with covariances to compare; only the recording was judged")
         return None
-    agreement = compare(known, placed(result))
+    agreement = compare_calibrations(known, CameraPoses.of_calibration(result))
     sentence = agreement.sentence("the rig and the recording")
     advice = "wave the wand again and run python -m calib wand"
     say(sentence if agreement.holds else f"warning: {sentence}; {advice}")
@@ -118,27 +116,6 @@ def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detect
     times = [message.t_ns for message in messages]
     middle = (min(times) + max(times)) // 2
     return [m for m in messages if m.t_ns <= middle], [m for m in messages if m.t_ns > middle]
-
-
-def placed(result: WandCalibration) -> Placed:
-    """The cameras of a calibration for `compare`: the covariance without the part that the lens priors cause, and that
-    part by camera."""
-    adjusted = result.adjusted
-    free, count = list(adjusted.problem.free), len(result.names)
-    pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
-    by_prior = camera_covariance(adjusted).by_prior.reshape(count, len(free), count, len(free))[:, pose][
-        :, :, :, lens
-    ]
-    by_lens = by_prior.reshape(6 * count, 4 * count)
-    rest = result.covariance - by_lens @ by_lens.T
-    sigma = adjusted.problem.claimed_prior_sigma()[:, lens]
-    lenses = {
-        name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
-        for k, name in enumerate(result.names)
-    }
-    scaled_by = result.report.scaled_by
-    metric = adjusted.problem.fixed_distance is None or (scaled_by is not None and scaled_by.sigma_m > 0)
-    return Placed(result.names, adjusted.state.cameras, rest, lenses, metric)
 
 
 def _figures(agreement: Agreement | None) -> dict[str, Any] | None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.precision_plot import draw_precision
 from calib.rig.rig import Rig, save_rig
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
+from calib.wand.result import WandCalibration
 from camera_node.errors import ConfigError
 from camera_node.terminal import say
 

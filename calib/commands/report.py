@@ -8,12 +8,10 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.live.wand_session import SessionProgress
-from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
-from calib.wand.quality.lens_change import describe, find_changes
-from calib.wand.quality.lens_shape import find_misfit
+from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes, find_misfit
 from calib.wand.recalibration import Recalibration
-from calib.wand.report import WandReport
+from calib.wand.result import WandCalibration, WandReport
 from camera_node.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
@@ -24,17 +22,17 @@ MAX_OUTLIERS = 5  # that are listed one by one
 def print_report(result: WandCalibration, quality: RigQuality) -> None:
     """Print a table of the cameras, then remarks and advice; the grade comes last."""
     console().print(camera_table(result, quality))
-    lenses = describe(find_changes(result.names, result.adjusted))
+    lenses = describe_lens_changes(find_lens_changes(result.names, result.adjusted))
     misfit = find_misfit(result.names, result.adjusted, result.observations)
     for line in [
         *_remarks(result.report),
         *_drifts(result),
-        *([f"warning: camera {result.jump.camera}: {result.jump.words()}"] if result.jump else []),
+        *([f"warning: camera {result.jump.camera}: {result.jump.sentence()}"] if result.jump else []),
         *lenses,
         *([misfit.sentence()] if misfit else []),
         *(quality.expected.lines() if quality.expected else []),
         *(f"{camera.name}: {camera.wave_next}" for camera in quality.cameras if camera.wave_next),
-        *quality.spoilt(),
+        *quality.lens_warnings(),
         quality.sentence(),
     ]:
         say(line)
@@ -87,11 +85,11 @@ def _drifts(result: WandCalibration) -> list[str]:
 
 
 def _remarks(report: WandReport) -> list[str]:
-    lines = [f"{report.instants} wand poses, residual {report.residual_px:.3f} px"]
-    if report.widened > MIN_INFLATION:
+    lines = [f"{report.wand_poses} wand poses, residual {report.residual_px:.3f} px"]
+    if report.sigma_inflation > MIN_INFLATION:
         lines.append(
-            f"residuals are correlated in time; standard deviations are inflated by {report.widened:.1f} (check the "
-            "lenses and the clocks)"
+            f"residuals are correlated in time; standard deviations are inflated by {report.sigma_inflation:.1f} "
+            "(check the lenses and the clocks)"
         )
     if report.length_mean_mm is not None and report.length_std_mm is not None:
         lines.append(

@@ -20,7 +20,7 @@ from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import place_one
+from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
@@ -110,7 +110,7 @@ class Wand:
 
     def _calibrate_one(self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Rig:
         with progress_console().status(f"calibrating the pose of {name}"):
-            result = place_one(rig, wand, messages, name)
+            result = recalibrate_camera(rig, wand, messages, name)
         print_recalibration(result)
         figures = result.rig.calibration | {"only": {"camera": name, **provenance()}}
         return msgspec.structs.replace(result.rig, calibration=figures)

@@ -280,7 +280,7 @@ def compute_trial(settings: WandSession, part: Sequence[Detections], share: floa
     sending = {message.camera for message in part}
     return Trial(
         unplaced={name: reason for name, reason in quality.unplaced.items() if name in sending},
-        noise_ratio={c.name: scale * c.strain for c in quality.cameras},
+        noise_ratio={c.name: scale * c.noise_ratio for c in quality.cameras},
         used={c.name: 1 - c.figures["unused"] for c in quality.cameras},
         advice={c.name: c.wave_next for c in quality.cameras},
         expected_mm=quality.expected.typical_mm if quality.expected else None,

@@ -107,11 +107,11 @@ def main(
         mm = [float(text) for text in re.findall(r"position ([0-9.]+|nan) mm RMS", text)]
         errors += mm
         cameras = re.search(r"position errors up to ([0-9.]+) mm", text)
-        widened = re.search(r"taken ([0-9.]+) times as large", text)
-        drifts = re.search(r"clocks drift apart, in ppm: (.*)", text)
+        inflated = re.search(r"inflated by ([0-9.]+)", text)
+        drifts = re.search(r"clock drift, ppm: (.*)", text)
         print(
             f"{run + 1}: robots {' '.join(f'{x:.2f}' for x in mm)} mm RMS; cameras {cameras and cameras[1]} mm; "
-            f"widened {widened[1] if widened else 'no'}; drifts {drifts[1] if drifts else 'none'}; {timestamps}",
+            f"inflated {inflated[1] if inflated else 'no'}; drifts {drifts[1] if drifts else 'none'}; {timestamps}",
             flush=True,
         )
     print(f"position error: median {np.median(errors):.2f}, max {max(errors):.2f} mm RMS")

@@ -41,7 +41,14 @@ def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
 def test_an_unused_camera_has_a_note():
     """Offline, not calibrated, moved, or a duplicate name; else the advice of its node."""
     health = CameraHealth(
-        fps=30.0, lateness_ms=5.0, residual_px=None, used=0, unused=0, late=0, calibrated=True, aside=True
+        fps=30.0,
+        lateness_ms=5.0,
+        residual_px=None,
+        assigned=0,
+        unassigned=0,
+        late=0,
+        calibrated=True,
+        excluded=True,
     )
     own = CameraStatus(
         camera="north",
@@ -60,7 +67,7 @@ def test_an_unused_camera_has_a_note():
     def advice(health: CameraHealth, now: float = 0.0) -> str:
         status = FusionStatus(
             t_ns=0,
-            instants_per_s=30.0,
+            frame_sets_per_s=30.0,
             latency_ms=None,
             cpu=0.1,
             memory_mb=100.0,
@@ -75,8 +82,11 @@ def test_an_unused_camera_has_a_note():
 
     assert advice(health).startswith("moved")
     assert advice(msgspec.structs.replace(health, calibrated=False)) == "not calibrated"
-    assert advice(msgspec.structs.replace(health, aside=False, shared=True)) == "two nodes use this name"
-    assert advice(msgspec.structs.replace(health, aside=False)) == "too dark"
+    assert (
+        advice(msgspec.structs.replace(health, excluded=False, duplicate_publisher=True))
+        == "two nodes use this name"
+    )
+    assert advice(msgspec.structs.replace(health, excluded=False)) == "too dark"
     assert advice(health, now=2 * STALE_S) == "offline"
 
 

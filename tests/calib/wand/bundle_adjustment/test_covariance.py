@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Covariances count what observations tell, not how many there are: errors that last for a while are found out."""
+"""Covariances account for residuals that are correlated in time."""
 
 from collections import Counter
 
 import numpy as np
 import pytest
 
-from calib.commands.check import placed, split
+from calib.commands.check import split
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
-from calib.wand.quality.agreement import Agreement, compare
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
@@ -18,8 +18,8 @@ from tests.calib.synthetic import Arena, record, ring
 SEEDS = range(4)
 
 
-def lasting(messages: list[Detections], seed: int) -> list[Detections]:
-    """Centres that wander off by 0.3 px RMS, all of a camera alike, with periods of 1 to 4 s."""
+def with_correlated_errors(messages: list[Detections], seed: int) -> list[Detections]:
+    """Shift all centres of a camera together by 0.3 px RMS, with periods of 1 to 4 s."""
     rng = np.random.default_rng(seed)
     names = sorted(Counter(message.camera for message in messages))
     rate = 2 * np.pi / rng.uniform(1, 4, (len(names), 2, 4))
@@ -36,27 +36,28 @@ def lasting(messages: list[Detections], seed: int) -> list[Detections]:
 
 def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibration], Agreement]:
     found = [calibrate(arena.intrinsics, arena.wand, half) for half in split(messages)]
-    return found, compare(*map(placed, found))
+    return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
 
 
-@pytest.mark.parametrize(("wandering", "expected"), [(False, 1.0), (True, 2.5)])
-def test_halves_agree_within_what_is_claimed(wandering: bool, expected: float):
-    """Chi-square of the halves' differences, summed over waves: its mean is the degrees of freedom D, its standard
-    deviation (2 D)^1/2, of which it keeps 4 where errors are independent; and nothing is widened by more than chance.
+@pytest.mark.parametrize(("correlated", "expected"), [(False, 1.0), (True, 2.5)])
+def test_halves_agree_within_their_covariance(correlated: bool, expected: float):
+    """Compares the two halves of recordings. The summed chi-square of their differences has the degrees of freedom D as
+    mean and (2 D)^1/2 as standard deviation; with independent errors it is within 4 of these, and the inflation is 1 up
+    to chance.
 
-    Of errors that last up to 4 s, blocks of 1 s see a part: what is claimed is right within a factor of 2, where
-    without widening it was wrong by more than 3.5: lenses that are adjusted take up some of such errors.
+    Blocks of 1 s see a part of errors with periods up to 4 s: standard deviations are right within a factor of 2;
+    without inflation they are too small by more than 3.5, although adjusted lenses absorb some of these errors.
     """
     arena, chi2, degrees, plain, factors = ring(3), 0.0, 0, 0.0, []
     for seed in SEEDS:
         messages = record(
             arena, 20.0, sigma_px=0.1, seed=seed, numbered=True, sized=False, free_running=False
         )
-        found, told = halves(arena, lasting(messages, seed) if wandering else messages)
-        chi2, degrees = chi2 + told.chi2, degrees + told.degrees
+        found, agreement = halves(arena, with_correlated_errors(messages, seed) if correlated else messages)
+        chi2, degrees = chi2 + agreement.chi2, degrees + agreement.degrees
         factor = float(np.mean([half.adjusted.inflation for half in found]))
-        plain, factors = plain + told.chi2 * factor, [*factors, factor]
-    if wandering:
+        plain, factors = plain + agreement.chi2 * factor, [*factors, factor]
+    if correlated:
         assert np.mean(factors) > expected
         assert plain / degrees > 3.5**2
         assert chi2 / degrees < 2.0**2
