@@ -19,13 +19,15 @@ from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.observations import detect_frames, read_observations
 from camera_node.terminal import track
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotPose
 from fusion.recordings.record import read_recording
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.result import Fused, Move
+from fusion.tracking.result import TrackingResult
 from fusion.tracking.smoothing import Smoother
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.tracker import Tracker
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 
@@ -43,7 +45,7 @@ class Summary:
     faults: Counter[str] = field(default_factory=Counter)
     moves: list[str] = field(default_factory=list)
 
-    def add(self, fused: Fused) -> None:
+    def add(self, fused: TrackingResult) -> None:
         self.instants += 1
         self.states.update((pose.robot, pose.state) for pose in fused.poses)
         self.unlabelled += int((fused.markers.robot_index() < 0).sum())
@@ -77,7 +79,7 @@ def fuse_recording(
     faults: Counter[str] | None = None,
     smooth: bool = False,
     moves: list[str] | None = None,
-) -> Iterator[Fused]:
+) -> Iterator[TrackingResult]:
     """Fuse recorded detections, in order of arrival.
 
     Args:
@@ -92,23 +94,23 @@ def fuse_recording(
     """
     limits = limits or Limits()
     tracker = Tracker(cameras, robots, limits)
-    smoother = Smoother(tracker) if smooth else None
+    smoother = Smoother(tracker.table.names) if smooth else None
     instants = FrameSynchronizer(round(1e9 / rate_hz) if rate_hz else None, round(limits.lateness_ms * 1e6))
     told = Counter() if faults is None else faults
     for instant in _gather(messages, cameras, instants, told):
-        fused = tracker.fuse(instant)
+        fused = tracker.track(instant)
         if smoother is None:
             yield fused
         else:
             smoother.add(fused)
-        for move in tracker.inspect():
+        for move in tracker.check_extrinsics(instant, fused):
             if moves is not None:
                 moves.append(_line(move, instant.t_ns))
     if smoother is not None:
         yield from smoother.smooth()
 
 
-def _line(move: Move, t_ns: int) -> str:
+def _line(move: ExtrinsicsCorrection, t_ns: int) -> str:
     """What a person should know of a moved camera."""
     if move.camera is None:
         return f"moved: camera '{move.name}', seen at t_ns {t_ns}; its detections are left out from then on"
@@ -195,7 +197,7 @@ def _check_rate(rate_hz: float | None) -> None:
         raise ConfigError(f"--rate-hz {rate_hz} is not within 0.1 and 1000")
 
 
-def _tell(fused: Iterable[Fused], out: Path, summary: Summary, robots: Iterable[str]) -> None:
+def _tell(fused: Iterable[TrackingResult], out: Path, summary: Summary, robots: Iterable[str]) -> None:
     """Write poses.csv and say what was found."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -207,7 +209,7 @@ def _tell(fused: Iterable[Fused], out: Path, summary: Summary, robots: Iterable[
     print("\n".join([*summary.lines(robots), f"wrote {out}"]))
 
 
-def _copy(recording: Path, out: Path, fused: Iterable[Fused], summary: Summary) -> None:
+def _copy(recording: Path, out: Path, fused: Iterable[TrackingResult], summary: Summary) -> None:
     """A recording with the same messages but other poses and markers, which stand at their instants."""
     entries = [e for e in iterate(recording, Counter()) if not e[0].endswith(("/pose", "/markers"))]
     arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]

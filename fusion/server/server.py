@@ -23,7 +23,8 @@ from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of
 from fusion.model.frames import FrameSet
-from fusion.model.robots import changed, load_kept_robots, load_robots, save_robots
+from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import (
     Latency,
     RobotPose,
@@ -43,8 +44,8 @@ from fusion.server.ingest import FAR_NS, Ingest
 from fusion.server.persistence import PersistedFile
 from fusion.server.status import ServerStatistics
 from fusion.server.transport import Transport, open_session
-from fusion.tracking.result import Move, latency_of
-from fusion.tracking.tracker import Tracker
+from fusion.tracking.result import latency_of
+from fusion.tracking.tracker import AssociatedFrames, Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # how finely the end of a wait is met
@@ -66,7 +67,7 @@ class Server:
         self.shard = Shard.parse(config.shard)
         self._own_key = shard_key(config.arena, self.shard.index)
         given = Path(config.robots)
-        self._kept_robots = PersistedFile("robots", config.kept_robots, load_kept_robots, save_robots)
+        self._kept_robots = PersistedFile("robots", config.kept_robots, load_saved_robots, save_robots)
         kept = self._kept_robots.newer_than(given)
         self.robots = load_robots(given) if kept is None else kept
         self.health = ServerStatistics(config.limits.lateness_ms)
@@ -74,6 +75,7 @@ class Server:
         kept_rig = PersistedFile("rig", config.kept_rig, load_rig, save_rig)
         self.calibration = ActiveRig(Path(config.rig) if config.rig else None, kept_rig)
         self._tracker: Tracker | None = None
+        self._early: AssociatedFrames | None = None  # of the frame set that is not complete yet
         self._now_ns = 0
         self._start()
         self._stopped = threading.Event()
@@ -157,7 +159,6 @@ class Server:
         moved = self.calibration.replace(rig)
         if moved is not None and self._tracker is not None:
             self._tracker.place(moved, rig.cameras[moved])  # robots stay as they are
-            self._tracker.watch.trust(moved)
         else:
             self._start()
 
@@ -173,7 +174,7 @@ class Server:
         if abs(told.t_ns - received_ns) > FAR_NS:
             self.health.count("implausible time")
         elif self._tracker is not None:
-            self._tracker.follow(told)
+            self._tracker.table.receive(told)
 
     def _start(self) -> None:
         """Begin with the rig in force; robots are found anew."""
@@ -203,8 +204,7 @@ class Server:
         name, camera = self.calibration.undo()
         log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
         if self._tracker is not None:
-            self._tracker.place(name, camera)
-            self._tracker.watch.hold(name)
+            self._tracker.place(name, camera, pinned=True)
         message = self.calibration.message()
         self.link.publish(self.keys.rig, message)
         return encode(message)
@@ -228,7 +228,7 @@ class Server:
 
     def _tell_status(self, now_ns: int) -> bool:
         tracker, late = self._tracker, self._instants.late
-        aside, misfits = (tracker.watch.bumped, tracker.shapes.misfits) if tracker else (set(), dict)
+        aside, misfits = (tracker.extrinsics.excluded, tracker.geometry.misfits) if tracker else (set(), dict)
         status = self.health.status(now_ns, set(self._cameras()), late, aside, misfits)
         if status is not None:
             own = "" if self.shard.leads else f"/{self.shard.index}"
@@ -239,7 +239,7 @@ class Server:
         """Use the wait for the last frames of an instant."""
         instant, owed = self._instants.open()
         if self._tracker is not None and instant is not None:
-            self._tracker.anticipate(instant, owed)
+            self._early = self._tracker.associate_early(instant, owed, self._early)
 
     def _fuse(self, instant: FrameSet) -> None:
         if self._tracker is None:
@@ -253,18 +253,20 @@ class Server:
 
     def _follow(self, tracker: Tracker, instant: FrameSet) -> None:
         begun_ns = time.time_ns()
-        first = tracker.advance(instant)
+        associated = tracker.associate(tracker.predict(instant.t_ns, self._early), instant)
+        self._early = None
+        update = tracker.update(associated, instant)
         latency = latency_of(instant, begun_ns, time.time_ns())
-        self._tell_poses(first, latency)
+        self._tell_poses(update.poses.values(), latency)
         if self.shard.count > 1:
-            self.link.publish(self._own_key, tracker.tell())
-        fused = tracker.complete()
-        told = {pose.robot for pose in first}
+            self.link.publish(self._own_key, tracker.table.shard_poses())
+        fused = tracker.finish(update)
+        told = {pose.robot for pose in update.poses.values()}
         self._tell_poses([pose for pose in fused.poses if pose.robot not in told], latency)
         if self.shard.leads:
             self.link.publish(self.keys.markers, fused.markers)
-        for move in tracker.inspect():
-            self._tell(move)
+        for correction in tracker.check_extrinsics(instant, fused):
+            self._tell(correction)
         states: dict[str, TrackingState] = {pose.robot: pose.state for pose in fused.poses}
         self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
 
@@ -273,7 +275,7 @@ class Server:
             told = msgspec.structs.replace(pose, latency=latency)
             self.link.publish(self.keys.robot_pose(pose.robot), told)
 
-    def _tell(self, move: Move) -> None:
+    def _tell(self, move: ExtrinsicsCorrection) -> None:
         """Say that a camera was moved, or where it stands now."""
         if move.camera is None:
             log.warning(

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion.model.frames import FrameSet
+from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
 
 LIMITS = Limits(sigma_floor_px=1e-3)
@@ -36,18 +37,18 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
     told = _Told(load)
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
     for k, instant in enumerate(instants(load, seconds)):
-        tracker.fuse(instant)
+        tracker.track(instant)
         told.fuse(instant)
         if k < START:
             continue
         truth = load.paths.at((instant.t_ns - START_NS) * 1e-9)
-        alive = np.array([status == "tracked" for status in tracker.status])
+        alive = tracker.table.tracked
         tracked.append(alive.mean())
-        error = tracker.states.p - truth.p
+        error = tracker.table.states.p - truth.p
         mine.append(np.sum(error[alive] ** 2, 1))
         theirs.append(np.sum((told.states.p - truth.p) ** 2, 1))
         variance.append(np.einsum("nii->n", told.states.P[:, 3:6, 3:6]))
-        honesty.append(_mahalanobis(tracker.states.R, truth.R, error, tracker.states.P)[alive])
+        honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.states.P)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
     return Accuracy(
         rms[0], rms[1], rms[2], float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked))
@@ -72,22 +73,22 @@ class _Told:
         tracker = Tracker(load.rig, load.bodies, LIMITS)
         self._tracker, self._load = tracker, load
         self._t_ns: int | None = None
-        self.states = tracker.states
+        self.states = tracker.table.states
 
     def fuse(self, instant: FrameSet) -> None:
         """Predict and update."""
         tracker = self._tracker
         if self._t_ns is None:
             truth = self._load.paths.at((instant.t_ns - START_NS) * 1e-9)
-            self.states = type(truth)(truth.R, truth.p, truth.omega, truth.v, tracker.states.P)
+            self.states = type(truth)(truth.R, truth.p, truth.omega, truth.v, tracker.table.states.P)
         dt = 1e-3 if self._t_ns is None else (instant.t_ns - self._t_ns) * 1e-9
         self._t_ns = instant.t_ns
         prediction = tracker.estimator.predict(self.states, np.full(len(self.states), dt))
-        sightings = DetectionTable.of(instant, tracker.optics, LIMITS.sigma_floor_px)
+        detections = DetectionTable.of(instant, tracker.cameras, LIMITS.sigma_floor_px)
         number = np.concatenate([frame.roundels.id for frame in instant.frames])
         rows = np.flatnonzero(number >= 0)
-        matches = Assignments.of(rows, number[rows].astype(np.intp))
-        observations = MatchedObservations.of(matches, sightings, tracker.catalogue)
+        assignments = Assignments.of(rows, number[rows].astype(np.intp))
+        observations = MatchedObservations.of(assignments, detections, tracker.table.markers)
         self.states, _ = tracker.estimator.update(prediction, observations)
 
 

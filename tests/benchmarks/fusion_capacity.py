@@ -18,12 +18,12 @@ import numpy as np
 
 from camera_node.arrays import Array
 from camera_node.protocol.messages import Detections, decode, encode
-from fusion.model.frames import CalibratedFrame
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.protocol.messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import collecting_between_instants
-from fusion.tracking.tracker import Tracker
+from fusion.tracking.tracker import AssociatedFrames, Tracker, Update
 from tests.benchmarks.fusion_load import Load
 
 T = TypeVar("T")
@@ -107,6 +107,7 @@ class Queue:
         self.latencies_ms, self.tracked = Series(room), Series(room)
         self._done_ns = Series(room)  # of processor time, at each instant's end
         self._warm = False
+        self._early: AssociatedFrames | None = None
 
     def step(self, data: bytes, arrival_ns: int) -> list[bytes]:
         """A message comes; what other shards are told. What is done in the first `START_S` is not counted."""
@@ -126,7 +127,7 @@ class Queue:
 
     def hear(self, messages: Sequence[bytes]) -> None:
         """Other shards' robots come."""
-        self._spend(lambda: [self.tracker.follow(decode(message, ShardPoses)) for message in messages])
+        self._spend(lambda: [self.tracker.table.receive(decode(message, ShardPoses)) for message in messages])
 
     def sum_up(self, seconds: float) -> Capacity:
         """What it took."""
@@ -142,28 +143,34 @@ class Queue:
         self._spend(lambda: self._add(data))
         out: list[bytes] = []
         for instant in self._spend(lambda: self.instants.take(arrival_ns)):
-            first = self._spend(lambda instant=instant: self.tracker.advance(instant))
+            update = self._spend(lambda instant=instant: self._update(instant))
+            first = list(update.poses.values())
             self._spend(lambda first=first: self._tell(first))
             done_ns = self.free_ns
             if self.tracker.shard.count > 1:
-                out.append(self._spend(lambda: encode(self.tracker.tell())))
-            fused = self._spend(self.tracker.complete)
+                out.append(self._spend(lambda: encode(self.tracker.table.shard_poses())))
+            fused = self._spend(lambda update=update: self.tracker.finish(update))
             told = {pose.robot for pose in first}
             if rest := [pose for pose in fused.poses if pose.robot not in told]:
                 self._spend(lambda rest=rest: self._tell(rest))
                 done_ns = self.free_ns
             self.latencies_ms.append((done_ns - arrival_ns) * 1e-6)
             self._spend(lambda fused=fused: encode(fused.markers))
-            self._spend(self.tracker.inspect)
+            self._spend(lambda instant=instant, fused=fused: self.tracker.check_extrinsics(instant, fused))
             self._done_ns.append(self.busy_ns)
             count = sum(pose.state == "tracked" for pose in fused.poses)
-            self.tracked.append(count / max(int(self.tracker.owned.sum()), 1))
+            self.tracked.append(count / max(int(self.tracker.table.owned.sum()), 1))
         return out
+
+    def _update(self, instant: FrameSet) -> Update:
+        associated = self.tracker.associate(self.tracker.predict(instant.t_ns, self._early), instant)
+        self._early = None
+        return self.tracker.update(associated, instant)
 
     def _anticipate(self) -> None:
         instant, owed = self.instants.open()
         if instant is not None:
-            self.tracker.anticipate(instant, owed)
+            self._early = self.tracker.associate_early(instant, owed, self._early)
 
     def _add(self, data: bytes) -> None:
         seen = decode(data, Detections)

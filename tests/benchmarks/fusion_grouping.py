@@ -9,7 +9,7 @@ import numpy as np
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
 from fusion.model.observations import DetectionTable
-from fusion.tracking.multiview import group
+from fusion.tracking.multiview import find_markers
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
 
 APART_M = 0.12  # between discs of 0.08 m with their white margins
@@ -26,17 +26,17 @@ def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: flo
     load.paths.place(scattered(points, seed))
     frames = tuple(load.frames(1 / load.hz))
     seen = Counter(int(k) for frame in frames for k in frame.roundels.id)
-    optics = CameraArray(load.rig)
-    sightings = DetectionTable.of(FrameSet(frames[0].t_ns, frames), optics, 0.0)
+    cameras_of = CameraArray(load.rig)
+    detections = DetectionTable.of(FrameSet(frames[0].t_ns, frames), cameras_of, 0.0)
     if not sized:
-        sightings.axes_px[:] = np.nan
-    rows, sizes = np.arange(len(sightings)), np.array([DIAMETER_M])
-    group(optics, sightings, rows, sizes)
+        detections.axes_px[:] = np.nan
+    rows, sizes = np.arange(len(detections)), np.array([DIAMETER_M])
+    find_markers(cameras_of, detections, rows, sizes)
     start = time.process_time()
-    markers = group(optics, sightings, rows, sizes)
+    markers = find_markers(cameras_of, detections, rows, sizes)
     cost_s = time.process_time() - start
     number = np.concatenate([frame.roundels.id for frame in frames])
-    kinds = [set(number[marker.sightings].tolist()) for marker in markers]
+    kinds = [set(number[marker.detections].tolist()) for marker in markers]
     right = [kind for kind in kinds if len(kind) == 1]
     many = {k for k, count in seen.items() if count >= 2}
     return len(right) / max(len(kinds), 1), len(set().union(*right) & many) / len(many), cost_s

@@ -136,8 +136,8 @@ class _Scene:
     """Renders detections of a load."""
 
     def __init__(self, load: Load) -> None:
-        self.load, self.optics = load, CameraArray(load.rig)
-        self.catalogue = MarkerTable.of(list(load.bodies.values()))
+        self.load, self.cameras = load, CameraArray(load.rig)
+        self.marker_table = MarkerTable.of(list(load.bodies.values()))
         rng = np.random.default_rng(load.seed + 3)
         self.clutter = np.column_stack(
             [
@@ -149,12 +149,14 @@ class _Scene:
 
     def detect(self, camera: int, seq: int, t_s: float, rng: np.random.Generator) -> Detections:
         """One frame's message."""
-        name, t_ns = self.optics.names[camera], START_NS + round(t_s * 1e9)
+        name, t_ns = self.cameras.names[camera], START_NS + round(t_s * 1e9)
         states = self.load.paths.at((t_ns - START_NS) * 1e-9)
-        poses = self.optics.pose(states, Exposures(np.array([camera]), np.zeros(1)))
-        n = len(self.catalogue.robot)
-        views = self.optics.view(poses, self.catalogue.discs(np.arange(n), np.zeros(n, np.intp)))
-        R, at = self.optics.R_cam_world[camera], self.optics.centres[camera]
+        exposures = Exposures(np.array([camera]), np.zeros(1))
+        n = len(self.marker_table)
+        views = self.cameras.views(
+            states, exposures, self.marker_table.discs(np.arange(n), np.zeros(n, np.intp))
+        )
+        R, at = self.cameras.R_cam_world[camera], self.cameras.centres[camera]
         c = np.column_stack([views.centre, R @ (self.clutter - at).T])
         normal = np.column_stack([views.normal, np.tile(R[:, 2:], len(self.clutter))])
         q = np.column_stack([views.q, c[:, n:]])

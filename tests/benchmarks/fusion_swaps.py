@@ -26,10 +26,10 @@ def identity(load: Load, seconds: float) -> Identity:
     tracker = Tracker(load.rig, load.bodies)
     was_wrong, wrong_poses, swaps, tracked = np.zeros(load.robots, bool), 0, 0, []
     for instant in instants(load, seconds):
-        tracker.fuse(instant)
+        tracker.track(instant)
         truth = load.paths.at((instant.t_ns - START_NS) * 1e-9)
-        alive = np.array([status == "tracked" for status in tracker.status])
-        wrong = alive & (np.linalg.norm(tracker.states.p - truth.p, axis=1) > WRONG_M)
+        alive = tracker.table.tracked
+        wrong = alive & (np.linalg.norm(tracker.table.states.p - truth.p, axis=1) > WRONG_M)
         swaps += int((wrong & ~was_wrong).sum())
         wrong_poses += int(wrong.sum())
         was_wrong = wrong

@@ -11,24 +11,25 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from fusion.model.frames import CalibratedFrame
+from fusion.model.limits import Limits
 from fusion.protocol.messages import RobotPose
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.result import Fused
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.result import TrackingResult
+from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import Arena
 
 
-def fuse(arena: Arena, frames: list[CalibratedFrame], limits: Limits | None = None) -> list[Fused]:
+def fuse(arena: Arena, frames: list[CalibratedFrame], limits: Limits | None = None) -> list[TrackingResult]:
     """All instants of the frames."""
     tracker, instants = Tracker(arena.cameras, arena.robots, limits), FrameSynchronizer(33_333_333)
     closed = []
     for frame in frames:
         instants.add(frame)
         closed += instants.take(frame.t_ns)
-    return [tracker.fuse(instant) for instant in (*closed, *instants.finish())]
+    return [tracker.track(instant) for instant in (*closed, *instants.finish())]
 
 
-def poses_of(fused: list[Fused], robot: str) -> list[RobotPose]:
+def poses_of(fused: list[TrackingResult], robot: str) -> list[RobotPose]:
     """The robot's poses, whatever their state."""
     return [pose for instant in fused for pose in instant.poses if pose.robot == robot]
 
@@ -46,7 +47,7 @@ def errors(arena: Arena, poses: list[RobotPose]) -> np.ndarray:
 
 
 @pytest.fixture
-def run_arena() -> Callable[..., tuple[list[Fused], Callable[[str], list[RobotPose]]]]:
+def run_arena() -> Callable[..., tuple[list[TrackingResult], Callable[[str], list[RobotPose]]]]:
     """`run_arena(arena, n)`: the fused instants of n frames a camera, and a function robot -> its poses."""
 
     def run(arena: Arena, n: int = 30, limits: Limits | None = None):

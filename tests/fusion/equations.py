@@ -45,15 +45,15 @@ class Poses:
         return discs.frame * self.n_bodies + discs.body
 
 
-def pose(optics: CameraArray, states: States, exposures: Exposures) -> Poses:
+def pose(cameras: CameraArray, states: States, exposures: Exposures) -> Poses:
     """Bodies at each frame's own time."""
-    tau, R_cw, B = exposures.tau[:, None], optics.R_cam_world[exposures.camera], len(states)
+    tau, R_cw, B = exposures.tau[:, None], cameras.R_cam_world[exposures.camera], len(states)
     R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
     turn = turns(omega[:, None] * tau)  # (3, 3, F, B)
     R_world = (
         turn[:, 0, None] * R[0, :, None] + turn[:, 1, None] * R[1, :, None] + turn[:, 2, None] * R[2, :, None]
     )
-    to = states.p.T[:, None] + v[:, None] * tau - optics.centres[exposures.camera].T[:, :, None]
+    to = states.p.T[:, None] + v[:, None] * tau - cameras.centres[exposures.camera].T[:, :, None]
     # The cameras' rotations by one product each: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
     R_cam = R_cw @ R_world.transpose(2, 0, 1, 3).reshape(-1, 3, 3 * B)
     t_cam = R_cw @ to.transpose(1, 0, 2)
@@ -69,7 +69,7 @@ def view(poses: Poses, discs: Discs) -> Views:
     """See `Views`."""
     at = poses.columns(discs)
     R = _take(poses.R_cam, at)
-    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.marker), R[:, 2]
+    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.position), R[:, 2]
     q = n * (n[2] * discs.radius**2 / c[2])
     q[2] -= discs.radius**2 / c[2]
     q += c
@@ -78,7 +78,7 @@ def view(poses: Poses, discs: Discs) -> Views:
 
 
 def derive(
-    optics: CameraArray, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
+    cameras: CameraArray, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
 ) -> Array:
     """(2, 12, N) of the outline's centre, times `whiten` (2, 2, N), by the error of the disc's body.
 
@@ -89,13 +89,13 @@ def derive(
     R = _take(poses.R_cam, at)
     h, k = np.einsum("ain,ijn->ajn", by_centre, R), np.einsum("ain,ijn->ajn", by_normal, R)
     J = np.empty((2, 12, len(at)))
-    x, y, z = discs.marker
+    x, y, z = discs.position
     J[:, 0] = y * h[:, 2] - z * h[:, 1]  # h (w x m) = (m x h) w
     J[:, 1] = z * h[:, 0] - x * h[:, 2]
     J[:, 2] = x * h[:, 1] - y * h[:, 0]
     J[:, 0] -= k[:, 1]
     J[:, 1] += k[:, 0]
-    R_cw = _take(_rotations(optics.R_cam_world), exposures.camera[discs.frame])
+    R_cw = _take(_rotations(cameras.R_cam_world), exposures.camera[discs.frame])
     J[:, POSITION] = np.einsum("ain,ijn->ajn", by_centre, R_cw)
     J[:, OMEGA] = tau * np.einsum("ain,jin->ajn", J[:, THETA], _take(poses.R_world, at))
     J[:, VELOCITY] = tau * J[:, POSITION]
@@ -164,7 +164,7 @@ def shape_rows(
     poses: Poses, discs: Discs, views: Views, observations: MatchedObservations, sigma: Array
 ) -> Array:
     """(N, 2, 13) equations of outlines, by difference quotients of their shears."""
-    seen = observations.seen
+    seen = observations.detections
     R = poses.R_cam[..., poses.columns(discs)]
     measured = measured_outlines(seen.axes_px, seen.angle_rad)
     turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
@@ -204,14 +204,14 @@ def _settled(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], w
 
 
 def candidates(
-    optics: CameraArray, states: States, seen: DetectionTable, discs: Discs, covariance: Array
+    cameras: CameraArray, states: States, seen: DetectionTable, discs: Discs, covariance: Array
 ) -> dict[tuple[int, int], float]:
     """Costs by disc and sighting of one frame, within the gates; `covariance` (N, 3, 3) of the discs' places."""
-    views = view(pose(optics, states, seen.exposures), discs)
+    views = view(pose(cameras, states, seen.exposures), discs)
     found = {}
     for i in np.flatnonzero((views.facing > 0.1) & np.isfinite(views.xy[0])):
         camera = seen.exposures.camera[discs.frame[i]]
-        R, z = optics.R_cam_world[camera], views.centre[2, i]
+        R, z = cameras.R_cam_world[camera], views.centre[2, i]
         J = (R[:2] - views.xy[:, i, None] * R[2]) / z
         depth = 0.05**2 + R[2] @ covariance[i] @ R[2] / z**2
         for j in np.flatnonzero(seen.frame == discs.frame[i]):
@@ -224,7 +224,7 @@ def candidates(
             shape = outlines(views.centre[:, [i]], views.normal[:, [i]], discs.radius[[i]], scale[..., None])
             size = np.log(seen.axes_px[0, j] / 2 / np.sqrt(np.linalg.eigvalsh(shape[0])[1]))
             if d2 < 13.8 and abs(size) <= np.log(1.35):
-                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * optics.focal[camera] ** 4 * depth)
+                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * cameras.focal[camera] ** 4 * depth)
                 found[int(i), int(j)] = cost
     return found
 
@@ -233,9 +233,9 @@ def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[
     """See `fusion.model.states.predict`."""
     half = exp_so3(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
-    turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
-    motion = Transition(turn, dt)
-    P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
+    T = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
+    motion = Transition(T, dt)
+    P = motion.multiply(motion.multiply(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
     moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
     return moved, motion
 

@@ -96,24 +96,24 @@ class Arena:
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
 
     def _detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
-        optics = CameraArray({name: self.cameras[name]})
-        catalogue = MarkerTable.of(list(self.robots.values()))
+        cameras = CameraArray({name: self.cameras[name]})
+        marker_table = MarkerTable.of(list(self.robots.values()))
         seen = [
             k
-            for k, (r, m) in enumerate(zip(catalogue.robot, catalogue.number, strict=True))
+            for k, (r, m) in enumerate(zip(marker_table.robot, marker_table.number, strict=True))
             if not self.hidden(list(self.robots)[r], int(m), t)
         ]
         poses = [self.motions[robot](t) for robot in self.robots]
-        R = np.array([pose[0] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3, 3)
-        p = np.array([pose[1] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3)
-        centre = p + np.einsum("nij,jn->ni", R, catalogue.marker[:, seen])
-        return self._roundels(optics, centre, R[:, :, 2], catalogue.radius[seen], rng)
+        R = np.array([pose[0] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3, 3)
+        p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
+        centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
+        return self._roundels(cameras, centre, R[:, :, 2], marker_table.radius[seen], rng)
 
-    def _roundels(self, optics: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
+    def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
         """Outlines from sampled circles, an ellipse fitted by moments of its undistorted conic: independent of
         the model under test in its centre."""
-        camera = optics.cameras[0]
-        facing = np.einsum("ni,ni->n", normal, optics.centres[0] - centre) > 0.0
+        camera = cameras[cameras.names[0]]
+        facing = np.einsum("ni,ni->n", normal, cameras.centres[0] - centre) > 0.0
         centre, normal, radius = centre[facing], normal[facing], radius[facing]
         uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
         uv = uv.reshape(-1, 2)

@@ -11,12 +11,14 @@ import pytest
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.result import TrackingResult
+from fusion.tracking.tracker import Tracker
 from tests.fusion.conftest import errors
 from tests.fusion.server.test_server import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
@@ -58,12 +60,12 @@ def test_crossing_robots_of_different_shards_keep_their_detections():
     trackers = [Tracker(arena.cameras, robots, shard=Shard(k, 2)) for k in (1, 2)]
     contested = 0
     for k, instant in enumerate(whole_instants(arena.frames(30))):
-        fused = [tracker.fuse(instant) for tracker in trackers]
-        claims = [claimed(tracker) for tracker in trackers]
+        fused = [tracker.track(instant) for tracker in trackers]
+        claims = [used_by(tracker, result) for tracker, result in zip(trackers, fused, strict=True)]
         assert not claims[0] & claims[1]
         contested += bool(claims[0]) and bool(claims[1])
         for tracker, hearing in zip(trackers, trackers[::-1], strict=True):
-            hearing.follow(decode(encode(tracker.tell()), ShardPoses))
+            hearing.table.receive(decode(encode(tracker.table.shard_poses()), ShardPoses))
         poses = [pose for one in fused for pose in one.poses]
         assert len({pose.robot for pose in poses}) == len(poses)
         if k > 3:
@@ -80,11 +82,10 @@ def whole_instants(frames: list[CalibratedFrame]) -> list[FrameSet]:
     return gathered.finish()
 
 
-def claimed(tracker: Tracker) -> set[int]:
-    """The sightings that a shard used for its own robots in the last instant."""
-    assert tracker._last is not None
-    _, _, matches, _ = tracker._last
-    return set(matches.sighting[tracker.owned[tracker.catalogue.robot[matches.disc]]].tolist())
+def used_by(tracker: Tracker, result: TrackingResult) -> set[int]:
+    """The detections that a shard used for its own robots."""
+    own = tracker.table.owned[tracker.table.markers.robot[result.assignments.marker]]
+    return set(result.assignments.detection[own].tolist())
 
 
 @pytest.mark.parametrize(
@@ -135,8 +136,8 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
             until(all_are_told)
             assert server._tracker is not None
             assert second._tracker is not None
-            assert server._tracker.owned.tolist() == [True, False, False]
-            assert second._tracker.owned.tolist() == [False, True, True]
+            assert server._tracker.table.owned.tolist() == [True, False, False]
+            assert second._tracker.table.owned.tolist() == [False, True, True]
         finally:
             second.stop()
             thread.join(DEADLINE_S)

@@ -15,7 +15,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
 from fusion.server.status import MAX_STRANGERS, ServerStatistics
-from fusion.tracking.result import Fused
+from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
 
@@ -36,16 +36,18 @@ class Path:
         self.intake, self.instants = Ingest(KEYS, self.health), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 
-    def take(self, message: Detections, received_ns: int) -> list[Fused]:
+    def take(self, message: Detections, received_ns: int) -> list[TrackingResult]:
         """The instants that were complete then."""
         frame = self.intake.receive(
             encode(message), KEYS.detections(message.camera), received_ns, self.arena.cameras
         )
         if frame is not None:
             self.instants.add(frame)
-        fused = [self.tracker.fuse(instant) for instant in self.instants.take(received_ns)]
-        self.tracker.inspect()
-        return fused
+        results = []
+        for frame_set in self.instants.take(received_ns):
+            results.append(self.tracker.track(frame_set))
+            self.tracker.check_extrinsics(frame_set, results[-1])
+        return results
 
     @property
     def faults(self) -> dict[str, int]:
@@ -54,13 +56,13 @@ class Path:
         return status.faults
 
 
-def play(path: Path, messages: list[Detections]) -> list[Fused]:
+def play(path: Path, messages: list[Detections]) -> list[TrackingResult]:
     """All messages, each 5 ms after its exposure."""
     ordered = sorted(messages, key=lambda message: message.t_ns)
     return [fused for m in ordered for fused in path.take(m, m.t_ns + 5_000_000)]
 
 
-def states(fused: list[Fused], robot: str = "a") -> list[str]:
+def states(fused: list[TrackingResult], robot: str = "a") -> list[str]:
     return [pose.state for f in fused for pose in f.poses if pose.robot == robot]
 
 

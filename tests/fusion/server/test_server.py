@@ -19,9 +19,9 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import ClockReply, Detections, Keys, decode, encode
 from fusion.client.arena import Arena as Client
+from fusion.model.limits import Limits
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
-from fusion.tracking.tracker import Limits
 from tests.conftest import ROOT, free_port
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 

@@ -30,14 +30,17 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
     R = exp_so3(np.array([[0.4, -0.8, 1.1]]))
     v, still = random.normal(size=(1, 3)), np.zeros((1, 3))
     states = States(R, random.normal(size=(1, 3)), still, v, root @ root.transpose(0, 2, 1))
-    catalogue = MarkerTable.of([WIDE])
-    expected = ExpectedMarkers(states.R, states.P, catalogue.robot, catalogue.marker, catalogue.radius)
+    marker_table = MarkerTable.of([WIDE])
+    expected = ExpectedMarkers(
+        states.R, states.P, marker_table.robot, marker_table.position, marker_table.radius
+    )
     found = expected.covariances(tau)
     steps = 1e-4 * np.eye(12)[:, None]
-    for k, marker in enumerate(catalogue.marker.T):
+    for k, marker in enumerate(marker_table.position.T):
         J = np.column_stack(
             [
-                (place(states.moved(step), marker, tau) - place(states.moved(-step), marker, tau))[0] / 2e-4
+                (place(states.retract(step), marker, tau) - place(states.retract(-step), marker, tau))[0]
+                / 2e-4
                 for step in steps
             ]
         )
@@ -49,8 +52,8 @@ def test_of_two_that_stand_in_line_the_one_of_the_measured_size_is_seen(measured
     """One robot hides the other from the camera: what is seen is as large as it is, a third apart, though the other was
     expected where the roundel is and this one 1.5 px aside."""
     camera = ring(1)["cam0"]
-    optics = CameraArray({"cam0": camera})
-    catalogue = MarkerTable.of([Robot(diameter_m=d, markers=((0.0, 0.0, 0.0),)) for d in (0.10, 0.13)])
+    cameras = CameraArray({"cam0": camera})
+    marker_table = MarkerTable.of([Robot(diameter_m=d, markers=((0.0, 0.0, 0.0),)) for d in (0.10, 0.13)])
     T = camera.matrix()
     at = np.array([0.0, 0.0, 2.0])
     aside = 1.5 / camera.fx * at[2] * np.eye(3)[0]
@@ -58,11 +61,12 @@ def test_of_two_that_stand_in_line_the_one_of_the_measured_size_is_seen(measured
     p = np.array([T[:3, :3] @ point + T[:3, 3] for point in seen_from])
     toward = np.tile(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]), (2, 1, 1))  # their normals look at the camera
     states = States.at_rest(toward, p, (0.01, 0.001, 0.01, 0.01))
-    major = 2 * camera.fx * catalogue.radius[measured] / at[2]
+    major = 2 * camera.fx * marker_table.radius[measured] / at[2]
     seen = Roundels.from_points(camera.project([at]), 0.05)
     seen = Roundels(
         seen.uv, seen.cov, np.full((1, 2), major), np.zeros(1), seen.ratio, seen.contrast, seen.id, seen.track
     )
-    association = Association(optics, catalogue, states, np.ones(2, bool), 0, 0.1)
-    matches = association.whole(FrameSet(0, (CalibratedFrame.measure("cam0", 0, seen, camera),)))[1]
-    assert catalogue.robot[matches.disc].tolist() == [measured]
+    association = Association.of(cameras, marker_table, states, np.ones(2, bool), 0, 0.1)
+    frame_set = FrameSet(0, (CalibratedFrame.measure("cam0", 0, seen, camera),))
+    assignments = association.extended(frame_set.frames).collect(frame_set)[1]
+    assert marker_table.robot[assignments.marker].tolist() == [measured]

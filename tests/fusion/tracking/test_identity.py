@@ -10,11 +10,11 @@ from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, require_distinct
-from fusion.tracking.constellation import Fit, identify
-from fusion.tracking.multiview import Marker, group
-from fusion.tracking.tracker import Limits
+from fusion.tracking.constellation import Criteria, Fit, identify
+from fusion.tracking.multiview import Marker, find_markers
 from tests.benchmarks.fusion_accuracy import accuracy
 from tests.benchmarks.fusion_grouping import cold_grouping
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
@@ -116,10 +116,10 @@ def test_no_detection_is_in_two_markers():
         CalibratedFrame.measure(name, 0, seen, cameras[name])
         for name, seen in zip(cameras, noise, strict=True)
     ]
-    optics = CameraArray(cameras)
-    sightings = DetectionTable.of(FrameSet(0, tuple(frames)), optics, 0.0)
-    markers = group(optics, sightings, np.arange(len(sightings)), np.array([0.12]))
-    taken = np.concatenate([marker.sightings for marker in markers])
+    camera_array = CameraArray(cameras)
+    detections = DetectionTable.of(FrameSet(0, tuple(frames)), camera_array, 0.0)
+    markers = find_markers(camera_array, detections, np.arange(len(detections)), np.array([0.12]))
+    taken = np.concatenate([marker.detections for marker in markers])
     assert len(np.unique(taken)) == len(taken)
     for marker in markers:
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
@@ -142,7 +142,9 @@ def found_among(sigma_m: float, diameter_m: float) -> list[Fit]:
     places = rng.uniform([-2, -1, 0], [2, 1, 0.5], (80, 3))
     markers = [Marker(p, sigma_m**2 * np.eye(3), none, none, diameter_m) for p in places]
     robots = dict(enumerate(Load(12, 4).bodies.values()))
-    return identify(robots, markers, lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
+    return identify(
+        robots, markers, Criteria(lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
+    )
 
 
 @pytest.mark.parametrize("robot", ["a", "c"])

@@ -77,11 +77,11 @@ def observed(
     discs = Discs(
         frame=np.repeat(np.arange(k), n),
         body=np.zeros(n * k, np.intp),
-        row=np.tile(np.arange(n), k),
-        marker=np.tile(MARKERS.T, k),
+        marker=np.tile(np.arange(n), k),
+        position=np.tile(MARKERS.T, k),
         radius=np.full(n * k, 1e-6),
     )
-    return MatchedObservations.seeing(
+    return MatchedObservations.of_discs(
         DetectionTable.of(FrameSet(0, tuple(frames)), CameraArray(CAMERAS), 0.0), discs
     )
 
@@ -103,7 +103,9 @@ def oracle(predicted: States, seen: MatchedObservations) -> tuple[np.ndarray, np
         graph.add(gtsam.NonlinearEqualityPoint3(gtsam.symbol("m", k), marker))
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY / np.sqrt(NOMINAL_WEIGHT))
     cameras = [placed(camera) for camera in CAMERAS.values()]
-    for row, (uv, cov) in enumerate(zip(seen.seen.uv.T, seen.seen.cov.transpose(2, 0, 1), strict=True)):
+    for row, (uv, cov) in enumerate(
+        zip(seen.detections.uv.T, seen.detections.cov.transpose(2, 0, 1), strict=True)
+    ):
         noise = gtsam.noiseModel.Gaussian.Covariance(NOMINAL_WEIGHT * cov)
         pose, lens = cameras[seen.discs.frame[row]]
         marker, robust = gtsam.symbol("m", row % len(MARKERS)), gtsam.noiseModel.Robust.Create(cauchy, noise)

@@ -18,7 +18,7 @@ def told(arena: Arena, n: int, cameras: str, later: str = "", seconds: float = n
     for frame in arena.frames(n):
         if frame.camera in cameras or (frame.camera in later and arena.seconds(frame.t_ns) > seconds):
             instants.add(frame)
-    return [tracker.fuse(instant).markers for instant in instants.finish()]
+    return [tracker.track(instant).markers for instant in instants.finish()]
 
 
 def test_its_place_is_as_good_as_its_covariance_says_and_one_candidate_is_its_normal():
@@ -65,5 +65,5 @@ def test_a_robots_own_markers_are_nobodys_to_no_camera(cameras: str):
     for frame in arena.frames(20):
         if arena.seconds(frame.t_ns) < 0.3 or frame.camera in cameras:
             instants.add(frame)
-    fused = [tracker.fuse(instant) for instant in instants.finish()]
+    fused = [tracker.track(instant) for instant in instants.finish()]
     assert all((instant.markers.robot_index() >= 0).all() for instant in fused[1:])

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from fusion.model.frames import CalibratedFrame
+from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.tracker import Tracker
 from tests.fusion.conftest import errors, fuse
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
@@ -174,14 +175,14 @@ def test_a_marker_of_nobody_has_position_velocity_and_normal(speed: float):
         tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT), FrameSynchronizer(33_333_333)
         for frame in arena.frames(10):
             instants.add(frame)
-        *_, last = (tracker.fuse(instant) for instant in instants.finish()[:-1])
+        *_, last = (tracker.track(instant) for instant in instants.finish()[:-1])
         R, p = motion(arena.seconds(last.t_ns))
         assert last.markers.robot_index().tolist() == [-1]
         assert last.markers.normals()[0] @ R[:, 2] > np.cos(np.radians(12))
         P = np.frombuffer(last.markers.covariance, "<f4").reshape(3, 3).astype(float)
         e = last.markers.positions()[0] - p
         off = last.markers.velocities()[0] - np.multiply((1, -0.5, 0.1), speed)
-        V = tracker.loose._tracks.states.P[0, 9:, 9:]
+        V = tracker.unlabeled._tracks.states.P[0, 9:, 9:]
         squares.append([e @ np.linalg.solve(P, e), off @ np.linalg.solve(V, off)])
     assert np.mean(squares, 0) == pytest.approx([3, 3], abs=4 * np.sqrt(6 / 30))
 
@@ -229,7 +230,7 @@ def test_late_frames_are_used_and_leave_the_covariance_honest():
         arrivals = [(f.t_ns + (100_000_000 if f.camera == "cam1" else 0), f) for f in arena.frames(14)]
         for now_ns, frame in sorted(arrivals, key=lambda arrival: arrival[0]):
             instants.add(frame)
-            closed += [tracker.fuse(instant) for instant in instants.take(now_ns)]
+            closed += [tracker.track(instant) for instant in instants.take(now_ns)]
         late = [fused for fused in closed if fused.poses and fused.cameras["cam1"].used]
         pose = late[-1].poses[0]
         e, P = errors(arena, [pose])[0], pose.covariance_matrix[:6, :6]
