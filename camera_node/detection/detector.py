@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import ConfigError
-from camera_node.sources.grey import grey
 
 
 class Detector:
@@ -120,18 +119,15 @@ class Detector:
         """
         return self._offsets, self._covariance
 
-    def detect(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Roundels:
-        """All roundels of a grey image (h, w), uint8, or uint16 of 10 to 16 bits, which are narrowed to 8.
+    def detect(self, image: Grey) -> Roundels:
+        """Detect all roundels of a grey image (h, w), uint8; its rows may be apart in memory.
 
         Raises:
-            ValueError: the array is no grey image.
+            ValueError: the array is no such image; `camera_node.sources.grey.to_grey` converts other formats.
         """
-        if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
-            raise ValueError(
-                f"a grey image (h, w) of uint8 or uint16 is needed, got {image.dtype} {image.shape}"
-            )
-        pixels = grey(image)
-        table = self._core.detect(pixels)
+        if image.dtype != np.uint8 or image.ndim != 2:
+            raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
+        table = self._core.detect(image if image.strides[1] == 1 else np.ascontiguousarray(image))
         table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
         self._offsets, self._covariance = table[:, 7:9], _symmetric(table[:, 10:])
         none = np.full(len(table), -1, np.int32)

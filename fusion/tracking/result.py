@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Index, Mask
-from camera_node.geometry.pose import wxyz_of
+from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
@@ -131,7 +131,7 @@ def robot_poses(
         return {}
     states, names, status = table.states, cameras.names, table.status
     p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
-    wxyz, residual = wxyz_of(states.R).tolist(), summary.residual_px.tolist()
+    wxyz, residual = wxyz_from_rotation(states.R).tolist(), summary.residual_px.tolist()
     P, markers = states.P.astype("<f4").tobytes(), summary.n_markers.tolist()
     owned, seen_by = table.owned.tolist(), summary.robot_cameras.tolist()
     return {

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from camera_node.arrays import Array, Mask
-from camera_node.geometry.pose import log_so3, wxyz_of
+from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.result import TrackingResult
@@ -51,7 +51,7 @@ class Smoother:
         ]
 
     def _with_states(self, result: TrackingResult, states: States) -> TrackingResult:
-        wxyz = wxyz_of(states.R)
+        wxyz = wxyz_from_rotation(states.R)
         poses = tuple(
             msgspec.structs.replace(
                 pose,
@@ -83,6 +83,6 @@ def _smooth(states: States, prediction: Prediction, after: States, continued: Ma
 def _difference(a: States, b: States) -> Array:
     """(N, 12) errors whose retraction of b is a."""
     error = np.empty((len(a), 12))
-    error[:, THETA] = log_so3(b.R.transpose(0, 2, 1) @ a.R)
+    error[:, THETA] = vector_from_rotation(b.R.transpose(0, 2, 1) @ a.R)
     error[:, POSITION], error[:, OMEGA], error[:, VELOCITY] = a.p - b.p, a.omega - b.omega, a.v - b.v
     return error
