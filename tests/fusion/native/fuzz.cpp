@@ -30,7 +30,7 @@ class Random {
         constexpr double kNaN = std::numeric_limits<double>::quiet_NaN(),
                          kInfinity = std::numeric_limits<double>::infinity();
         constexpr double kHostile[] = {0,      -0.0,   kNaN, kInfinity, -kInfinity, 1e308,
-                                       -1e308, 1e-320, 1e18,  -1e18,    1e-9,      -1e-9};
+                                       -1e308, 1e-320, 1e18, -1e18,     1e-9,       -1e-9};
         const bool is_wild = std::uniform_real_distribution<double>()(engine_) < wild;
         return is_wild ? kHostile[below(std::size(kHostile))] : scale * normal();
     }
@@ -62,12 +62,12 @@ class Random {
 FramePoses poses_of(Random& random, size_t bodies, size_t frames, double wild) {
     std::vector<Body> all;
     for (size_t b = 0; b < bodies; ++b)
-        all.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(1, wild), random.vector(3, wild),
-                       random.vector(2, wild)});
+        all.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(1, wild),
+                       random.vector(3, wild), random.vector(2, wild)});
     std::vector<Exposure> exposures;
     for (size_t f = 0; f < frames; ++f)
-        exposures.push_back(
-            {rotation_from_vector(random.vector(1, wild)), random.vector(3, wild), random.number(0.01, wild)});
+        exposures.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(3, wild),
+                             random.number(0.01, wild)});
     return {all, exposures};
 }
 
@@ -97,8 +97,8 @@ bool estimate(Random& random, double wild) {
     Numbers left(2 * n);
     residuals(system, steps.data(), left.data());
     for (size_t b = 0; b < bodies; ++b) {
-        Body moving{rotation_from_vector(random.vector(1, wild)), random.vector(1, wild), random.vector(1, wild),
-                    random.vector(1, wild)};
+        Body moving{rotation_from_vector(random.vector(1, wild)), random.vector(1, wild),
+                    random.vector(1, wild), random.vector(1, wild)};
         predict(moving, H[b], {random.number(0.01, wild), random.number(1, wild), 1, b % 2 == 0});
         try {
             inverse(H[b]);

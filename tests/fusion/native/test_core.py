@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The native core against the same equations in NumPy (`tests/fusion/equations.py`).
+"""The native core compared with the same equations in NumPy (`tests/fusion/equations.py`).
 
-Both round differently, no more: in the order of 1e-15 of the largest term; 1e-9 leaves room for cancellation.
+Only the rounding differs, by about 1e-15 of the largest term; 1e-9 allows for cancellation.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ assert_near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
 
 
 def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
-    """Turning bodies about the middle, and detections that have nothing to do with them; one can't be seen at all."""
+    """Rotating bodies near the centre, and unrelated detections; one body is not visible."""
     random = np.random.default_rng(seed)
     n = len(CAMERAS) * EACH
     states = States(
@@ -54,7 +54,7 @@ def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
 
 
 def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
-    """A camera's, up to 20 ms beside the instant."""
+    """A frame up to 20 ms from the time of the frame set."""
     root = random.normal(size=(EACH, 2, 2))
     axes = np.sort(random.uniform(10, 30, (EACH, 2)))[:, ::-1]
     none, level = np.full(EACH, -1, np.int32), np.ones(EACH)
@@ -65,7 +65,7 @@ def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
     )
 
 
-def test_views_are_the_observation_models():
+def test_views_equal_the_observation_model():
     states, seen = scene()
     exposures = seen.detections.exposures
     found = ARRAY.views(states, exposures, seen.discs)
@@ -75,7 +75,7 @@ def test_views_are_the_observation_models():
         assert_near(getattr(found, name), getattr(expected, name))
 
 
-def test_equations_of_centres_are_the_derivatives():
+def test_equations_of_centres_equal_the_derivatives():
     states, seen = scene()
     exposures, discs = seen.detections.exposures, seen.discs
     single = np.arange(BODIES) == 1
@@ -91,9 +91,9 @@ def test_equations_of_centres_are_the_derivatives():
     assert_near(found, rows, atol=1e-9 * np.abs(rows).max())
 
 
-def test_equations_of_outlines_are_the_shears_quotients():
-    """An outline's shape is what two numbers leave that are (range / radius)^2, up to 4e4, times larger; by the step of
-    1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives in the order of 30."""
+def test_equations_of_outlines_equal_difference_quotients():
+    """The shape of an outline is a difference of numbers that are larger by (range / radius)^2, up to 4e4. Divided by the
+    step of 1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives of about 30."""
     states, seen = scene()
     exposures, discs = seen.detections.exposures, seen.discs
     sigma = np.linspace(0.1, 0.2, len(discs))
@@ -106,7 +106,7 @@ def test_equations_of_outlines_are_the_shears_quotients():
     assert_near(found, rows, atol=1e-6)
 
 
-def test_sums_and_weights_are_those_of_reweighted_least_squares():
+def test_sums_and_weights_equal_reweighted_least_squares():
     random = np.random.default_rng(8)
     rows, body = random.normal(size=(200, 2, 13)), random.integers(0, 5, 200)
     rows[:9, :, 12] += 20  # outliers
@@ -119,7 +119,7 @@ def test_sums_and_weights_are_those_of_reweighted_least_squares():
     assert_near(_core.residuals(rows, body, steps), rest.T)
 
 
-def test_prediction_is_the_motion_models():
+def test_prediction_equals_the_motion_model():
     random = np.random.default_rng(6)
     states, _ = scene()
     root = random.normal(size=(BODIES, 12, 20))
@@ -132,8 +132,8 @@ def test_prediction_is_the_motion_models():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_least_cost(seed: int):
-    """Against SciPy's assignment of whole frames, from a few pairs to every marker near every detection."""
+def test_assignment_chooses_the_most_pairs_at_the_lowest_cost(seed: int):
+    """Compared with SciPy on whole frames, from a few pairs to every marker near every detection."""
     random = np.random.default_rng(seed)
     frame = np.repeat(np.arange(3), random.integers(1, 30, 3))
     marker, detection = np.nonzero(random.random((25, len(frame))) < random.uniform(0.02, 1))
@@ -155,7 +155,7 @@ def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_le
     assert costs[chosen].sum() == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_covariance_is_the_inverse_of_its_information():
+def test_inverses_are_inverse_matrices():
     root = np.random.default_rng(9).normal(size=(3, 12, 20))
     information = root @ root.transpose(0, 2, 1)
     assert_near(_core.inverses(information), np.linalg.inv(information))
@@ -165,7 +165,7 @@ def test_a_covariance_is_the_inverse_of_its_information():
 
 
 def test_candidates_are_the_pairs_within_the_gates():
-    """Of discs a few pixels beside detections: some pairs are near enough, of some the size does not fit."""
+    """Discs a few pixels from detections: some pairs are too far apart, and some sizes do not fit."""
     states, seen = scene()
     exposures, discs = seen.detections.exposures, seen.discs
     random = np.random.default_rng(3)
@@ -201,7 +201,7 @@ def test_candidates_are_the_pairs_within_the_gates():
 
 
 def test_indices_and_lengths_are_checked():
-    """An array that does not fit is refused rather than read beyond its end."""
+    """The core refuses an array that does not fit and never reads beyond its end."""
     states, seen = scene()
     poses = ARRAY.frame_poses(states, seen.detections.exposures)
     frame, body = seen.discs.frame, seen.discs.body
@@ -215,8 +215,8 @@ def test_indices_and_lengths_are_checked():
         _core.residuals(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
 
 
-def test_a_disc_that_is_seen_from_its_edge_gives_numbers_or_nothing():
-    """Its outline is a line: within a step of the derivative (1e-4 rad) of it there is none to compare with."""
+def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
+    """Its outline is a line. Within one step of the derivative (1e-4 rad) of it there is no outline to compare with."""
     tilt = np.radians(90) + np.linspace(-3e-4, 3e-4, 61)
     n, none = len(tilt), np.zeros(len(tilt), np.intp)
     up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])  # towards the camera
