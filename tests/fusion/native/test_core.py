@@ -92,8 +92,8 @@ def test_equations_of_centres_equal_the_derivatives():
 
 
 def test_equations_of_outlines_equal_difference_quotients():
-    """The shape of an outline is a difference of numbers that are larger by (range / radius)^2, up to 4e4. Divided by the
-    step of 1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives of about 30."""
+    """The shape of an outline is a difference of numbers that are larger by (range / radius)^2, up to 4e4. Divided by
+    the step of 1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives of about 30."""
     states, seen = scene()
     exposures, discs = seen.detections.exposures, seen.discs
     sigma = np.linspace(0.1, 0.2, len(discs))

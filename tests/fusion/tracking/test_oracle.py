@@ -60,7 +60,7 @@ def predicted(rng: np.random.Generator) -> Prediction:
 def observed(
     predicted: States, rng: np.random.Generator, noise_px: float, outliers: int
 ) -> MatchedObservations:
-    """Every marker in every camera, of a robot about one sigma from the prediction; the noise along one axis is double."""
+    """Every marker in every camera, for a robot about one sigma from the prediction; u is twice as noisy as v."""
     R = predicted.R[0] @ rotation_from_vector(SIGMAS[0] * rng.normal(size=3))
     p = predicted.p[0] + SIGMAS[1] * rng.normal(size=3)
     n, k = len(MARKERS), len(CAMERAS)
