@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# `make demo` and `make test` set themselves up: a virtual environment in the checkout, and nothing outside it.
+# `make demo` and `make test` first create a virtual environment in the checkout. They change nothing outside of it.
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
@@ -26,7 +26,7 @@ format: .venv/ready
 
 setup: .venv/ready
 
-# Not isolated: what was built before is built again only where it changed, here and by the wheel's test.
+# Without build isolation, so that this build and the wheel's test compile changed files only.
 .venv/ready: pyproject.toml CMakeLists.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "error: $(PYTHON) is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }

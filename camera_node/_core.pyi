@@ -1,9 +1,13 @@
+from typing import TypedDict
+
 import numpy as np
 from numpy.typing import NDArray
 
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 
-class Detector:
+class RoundelLimits:
+    """The limits within which a ring counts as a roundel."""
+
     def __init__(
         self,
         inner_ratios: list[float],
@@ -11,19 +15,28 @@ class Detector:
         min_diameter: float,
         max_diameter: float,
         min_contrast: float,
-        search_share: float,
-        by_paper: bool,
     ) -> None: ...
-    def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One row of 38 a roundel.
 
-        u, v, major, minor, angle, ratio, contrast; offset_u, offset_v from the ellipse's centre to the disc's own;
-        the track's number; then the upper triangle, row by row, of the covariance (7, 7) of what the pose follows
-        from: u, v, the shape xx, xy, yy (the ellipse is centre + A q, |q| = 1), offset_u and offset_v.
-        """
+class FrameColumns(TypedDict):
+    """The N roundels of a frame, in pixels and grey levels.
 
+    `offset_px` points from the outer ellipse's centre to the image of the disc's centre. `pose_cov` is the covariance
+    of u, v, of the shape xx, xy, yy (the ellipse is centre + A q, |q| = 1) and of the offset.
+    """
+
+    uv: NDArray[np.float64]  # (N, 2)
+    axes_px: NDArray[np.float64]  # (N, 2) full axes, major first
+    angle_rad: NDArray[np.float64]  # (N,)
+    ratio: NDArray[np.float64]  # (N,)
+    contrast: NDArray[np.float64]  # (N,)
+    offset_px: NDArray[np.float64]  # (N, 2)
+    pose_cov: NDArray[np.float64]  # (N, 7, 7)
+    track: NDArray[np.int32]  # (N,)
+    n_postponed: int  # seeds left for the next frame
+
+class Detector:
+    def __init__(self, limits: RoundelLimits, search_share: float, by_paper: bool) -> None: ...
+    def detect(self, image: NDArray[np.uint8]) -> FrameColumns: ...
     def take_over(self, other: Detector) -> None: ...
     @property
-    def theta(self) -> float: ...
-    @property
-    def postponed(self) -> int: ...
+    def theta(self) -> float | None: ...

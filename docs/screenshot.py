@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Make docs/demo.png again: `.venv/bin/python docs/screenshot.py` plays the demo and takes a picture of its page."""
+"""Creates docs/demo.png: `.venv/bin/python docs/screenshot.py` runs the demo and takes a picture of its page."""
 
 import os
 import shutil
@@ -22,24 +22,24 @@ OFFLINE = [
 
 
 def main() -> None:
-    """Start the demo, wait until its robots have trails, take the picture, end the demo."""
+    """Run the demo until the robots have trails, take the picture, and end the demo."""
     command = [sys.executable, "-m", "web", "--demo", "--port", str(PORT), "--seconds", "120"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as demo:
         try:
             assert demo.stdout is not None
-            os.nice(15)  # the browser draws without a graphics card, and would take the arena's time
+            os.nice(15)  # software rendering in the browser must not take time from the arena
             for line in demo.stdout:
                 print(line, end="", flush=True)
                 if line.startswith("8 s: error"):
-                    take(Path(__file__).with_name("demo.png"))
+                    take_screenshot(Path(__file__).with_name("demo.png"))
                     break
         finally:
             demo.terminate()
             demo.communicate()
 
 
-def take(path: Path) -> None:
-    """The page as a browser without a graphics card shows it, less the note that says so."""
+def take_screenshot(path: Path) -> None:
+    """Save the page, without the notification about software rendering."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS + OFFLINE)
         page = browser.new_page(viewport={"width": 1280, "height": 720})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What several folders of tests need, and in which order they run where `make test` runs them on all cores."""
+"""Fixtures of several folders, and the order of the tests when `make test` runs them on all cores."""
 
 import fcntl
 import os
@@ -9,7 +9,6 @@ import shutil
 import signal
 import socket
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
@@ -17,42 +16,42 @@ from typing import IO
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-WAVE_S = 8.0  # enough for every camera of the demo to see the wand in most of its image
+WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
 LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py")
-PORTS = range(20_000, 30_000)  # below those that Linux, macOS and Windows give away by themselves
+PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _locked_ports: list[IO[str]] = []
-BEHIND = 10  # the niceness of tests that only compute
+NICENESS = 10  # of tests that only compute
 
-# A shell that runs the tests in the background has them, and the programs that they start, ignore Ctrl-C.
+# A shell that runs the tests in the background makes them, and the programs that they start, ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def is_live(item: pytest.Item) -> bool:
-    """Whether a test runs programs or a browser against the clock."""
+    """Whether the result of a test depends on real time: it runs programs or a browser."""
     fixtures = getattr(item, "fixturenames", ())
     return "endpoint" in fixtures or item.path.parent.name == "web" or item.path.name in LIVE_FILES
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Live tests go first, and one at a time; of others, those of a file share its fixtures."""
+    """Run live tests first and one at a time, and the others of one file in one process, which shares fixtures."""
     items.sort(key=lambda item: not is_live(item))
     for item in items:
         item.add_marker(pytest.mark.xdist_group("live" if is_live(item) else str(item.path)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Beside live tests, those that only compute wait: the clock is not theirs."""
+    """Give live tests priority over tests that only compute."""
     if "PYTEST_XDIST_WORKER" in os.environ and not is_live(item):
-        os.nice(max(0, BEHIND - os.nice(0)))
+        os.nice(max(0, NICENESS - os.nice(0)))
 
 
 def free_port() -> int:
-    """A TCP port of this process alone, until it ends, and of nobody else on this machine as long as it is in use.
+    """Return a TCP port that is reserved for this process until it ends.
 
-    It is not one that the system gives away by itself, to an outgoing connection for instance. A locked file keeps the
-    tests of other processes off it.
+    It is outside the ephemeral range, so the operating system does not assign it to an outgoing connection. A locked
+    file reserves it against the tests of other processes.
     """
     for port in random.Random(os.urandom(8)).sample(PORTS, len(PORTS)):
         file = (Path(tempfile.gettempdir()) / f"roundel-test-port-{os.getuid()}-{port}").open("w")
@@ -67,30 +66,19 @@ def free_port() -> int:
     raise RuntimeError(f"no free port in {PORTS}")
 
 
-def wait_for_port(port: int, deadline_s: float = 120.0) -> None:
-    """Return as soon as somebody listens on a TCP port here; fail loudly when nobody does."""
-    end = time.monotonic() + deadline_s
-    while True:
-        try:
-            return socket.create_connection(("127.0.0.1", port), timeout=1).close()
-        except OSError:
-            assert time.monotonic() < end, "nobody listens"
-            time.sleep(0.05)
-
-
 @pytest.fixture
 def endpoint() -> str:
-    """A Zenoh endpoint on loopback that is free."""
+    """A Zenoh endpoint on loopback with a reserved port."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """The demo's own scene with a shorter wave, in a folder of its own."""
+    """A copy of the demo's scene with a shorter wand session."""
     folder = tmp_path / "demo"
     shutil.copytree(ROOT / "configs" / "demo", folder)
     path = folder / "scene.yaml"
-    text, count = re.subn(r"(?m)^wave_s: *[0-9.]+", f"wave_s: {WAVE_S}", path.read_text())
+    text, count = re.subn(r"(?m)^wave_s: *[0-9.]+", f"wave_s: {WAND_S}", path.read_text())
     assert count == 1
     path.write_text(text)
     return path
@@ -98,7 +86,7 @@ def scene(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def shared_data() -> Callable[[str], Path]:
-    """`shared_data("arena_small")`: a recording that lies beside the checkout; skips where it is absent."""
+    """`shared_data("arena_small")` returns a recording beside the checkout; skips if it is absent."""
 
     def find(name: str) -> Path:
         path = ROOT.parent / "shared" / "data" / name

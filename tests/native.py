@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A native core with a driver of ours: built without Python and without vectors, and fuzzed under sanitizers."""
+"""Builds a native core with a C++ driver, without Python and without vector instructions, and fuzzes it."""
 
 import subprocess
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ FLAGS = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off"]
 def build(
     native: Path, driver: Path, folder: Path, only: Sequence[str] = ("*",), flags: Sequence[str] = ()
 ) -> Path:
-    """The program of a driver and the sources of `native`, all or those called `only`; bindings are left out."""
+    """Compile and link a driver with the sources of `native`, all or those named `only`, except for bindings."""
 
     def compile_one(source: Path) -> Path:
         made = folder / f"{source.parent.name}_{source.stem}.o"
@@ -32,7 +32,7 @@ def build(
 def fuzz(
     native: Path, driver: Path, rounds: int, folder: Path, checks: Iterable[str] = ("address", "undefined")
 ) -> tuple[int, str]:
-    """Run so many rounds of a driver that tries to break a core; exit code and stderr."""
+    """Run `rounds` of a fuzzing driver under sanitizers; returns its exit code and stderr."""
     sanitizers = ["-g", f"-fsanitize={','.join(checks)}", "-fno-sanitize-recover=all"]
     program = build(native, driver, folder, flags=sanitizers)
     done = subprocess.run([program, str(rounds)], capture_output=True, text=True, timeout=300)

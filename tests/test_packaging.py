@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The wheel, as a stranger installs it."""
+"""The wheel works outside of the checkout and contains the right files."""
 
 import os
 import subprocess
@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from camera_node import _core
+from tests.conftest import ROOT
+
 PROBE = """
 import pathlib, sys
 import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fusion.client.arena
@@ -23,7 +25,7 @@ assert here in default_scene().parents, default_scene()
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built where `make setup` built, so that only what changed since is compiled."""
+    """The wheel, built in the folder of `make setup`, so that only changed files are compiled."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [*(sys.executable, "-m", "pip", "wheel"), "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True, timeout=300)
@@ -31,9 +33,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
-    """Installed without the checkout, the native cores and the demo's configs are its own.
+    """The native modules and the demo's configs come from the wheel, not from the checkout.
 
-    `-S` keeps the editable install's import hook out; the dependencies come by PYTHONPATH, after the wheel.
+    `-S` disables the import hook of the editable install; PYTHONPATH has the wheel first, then the dependencies.
     """
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
@@ -43,8 +45,8 @@ def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
     subprocess.run(probe, check=True, timeout=60, cwd=tmp_path, env=env)
 
 
-def test_a_wheel_holds_what_runs_and_nothing_else(wheel: Path):
-    """The four programs, the native modules with their stubs, the configs of the demo; no C++ sources and no tests."""
+def test_a_wheel_contains_the_programs_only(wheel: Path):
+    """With native modules, their stubs and the demo's configs; without C++ sources and tests."""
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
         "camera_node",
@@ -55,3 +57,8 @@ def test_a_wheel_holds_what_runs_and_nothing_else(wheel: Path):
     assert not [name for name in names if name.endswith((".cpp", ".hpp"))]
     assert {"camera_node/_core.pyi", "fusion/_core.pyi"} <= set(names)
     assert "web/configs/wand.yaml" in names
+
+
+def test_the_native_module_computes():
+    """A disc of 0.14 m whose major axis is 0.028 in the normalised image plane has a distance of 5 m."""
+    assert abs(_core.distance_by_principal_axis(0.14, 0.028) - 5.0) < 1e-12

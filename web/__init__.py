@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""the live view in Viser, and the demo."""
+"""The live view in a browser (Viser), and the demo."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m web`: watch an arena or its recording, in the browser or on one line a second; or start a demo."""
+"""`python -m web`: shows an arena or a recording in the browser or in one line per second, or runs the demo."""
 
 import contextlib
 import signal
@@ -14,27 +14,27 @@ from camera_node.protocol.session import open_client
 from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.subscription import Subscription
-from web.tables import describe
+from web.tables import describe_arena
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Watch an arena.
+    """Show an arena.
 
     Attributes:
         connect: Zenoh endpoints of the server.
         arena: Name of the arena, as in the server's configuration.
         zenoh: A Zenoh configuration (JSON5) for TLS, access control or scouting.
-        host: Address that the page is served on; 0.0.0.0 shows it to the whole network.
-        port: Port that the page is served on.
-        headless: One line a second instead of a page.
-        seconds: End after so long; of a demo, so long after calibration.
-        demo: Start a simulated arena, calibrate it by a wand wave, track its robots, and watch it.
-        rig: The arena's rig.yaml (lenses at the least), for a button that places its cameras by a waved wand.
-        wand: The wand that is waved.
-        replay: Show a recording (MCAP, by python -m fusion record) instead of a running arena.
-        scene: The demo's scene; arena.yaml, robots.yaml and wand.yaml lie beside it. The checkout's own by default.
-        listen: Zenoh endpoint of the demo's server, as tcp/127.0.0.1:7447; a free one by default.
+        host: Address of the page; 0.0.0.0 makes it available to the whole network.
+        port: Port of the page.
+        headless: Print one line per second instead of serving a page.
+        seconds: End after this time; in the demo, this long after the calibration.
+        demo: Run a simulated arena: calibrate it with a wand, track its robots and show it.
+        rig: The arena's rig.yaml with at least the intrinsics; adds a button that calibrates with a wand.
+        wand: The wand for that button.
+        replay: Show a recording (MCAP, from python -m fusion record) instead of a running arena.
+        scene: The demo's scene, with arena.yaml, robots.yaml and wand.yaml beside it; by default the one in configs.
+        listen: Zenoh endpoint of the demo's server; by default tcp/127.0.0.1:7447, or a free port if that is taken.
     """
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -52,8 +52,8 @@ class Options:
     listen: str | None = None
 
 
-def watch(options: Options, stop: threading.Event) -> None:
-    """Show the arena until `stop` is set."""
+def show_live(options: Options, stop: threading.Event) -> None:
+    """Show a running arena until `stop` is set."""
     session = open_client(options.connect, options.zenoh)
     try:
         feed = Feed(options.arena)
@@ -62,35 +62,31 @@ def watch(options: Options, stop: threading.Event) -> None:
         session.close()
 
 
-def replay(path: Path, options: Options, stop: threading.Event) -> None:
+def show_recording(path: Path, options: Options, stop: threading.Event) -> None:
     """Show a recording until `stop` is set; without a page, until it ends."""
-    recorded = RecordingPlayer(path)
-    feed = Feed(recorded.arena, clock=recorded.seconds)
-    teller = threading.Thread(target=recorded.run, args=(feed, stop, options.headless))
-    teller.start()
+    player = RecordingPlayer(path)
+    feed = Feed(player.arena, clock=player.seconds)
+    thread = threading.Thread(target=player.run, args=(feed, stop, options.headless))
+    thread.start()
     try:
-        _show(feed, recorded, options, stop)
+        _show(feed, player, options, stop)
     finally:
         stop.set()
-        teller.join()
+        thread.join()
 
 
 def _show(
     feed: Feed, source: Subscription | RecordingPlayer, options: Options, stop: threading.Event
 ) -> None:
     if options.headless:
-        ended = False
-        while not ended:
-            ended = stop.wait(1.0)
-            print(describe(feed.latest()), flush=True)
+        _print_lines(feed, stop)
         return
-    from web.calibrating import Calibrating, Files
-    from web.controls import LiveControls
-    from web.picking import Picking
-    from web.playback import ReplayControls
+    from web.controls import LiveControls, ReplayControls
+    from web.marker_picker import MarkerPicker
     from web.view import View
+    from web.wand_calibration import CalibrationFiles, WandSessionPanel
 
-    files = Files(options.rig, options.wand) if options.rig is not None else None
+    files = CalibrationFiles(options.rig, options.wand) if options.rig is not None else None
     if files is not None:
         files.check()
     with contextlib.ExitStack() as stack:
@@ -100,15 +96,23 @@ def _show(
             view.add(ReplayControls(view.server, source))
         else:
             if files is not None:
-                stack.callback(Calibrating(view.server, source, files).close)
+                stack.callback(WandSessionPanel(view.server, source, files).close)
             view.add(LiveControls(view.server, source))
-            view.add(Picking(view.server, source))
+            view.add(MarkerPicker(view.server, source))
         print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
         view.run(stop)
 
 
-def play(options: Options) -> int:
-    """Play the demo; returns its exit code."""
+def _print_lines(feed: Feed, stop: threading.Event) -> None:
+    """Print the state every second, and once more at the end."""
+    ended = False
+    while not ended:
+        ended = stop.wait(1.0)
+        print(describe_arena(feed.state()), flush=True)
+
+
+def play_demo(options: Options) -> int:
+    """Run the demo and return its exit code."""
     from web.demo import default_scene, run_demo
     from web.view import check_port
 
@@ -121,15 +125,15 @@ def play(options: Options) -> int:
 def program() -> int | None:
     options = tyro.cli(Options, prog="python -m web")
     if options.demo:
-        return play(options)
+        return play_demo(options)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     if options.seconds is not None:
         threading.Timer(options.seconds, stop.set).start()
     if options.replay is not None:
-        replay(options.replay, options, stop)
+        show_recording(options.replay, options, stop)
     else:
-        watch(options, stop)
+        show_live(options, stop)
     return 0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Everything that an arena says, kept at its latest: what the viewer draws and what the status line tells."""
+"""Stores the latest message of each kind that an arena publishes, for the page and the status line."""
 
 import math
 import threading
@@ -15,48 +15,49 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
-from web.coverage import Coverage
+from web.coverage import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
-MAX_NAMES = 256  # cameras or robots of one arena; more are a fault of whoever publishes them
-MAX_REASONS = 32
-FAR_M = 1e5  # nothing of an arena is so far away
+MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
+MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
+MAX_DISTANCE_M = 1e5  # the feed rejects positions beyond it, and the page does not draw them
+MIN_QUATERNION_NORM = 1e-6
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A message and when it came, seconds of the feed's clock."""
+class TimedMessage:
+    """A message and its time of arrival, seconds of the feed's clock."""
 
     message: Any
-    at: float
+    received_s: float
 
 
 @dataclass
-class Latest:
-    """What is known of an arena at one moment."""
+class ArenaState:
+    """The latest messages of an arena at one moment of the feed's clock."""
 
-    now: float = 0.0  # seconds of the feed's clock
-    poses: dict[str, Seen] = field(default_factory=dict)
-    cameras: dict[str, Seen] = field(default_factory=dict)
-    coverage: dict[str, Coverage] = field(default_factory=dict)
-    markers: Seen | None = None
-    status: Seen | None = None
-    progress: Seen | None = None
+    now_s: float = 0.0
+    poses: dict[str, TimedMessage] = field(default_factory=dict)  # by robot
+    cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
+    coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
+    markers: TimedMessage | None = None
+    status: TimedMessage | None = None  # of the server
+    progress: TimedMessage | None = None  # of the demo
     rig: Rig | None = None
     server_alive: bool = False
-    received: Counter[str] = field(default_factory=Counter)  # messages by kind; frames by "frames <camera>"
-    faults: Counter[str] = field(default_factory=Counter)  # what was skipped, by its reason
+    message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
+    faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
 
-    def age(self, seen: Seen | None) -> float:
-        """Seconds since a message came; infinite where there is none."""
-        return self.now - seen.at if seen else math.inf
+    def age_s(self, timed: TimedMessage | None) -> float:
+        """Return the seconds since a message arrived; infinity for None."""
+        return self.now_s - timed.received_s if timed else math.inf
 
 
 class Feed:
-    """What an arena's messages say. Bad bytes are counted in `Latest.faults` and go no further.
+    """Decodes the messages of an arena and stores the latest of each kind.
 
-    Messages come by `receive`: from Zenoh (`web.subscription`) or from a recording (`web.replay`), whose clock may
-    stand still.
+    Messages arrive through `receive`, from Zenoh (`web.subscription`) or from a recording (`web.replay`). Invalid
+    messages are counted in `ArenaState.faults` and have no other effect. All methods are thread-safe.
     """
 
     def __init__(
@@ -65,96 +66,105 @@ class Feed:
         on_pose: Callable[[RobotPose], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Create an empty feed.
+
+        Args:
+            arena: name of the arena, the first part of its Zenoh keys.
+            on_pose: is called with each valid pose, in the thread that calls `receive`.
+            clock: returns seconds. The clock of a recording may stand still.
+        """
         self.keys = Keys(arena)
         self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
-        self._latest = Latest()
+        self._state = ArenaState()
         keys = self.keys
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
-            keys.robot_pose(): (RobotPose, self._take_pose),
-            keys.markers: (Markers, self._keep("markers")),
-            keys.fusion_status: (FusionStatus, self._keep("status")),
-            keys.camera_status(): (CameraStatus, self._take_camera),
-            keys.detections(): (Detections, self._take_detections),
-            keys.rig: (RigMessage, self._take_rig),
-            progress_key(arena): (DemoProgress, self._keep("progress")),
+            keys.robot_pose(): (RobotPose, self._store_pose),
+            keys.markers: (Markers, self._store_as("markers")),
+            keys.fusion_status: (FusionStatus, self._store_as("status")),
+            keys.camera_status(): (CameraStatus, self._store_camera_status),
+            keys.detections(): (Detections, self._add_coverage),
+            keys.rig: (RigMessage, self._store_rig),
+            progress_key(arena): (DemoProgress, self._store_as("progress")),
         }
 
     @property
     def key_exprs(self) -> tuple[str, ...]:
-        """The Zenoh key expressions of all that is understood."""
+        """The Zenoh key expressions of all messages that the feed decodes."""
         return tuple(self._kinds)
 
     def receive(self, key_expr: str, key: str, data: bytes) -> None:
-        """A message on a key that one of `key_exprs` includes."""
-        kind, take = self._kinds[key_expr]
+        """Store a message; `key_expr` is the one of `key_exprs` that includes its `key`."""
+        kind, store = self._kinds[key_expr]
         try:
             message = decode(data, kind)
             with self._lock:
-                take(message, key)
-                self._latest.received[kind.__name__] += 1
+                store(message, key)
+                self._state.message_counts[kind.__name__] += 1
         except MessageError as error:
             self.count_fault(f"{kind.__name__}: {error}"[:120])
 
-    def latest(self) -> Latest:
-        """A copy that no later message changes."""
+    def state(self) -> ArenaState:
+        """Return a copy of the state, which later messages do not change."""
         with self._lock:
-            latest = self._latest
-            copies = {name: getattr(latest, name).copy() for name in _CONTAINERS}
-            return replace(latest, now=self._clock(), **copies)
+            copies = {name: getattr(self._state, name).copy() for name in _CONTAINERS}
+            return replace(self._state, now_s=self._clock(), **copies)
 
-    def server_changed(self, alive: bool) -> None:
-        """The server came or went."""
+    def set_server_alive(self, alive: bool) -> None:
+        """Store whether the server is running."""
         with self._lock:
-            self._latest.server_alive = alive
+            self._state.server_alive = alive
 
-    def forget(self) -> None:
-        """Know nothing, but what was skipped and whether the server is there."""
+    def clear(self) -> None:
+        """Discard all messages; fault counts and the server's presence remain."""
         with self._lock:
-            known = self._latest
-            self._latest = Latest(server_alive=known.server_alive, faults=known.faults)
+            self._state = ArenaState(server_alive=self._state.server_alive, faults=self._state.faults)
 
     def count_fault(self, reason: str) -> None:
-        """Count something of the arena that could not be shown."""
+        """Count a message or drawing that was skipped."""
         with self._lock:
-            faults = self._latest.faults
+            faults = self._state.faults
             faults[reason if reason in faults or len(faults) < MAX_REASONS else "others"] += 1
 
-    def _keep(self, name: str) -> Callable[[msgspec.Struct, str], None]:
-        return lambda message, key: setattr(self._latest, name, Seen(message, self._clock()))
+    def _store_as(self, name: str) -> Callable[[msgspec.Struct, str], None]:
+        return lambda message, key: setattr(self._state, name, TimedMessage(message, self._clock()))
 
-    def _take_pose(self, pose: RobotPose, key: str) -> None:
-        if max(map(abs, pose.position)) > FAR_M or math.hypot(*pose.quaternion_wxyz) < 1e-6:
-            raise MessageError("a pose out of any arena, or without an orientation")
-        self._store(self._latest.poses, pose.robot, pose, key)
+    def _store_pose(self, pose: RobotPose, key: str) -> None:
+        outside = max(map(abs, pose.position)) > MAX_DISTANCE_M
+        if outside or math.hypot(*pose.quaternion_wxyz) < MIN_QUATERNION_NORM:
+            raise MessageError("a position outside of any arena, or a quaternion of zero length")
+        self._store_named(self._state.poses, pose.robot, pose, key)
         if self._on_pose is not None:
             self._on_pose(pose)
 
-    def _take_camera(self, status: CameraStatus, key: str) -> None:
-        self._store(self._latest.cameras, status.camera, status, key)
+    def _store_camera_status(self, status: CameraStatus, key: str) -> None:
+        self._store_named(self._state.cameras, status.camera, status, key)
 
-    def _take_detections(self, detections: Detections, key: str) -> None:
+    def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
-        _check_name(self._latest.coverage, camera, key)
-        known = self._latest.coverage.get(camera)
-        if known is None or known.size != size:
-            known = self._latest.coverage[camera] = Coverage(*size)
-        known.add(detections)
-        self._latest.received[f"frames {camera}"] += 1
+        _check_name(self._state.coverage, camera, key)
+        picture = self._state.coverage.get(camera)
+        if picture is None or picture.size != size:
+            picture = self._state.coverage[camera] = CoveragePicture(*size)
+        picture.add(detections)
+        self._state.message_counts[f"frames {camera}"] += 1
 
-    def _take_rig(self, message: RigMessage, key: str) -> None:
-        self._latest.rig = message.rig()
+    def _store_rig(self, message: RigMessage, key: str) -> None:
+        self._state.rig = message.rig()
 
-    def _store(self, into: dict[str, Seen], name: str, message: msgspec.Struct, key: str) -> None:
-        _check_name(into, name, key)
-        into[name] = Seen(message, self._clock())
+    def _store_named(
+        self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str
+    ) -> None:
+        _check_name(messages, name, key)
+        messages[name] = TimedMessage(message, self._clock())
 
 
-_CONTAINERS = ("poses", "cameras", "coverage", "received", "faults")
+_CONTAINERS = ("poses", "cameras", "coverage", "message_counts", "faults")
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:
+    """Raise MessageError if the name in a message differs from its key's, or if there are too many names."""
     if f"/{name}/" not in key or not name:
-        raise MessageError(f"a name that is not the key's, on {key}")
+        raise MessageError(f"a name that differs from the one in the key {key}")
     if name not in known and len(known) >= MAX_NAMES:
         raise MessageError(f"more than {MAX_NAMES} names")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The demo's message over Zenoh, encoded as in `camera_node.protocol.messages`: its progress, and the true poses."""
+"""The Zenoh message of the demo: its progress and the true positions of what it simulates."""
 
 import math
 
@@ -11,22 +11,23 @@ Vector = tuple[float, float, float]
 
 
 class DemoProgress(msgspec.Struct, frozen=True, kw_only=True):
-    """A line for people, how much of the step is done, and where the simulation knows things to be.
+    """A status line, the completed share of the current step, and true marker positions.
 
-    `ghosts` maps a name to points in the world, metres, joined by a line in the viewer.
+    `true_points` maps the name of a simulated object to its marker positions in the world, metres. The viewer draws
+    them. The encoding is that of `camera_node.protocol.messages`.
     """
 
     version: int = VERSION
     t_ns: int
     text: str
-    share: float  # of the present step, 0 to 1
-    ghosts: dict[str, tuple[Vector, ...]] = {}
+    share: float  # completed part of the current step, 0 to 1
+    true_points: dict[str, tuple[Vector, ...]] = {}
 
     def check(self) -> None:
-        """Raise MessageError unless all numbers are finite and the share is one."""
-        points = (x for ghost in self.ghosts.values() for point in ghost for x in point)
-        if not (0.0 <= self.share <= 1.0 and all(map(math.isfinite, points))):
-            raise MessageError("a share outside 0 to 1, or a ghost that is not finite")
+        """Raise MessageError unless `share` is within 0 to 1 and all coordinates are finite."""
+        coordinates = (x for points in self.true_points.values() for point in points for x in point)
+        if not (0.0 <= self.share <= 1.0 and all(map(math.isfinite, coordinates))):
+            raise MessageError("a share outside 0 to 1, or a true position that is not finite")
 
 
 def progress_key(arena: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The programs of an arena as child processes: started together, watched, and never left behind."""
+"""Starts, watches and stops the programs of an arena as child processes."""
 
 import os
 import signal
@@ -15,16 +15,16 @@ import psutil
 
 from web.errors import WebError
 
-GRACE_S = 5.0  # to end after being asked to; then a child is killed
-TAIL_LINES = 8
+GRACE_S = 5.0  # between SIGTERM and SIGKILL
+TAIL_LINES = 8  # of a log, that the message of a failure quotes
 
 
 class ProgramFailed(Exception):
-    """A child stopped that should not have; the message shows what it said last."""
+    """A child stopped unexpectedly; the message quotes the end of its log."""
 
 
 class Processes:
-    """Children by name, each writing to `<folder>/<name>.log`. Leaving the `with` block stops all of them."""
+    """Children by name; each writes to `<folder>/<name>.log`. Leaving the `with` block stops all of them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -41,14 +41,14 @@ class Processes:
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments`."""
         command = [sys.executable, "-m", module, *arguments]
-        # One thread a program: on few cores, those of linear algebra libraries only take time from the cameras.
+        # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
         environment = os.environ | {
             "PYTHONUNBUFFERED": "1",
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
         }
         with self._log(name).open("wb") as log:
-            # In a session of its own, so that Ctrl-C reaches this program alone, which then stops the others in order.
+            # In a session of its own: Ctrl-C reaches this program only, which then stops its children.
             child = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -61,10 +61,11 @@ class Processes:
         self._meters[name] = psutil.Process(child.pid)
 
     def finished(self, name: str) -> bool:
-        """Whether the child ended well.
+        """Whether the child ended with exit code 0.
 
         Raises:
-            WebError, ProgramFailed: it ended otherwise.
+            WebError: it ended with one line on a fault that the user can correct.
+            ProgramFailed: it ended with another exit code.
         """
         code = self._children[name].poll()
         if code:
@@ -72,18 +73,17 @@ class Processes:
         return code == 0
 
     def check(self, *expected_to_end: str) -> None:
-        """Raise unless all children run; those that are expected to end may have ended well.
+        """Raise unless all children run; those that are expected to end may have ended with exit code 0.
 
         Raises:
-            WebError: a child ended because of something that a person can mend; its own line says what.
-            ProgramFailed: it ended in another way.
+            WebError, ProgramFailed: as `finished`; a child that ended unexpectedly raises ProgramFailed.
         """
         for name in self._children:
             if self.finished(name) and name not in expected_to_end:
                 self._raise_failed(name, 0)
 
     def stop(self) -> None:
-        """Ask all children to end, the newest first; kill those that don't."""
+        """Terminate all children, the newest first; kill those that do not end within `GRACE_S`."""
         for child in reversed(self._children.values()):
             if child.poll() is None:
                 child.terminate()
@@ -97,11 +97,11 @@ class Processes:
         self._children.clear()
 
     def pids(self) -> list[int]:
-        """The children's process numbers."""
+        """Return the process ids of the children."""
         return [child.pid for child in self._children.values()]
 
-    def processor_seconds(self) -> float:
-        """Processor time that the running children and this process have used so far; notes the memory's peak."""
+    def measure(self) -> float:
+        """Update `peak_bytes`; return the processor time of this process and the running children, seconds."""
         seconds, resident = 0.0, 0
         for meter in (*self._meters.values(), psutil.Process()):
             try:
@@ -109,7 +109,7 @@ class Processes:
                     times = meter.cpu_times()
                     seconds += times.user + times.system
                     resident += meter.memory_info().rss
-            except psutil.Error:  # it has ended
+            except psutil.Error:  # the child has ended
                 continue
         self.peak_bytes = max(self.peak_bytes, resident)
         return seconds
@@ -118,16 +118,16 @@ class Processes:
         lines = self._log(name).read_text(errors="replace").strip().splitlines()
         if code == 2 and lines and lines[-1].startswith("error: "):
             raise WebError(f"{name}: {lines[-1].removeprefix('error: ')}")
-        said = "\n".join(f"  {line}" for line in lines[-TAIL_LINES:])
-        raise ProgramFailed(f"{name} stopped with code {code}; its log is {self._log(name)}\n{said}".rstrip())
+        tail = "\n".join(f"  {line}" for line in lines[-TAIL_LINES:])
+        raise ProgramFailed(f"{name} stopped with code {code}; its log is {self._log(name)}\n{tail}".rstrip())
 
     def _log(self, name: str) -> Path:
         return self.folder / f"{name}.log"
 
 
 @contextmanager
-def ended_by_signals() -> Iterator[None]:
-    """Make a closed terminal and a request to end raise KeyboardInterrupt, so that `with` blocks are left in order."""
+def interrupt_on_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT, SIGTERM and SIGHUP, so that `with` blocks clean up."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

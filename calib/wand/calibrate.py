@@ -1,106 +1,65 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From a waved wand to a rig: label, start from pairs, adjust, choose a world."""
+"""The wand calibration: label the detections, build an initial rig, adjust it, and report.
+
+`calibrate` is the pipeline. Its steps are in `labeling`, `initialization`, `adjustment` and `conclusion`.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
-from calib.wand.detections import FrameTable, WandDetections, frame_counts, gather
-from calib.wand.initialization.diagnosis import find_faults
-from calib.wand.initialization.initial_rig import InitialRig, explain_unplaced, find_start
-from calib.wand.initialization.two_view import MIN_INSTANTS, TwoViewGeometry
-from calib.wand.labeling import label
-from calib.wand.outcome import Told, WandCalibration, conclude
+from calib.wand.adjustment import RoughRig, Solution, adjust_rig
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
+from calib.wand.conclusion import Placement, conclude
+from calib.wand.detections import count_frames
+from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
+from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
+from calib.wand.initialization.two_view import MIN_FRAME_SETS, TwoViewGeometry
+from calib.wand.labeling import WandRecording, label_recording
 from calib.wand.quality.checks import check_motion
+from calib.wand.result import NOT_RECORDED, WandCalibration
 from calib.wand.scale import Distance
-from calib.wand.solution import Solution, solve
-from calib.wand.wave import Wave
-from camera_node.arrays import Array
+from camera_node.arrays import Index
 from camera_node.geometry.body import Body
-from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
-
-
-@dataclass(frozen=True, slots=True)
-class WandRecording:
-    """A labelled recording: cameras in order of names."""
-
-    names: list[str]
-    lenses: list[Lens]
-    frames: FrameTable
-    seen: WandDetections
-    left_out: list[Counter[str]]
 
 
 def calibrate(
     rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None = None
 ) -> WandCalibration:
-    """Place the cameras of a rig, and set their clocks, by a wand waved before them.
+    """Estimate the poses and clocks of a rig's cameras from a wand recording.
 
     Args:
-        rig: intrinsics of every camera; poses in it are not used.
-        wand: its markers; two of them or more give the scale, one gives it only by the roundel's size.
-        messages: detections of all cameras, any order; a roundel's `id`, where given, is its marker number.
-        distance: of two cameras: the scale, where the wand has one marker; else compared with what the wand gives.
+        rig: intrinsics of every camera; its poses are not used.
+        wand: its markers; two or more give the scale, one gives it only by the size of the roundel.
+        messages: detections of all cameras, in any order; the `id` of a roundel, if given, is its marker number.
+        distance: measured between two cameras: the scale for a wand of one marker, else compared with the wand.
 
     Returns:
-        the rig with the poses and time offsets of all cameras that could be placed, and the report.
+        the rig with poses and time offsets of all cameras that could be placed, and the report.
 
     Raises:
-        CalibrationError: the recording or the wand can't place two cameras, or cameras contradict each other and no
-            majority agrees; the message says why.
+        CalibrationError: the recording or the wand does not place two cameras, or no majority of the cameras agrees.
     """
     check_recording(rig, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
-    recording = read(rig, wand, messages)
-    if not len(recording.seen):
-        raise CalibrationError(_unseen(recording))
-    check_motion(recording.seen, recording.names, recording.lenses)
-    pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
-    told, solution = _solve_majority(recording, pairs, wand, distance)
-    absent = {name: "is not in the recording" for name in rig.cameras if name not in recording.names}
-    return conclude(rig, solution, replace(told, unplaced=told.unplaced | absent))
-
-
-def _solve_majority(
-    recording: WandRecording, pairs: TwoViewGeometry, wand: Body, distance: Distance | None
-) -> tuple[Told, Solution]:
-    """The solution of the cameras that agree; those that contradict them are left out, and told.
-
-    Raises:
-        CalibrationError: fewer than two can be placed, or no more than half of those agree.
-    """
-    names, counts = recording.names, frame_counts(recording.seen, len(recording.names))
-    wrong: dict[str, str] = {}
-    sure: dict[str, str] = {}
-    while True:
-        start = find_start(pairs, [k for k, name in enumerate(names) if name not in wrong])
-        placed = sorted(start.poses)
-        faults = find_faults(names, recording.frames, pairs, placed)
-        unplaced = explain_unplaced(names, placed, counts, pairs.shared(), start) | wrong | faults | sure
-        if len(placed) < 2:
-            raise CalibrationError(_unplaceable(recording, counts, pairs, unplaced, wrong | faults))
-        left_out = [recording.left_out[k] for k in placed]
-        told = Told([names[k] for k in placed], [counts[k] for k in placed], left_out, unplaced, start.metric)
-        told = replace(told, distance=distance, scaled=distance is not None and len(wand.markers) == 1)
-        known = distance.between(told.names, unplaced) if distance is not None and told.scaled else None
-        wave = gather_wave(recording, pairs, wand, placed)
-        try:
-            return told, solve(wave, *_columns(start, placed), start.metric, known)
-        except CameraFault as fault:
-            wrong |= fault.reasons
-            sure |= fault.reasons if fault.certain else {}
-            if len(placed) - len(fault.reasons) <= len(wrong):
-                raise CalibrationError(f"no majority of the cameras agrees: {CameraFault(wrong)}") from None
+    recording = label_recording(rig, wand, messages)
+    if not len(recording.detections):
+        raise CalibrationError(_explain_no_wand(recording))
+    check_motion(recording.detections, recording.names, recording.lenses)
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.frames.period_s())
+    placement, solution = _solve_majority(recording, pairs, distance)
+    absent = {name: NOT_RECORDED for name in rig.cameras if name not in recording.names}
+    return conclude(rig, solution, replace(placement, unplaced=placement.unplaced | absent))
 
 
 def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
-    """Raise CalibrationError where a recording can't belong to a rig, or has fewer than two cameras."""
+    """Raise CalibrationError if a recording does not fit the rig, or has fewer than two cameras."""
     sizes = {message.camera: (message.width, message.height) for message in messages}
     if unknown := sorted(set(sizes) - set(rig.cameras)):
         raise CalibrationError(
@@ -119,64 +78,124 @@ def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
             )
 
 
-def read(rig: Rig, wand: Body, messages: Sequence[Detections]) -> WandRecording:
-    """Label a recording's detections."""
-    names = sorted({message.camera for message in messages})
-    lenses: list[Lens] = [rig.cameras[name] for name in names]
-    frames, seen = gather(messages, names, lenses)
-    return WandRecording(names, lenses, frames, *label(frames, seen, wand, lenses))
+@dataclass(slots=True)
+class _Excluded:
+    """Cameras that contradict the others, by name with the reason; `certain` ones are known to be the cause."""
+
+    reasons: dict[str, str] = field(default_factory=dict)
+    certain: dict[str, str] = field(default_factory=dict)
+
+    def add(self, fault: CameraFault) -> None:
+        self.reasons |= fault.reasons
+        self.certain |= fault.reasons if fault.certain else {}
 
 
-def _unseen(recording: WandRecording) -> str:
-    reasons = sum(recording.left_out, Counter())
-    told = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
-    return f"the wand was in no frame ({told}); do the wand file's diameter and markers match the wand?"
+def _solve_majority(
+    recording: WandRecording, pairs: TwoViewGeometry, distance: Distance | None
+) -> tuple[Placement, Solution]:
+    """Solve for the cameras that agree; exclude those that contradict them, until a majority is consistent.
 
-
-def _unplaceable(
-    recording: WandRecording,
-    counts: list[int],
-    pairs: TwoViewGeometry,
-    unplaced: dict[str, str],
-    faults: dict[str, str],
-) -> str:
-    if faults:
-        told = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
-        return f"no two cameras could be placed: {told}"
-    shared = pairs.shared()
-    if not (shared - np.diag(np.diag(shared))).any():
-        seen = ", ".join(f"{name} {n}" for name, n in zip(recording.names, counts, strict=True))
-        return f"no two cameras ever saw the wand at once (frames with the wand: {seen}); wave where views overlap"
-    if shared.max(initial=0, where=~np.eye(len(shared), dtype=bool)) >= MIN_INSTANTS:
-        most = np.triu(shared, 1)
-        a, b = np.unravel_index(int(most.argmax()), most.shape)
-        return (
-            f"no two cameras could be placed, though '{recording.names[a]}' and '{recording.names[b]}' saw the wand at "
-            f"once {most.max()} times: what they saw does not fit a wand with these markers; measure it, and compare "
-            "the intrinsics with the cameras"
+    Raises:
+        CalibrationError: fewer than two cameras can be placed, or at most half of them agree.
+    """
+    excluded = _Excluded()
+    while True:
+        included = [k for k, name in enumerate(recording.names) if name not in excluded.reasons]
+        start = build_initial_rig(pairs, included)
+        placement = _place(recording, pairs, start, excluded, distance)
+        known = placement.scaled_by and placement.scaled_by.between(placement.names, placement.unplaced)
+        poses, offset_s = (
+            np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
         )
-    told = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
-    return f"no two cameras could be placed; wave where two see the wand at once ({told})"
+        labeled = select_cameras(recording, pairs, start.placed)
+        try:
+            return placement, adjust_rig(labeled, RoughRig(poses, offset_s, start.metric, known))
+        except CameraFault as fault:
+            excluded.add(fault)
+            if len(start.placed) - len(fault.reasons) <= len(excluded.reasons):
+                message = f"no majority of the cameras agrees: {CameraFault(excluded.reasons)}"
+                raise CalibrationError(message) from None
 
 
-def gather_wave(recording: WandRecording, pairs: TwoViewGeometry, wand: Body, placed: list[int]) -> Wave:
-    """What the placed cameras saw, numbered anew."""
+def _place(
+    recording: WandRecording,
+    pairs: TwoViewGeometry,
+    start: InitialRig,
+    excluded: _Excluded,
+    distance: Distance | None,
+) -> Placement:
+    """Collect what the initial rig places, and the reasons why it does not place the other cameras.
+
+    Raises:
+        CalibrationError: it places fewer than two.
+    """
+    names, placed = recording.names, start.placed
+    counts, shared = count_frames(recording.detections, len(names)), pairs.count_shared()
+    faults = find_faults(names, recording.frames, pairs, placed)
+    unplaced = explain_unplaced(names, counts, shared, start) | excluded.reasons | faults | excluded.certain
+    if len(placed) < 2:
+        faults = excluded.reasons | faults
+        raise CalibrationError(
+            _explain_faults(faults) if faults else _explain_failure(names, counts, shared, unplaced)
+        )
+    by_distance = len(pairs.wand.markers) == 1
+    return Placement(
+        names=[names[k] for k in placed],
+        frames=[counts[k] for k in placed],
+        left_out=[recording.left_out[k] for k in placed],
+        unplaced=unplaced,
+        metric=start.metric,
+        scaled_by=distance if by_distance else None,
+        compared_with=None if by_distance else distance,
+    )
+
+
+def select_cameras(
+    recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]
+) -> LabeledRecording:
+    """Return the input of the adjustment for the cameras `placed`, renumbered in this order."""
     number = np.full(len(recording.names), -1)
     number[placed] = np.arange(len(placed))
-    seen = recording.seen.select(number[recording.seen.camera] >= 0)
-    seen = replace(seen, camera=number[seen.camera])
+    detections = recording.detections.select(number[recording.detections.camera] >= 0)
     t_s = recording.frames.t_s
-    return Wave(
-        seen,
+    return LabeledRecording(
+        replace(detections, camera=number[detections.camera]),
         [recording.names[k] for k in placed],
         [recording.lenses[k] for k in placed],
         [pairs.tracks[k] for k in placed],
-        wand,
+        pairs.wand,
         pairs.period_s,
         pairs.gap_s,
         float(t_s.min() + t_s.max()) / 2,
     )
 
 
-def _columns(start: InitialRig, placed: list[int]) -> tuple[Array, Array]:
-    return np.array([start.poses[k] for k in placed]), np.array([start.offset_s[k] for k in placed])
+def _explain_no_wand(recording: WandRecording) -> str:
+    reasons = sum(recording.left_out, Counter())
+    counts = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
+    return f"the wand was in no frame ({counts}); do the wand file's diameter and markers match the wand?"
+
+
+def _explain_faults(faults: dict[str, str]) -> str:
+    reasons = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
+    return f"no two cameras could be placed: {reasons}"
+
+
+def _explain_failure(names: list[str], counts: list[int], shared: Index, unplaced: dict[str, str]) -> str:
+    """Explain why no two cameras could be placed, from the frame sets (C, C) that they share."""
+    pairs = np.triu(shared, 1)
+    if not pairs.any():
+        frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
+        return (
+            f"no two cameras ever saw the wand at once (frames with the wand: {frames}); wave the wand where views "
+            "overlap"
+        )
+    if pairs.max() >= MIN_FRAME_SETS:
+        a, b = np.unravel_index(int(pairs.argmax()), pairs.shape)
+        return (
+            f"no two cameras could be placed, although '{names[a]}' and '{names[b]}' saw the wand at once "
+            f"{pairs.max()} times: their detections do not fit a wand with these markers; measure the wand, and check "
+            "the intrinsics of the cameras"
+        )
+    reasons = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
+    return f"no two cameras could be placed; wave the wand where two cameras see it at once ({reasons})"

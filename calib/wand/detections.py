@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What all cameras saw of the wand, as columns: one row a detection, frames and cameras by number."""
+"""The detections of all cameras as columns: one row per detection, frames and cameras by index."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 
-UNKNOWN_S = 1.0  # more than cameras' clocks may be apart
+MAX_CLOCK_ERROR_S = 1.0  # bound for a timestamp without a clock error: above any difference of camera clocks
 HEADER = ("camera", "t_ns", "clock_error_us")
-# Of a message: what its columns hold, and how many of them a roundel has (`Detections`).
+# Columns of a `Detections` message: element type, and elements per roundel.
 COLUMNS = {
     "uv": ("<f8", 2),
     "cov": ("<f4", 3),
@@ -26,7 +26,7 @@ COLUMNS = {
 
 
 class Ellipses(Protocol):
-    """Columns of detections with their ellipses, as `WandDetections` has them."""
+    """Detections with ellipses, as columns (see `WandDetections`)."""
 
     @property
     def camera(self) -> Index: ...
@@ -40,12 +40,12 @@ class Ellipses(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameTable:
-    """All frames of a recording, by camera, then by time.
+    """All frames of a recording, sorted by camera, then by time.
 
     Attributes:
         camera: (F,) index of the camera.
-        t_s: (F,) stamp of the middle of the exposure, seconds after `origin_ns`.
-        origin_ns: the first stamp.
+        t_s: (F,) timestamp of the middle of the exposure, seconds after `origin_ns`.
+        origin_ns: the first timestamp.
     """
 
     camera: Index
@@ -53,7 +53,7 @@ class FrameTable:
     origin_ns: int
 
     def period_s(self) -> float:
-        """The median time from one frame of a camera to its next; 0 where no camera has two."""
+        """Return the median time between consecutive frames of a camera, seconds; 0 if no camera has two."""
         steps = np.diff(self.t_s)[(np.diff(self.camera) == 0) & (np.diff(self.t_s) > 0)]
         return float(np.median(steps)) if len(steps) else 0.0
 
@@ -63,13 +63,13 @@ class WandDetections:
     """Detections, sorted by frame.
 
     Attributes:
-        camera, frame: (n,) where a detection is from.
-        t_s: (n,) stamp of its frame, seconds.
-        stamp_sigma_s: (n,) standard deviation of that, beside the offset that a camera's stamps share.
-        label: (n,) marker of the wand; -1 where it is not known.
+        camera, frame: (n,) indices of the camera and of the frame.
+        t_s: (n,) timestamp of the frame, seconds.
+        stamp_sigma_s: (n,) standard deviation of the timestamp, without the offset common to the camera's timestamps.
+        label: (n,) marker of the wand, -1 if unknown.
         uv: (n, 2) centre of the ellipse, raw pixels.
-        cov: (n, 2, 2) its covariance, square pixels.
-        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
+        cov: (n, 2, 2) covariance of the centre, square pixels.
+        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN if unknown.
         xy: (n, 2) undistorted image plane coordinates of `uv`.
     """
 
@@ -88,86 +88,94 @@ class WandDetections:
         return len(self.uv)
 
     def select(self, rows: NDArray) -> "WandDetections":
-        """The rows that a mask or an index array names."""
+        """Return the rows that a mask or an index array selects."""
         return WandDetections(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def rays(self) -> Array:
-        """(n, 3) unit viewing rays, camera frames."""
+        """Return (n, 3) unit viewing rays, camera frames."""
         rays = np.column_stack([self.xy, np.ones(len(self))])
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def gather(messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Lens]):
-    """Frames and sightings of the cameras `names`, their labels the numbers that the detections carry.
+def gather(
+    messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Lens]
+) -> tuple[FrameTable, WandDetections]:
+    """Collect the detections of the cameras `names` from their messages.
 
-    Detections outside of what a lens model covers are left out.
-
-    Returns:
-        frames, sightings
+    The `id` of a roundel becomes its label. Detections outside the valid area of a lens model are dropped.
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
     camera_of, t_ns, bound_us, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
     origin_ns = min(t_ns)
     camera = np.array([index[name] for name in camera_of], np.intp)
-    t_s = (np.array(t_ns) - origin_ns) * 1e-9
-    tables = [_table(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
+    frames = FrameTable(camera, (np.array(t_ns) - origin_ns) * 1e-9, origin_ns)
+    tables = [_read_column(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
     uv, cov, axes_px, angle_rad, number = tables
     frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])
-    xy = np.full(uv.shape, np.nan)
-    for k, lens in enumerate(lenses):
-        mine = camera[frame] == k
-        xy[mine] = lens.normalise(uv[mine])
-    every = WandDetections(
+    detections = WandDetections(
         camera[frame],
         frame,
-        t_s[frame],
+        frames.t_s[frame],
         stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
         number[:, 0].astype(np.intp),
         uv,
         cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
         axes_px,
         angle_rad[:, 0],
-        xy,
+        normalise(lenses, camera[frame], uv),
     )
-    return FrameTable(camera, t_s, origin_ns), every.select(np.flatnonzero(np.isfinite(xy).all(axis=1)))
+    return frames, detections.select(np.flatnonzero(np.isfinite(detections.xy).all(axis=1)))
+
+
+def normalise(lenses: Sequence[Lens], camera: Index, uv: Array) -> Array:
+    """Return (n, 2) undistorted image plane coordinates of pixels (n, 2) of the cameras (n,); NaN where invalid."""
+    xy = np.full(uv.shape, np.nan)
+    for k, lens in enumerate(lenses):
+        xy[camera == k] = lens.normalise(uv[camera == k])
+    return xy
 
 
 def stamp_sigmas(camera: Index, bound_s: Array) -> Array:
-    """Standard deviations (F,) of frames' stamps, seconds, beside the offset that is sought for each camera.
+    """Return (F,) standard deviations of frame timestamps, seconds, without the estimated offset of each camera.
 
-    What the least bound of a camera leaves open may be the same in all its frames, and is the offset's. Within what
-    another is wider by, all is equally likely. A frame of before the server's first answer has a stamp of any clock.
+    An error within the smallest bound of a camera can be common to all its frames: the time offset absorbs it. A frame
+    with a larger bound has a further error, uniform within the difference of the bounds. A frame from before the first
+    reply of the server has no bound: its timestamp comes from an unsynchronized clock.
+
+    Args:
+        camera: (F,) index of the camera.
+        bound_s: (F,) bound of the clock error, NaN if unknown.
     """
-    bound_s = np.nan_to_num(bound_s, nan=UNKNOWN_S)
+    bound_s = np.nan_to_num(bound_s, nan=MAX_CLOCK_ERROR_S)
     least = np.full(camera.max() + 1, np.inf)
     np.minimum.at(least, camera, bound_s)
     return (bound_s - least[camera]) / np.sqrt(3)
 
 
-def _table(data: Sequence[bytes], dtype: str, width: int) -> Array:
+def _read_column(data: Sequence[bytes], dtype: str, width: int) -> Array:
     return np.frombuffer(b"".join(data), dtype).reshape(-1, width).astype(float)
 
 
-def ranges(lenses: Sequence[Lens], seen: Ellipses, diameter_m: float) -> Array:
-    """Distances (n,) of discs, metres, from the angle under which their major axis appears.
+def ranges(lenses: Sequence[Lens], detections: Ellipses, diameter_m: float) -> Array:
+    """Return (n,) distances of discs from the cameras, metres, from the angle that their major axis subtends.
 
-    A disc of diameter d at distance r, seen at any tilt, appears under the angle 2 atan(d / 2r) along its major axis.
-    NaN where the detection has no axes.
+    A disc of diameter d at distance r and any slant subtends the angle 2 atan(d / 2r) along its major axis. NaN where
+    a detection has no axes.
     """
-    along = np.column_stack([np.cos(seen.angle_rad), np.sin(seen.angle_rad)])
-    half = seen.axes_px[:, :1] / 2 * along
-    distances = np.full(len(seen.uv), np.nan)
+    along = np.column_stack([np.cos(detections.angle_rad), np.sin(detections.angle_rad)])
+    half = detections.axes_px[:, :1] / 2 * along
+    distances = np.full(len(detections.uv), np.nan)
     for k, lens in enumerate(lenses):
-        rows = np.flatnonzero((seen.camera == k) & np.isfinite(half).all(axis=1))
+        rows = np.flatnonzero((detections.camera == k) & np.isfinite(half).all(axis=1))
         if len(rows):
-            a, b = lens.rays(seen.uv[rows] - half[rows]), lens.rays(seen.uv[rows] + half[rows])
+            a, b = (lens.rays(detections.uv[rows] + sign * half[rows]) for sign in (-1, 1))
             apart = np.maximum(np.linalg.norm(a - b, axis=1), 1e-12)
             distances[rows] = diameter_m / apart * np.linalg.norm(a + b, axis=1) / 2
     return distances
 
 
-def frame_counts(seen: WandDetections, cameras: int) -> list[int]:
-    """The number of frames with sightings, by camera."""
-    first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
-    return np.bincount(seen.camera[first], minlength=cameras).tolist()
+def count_frames(detections: WandDetections, cameras: int) -> list[int]:
+    """Count the frames with detections, by camera."""
+    first = np.flatnonzero(np.diff(detections.frame, prepend=-1))
+    return np.bincount(detections.camera[first], minlength=cameras).tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One camera against a rig in force: somebody touched it, or it is new. A short wave, and the others stay."""
+"""Recalibrates one camera of a rig, moved or new, from a short wand recording; the other cameras are fixed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,35 +10,38 @@ import numpy as np
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE
 from calib.rig.rig import Rig
+from calib.wand.adjustment import Solution
 from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
-from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors, parameter_sigma
+from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
-from calib.wand.bundle_adjustment.problem import WandObservations
-from calib.wand.calibrate import check_recording, gather_wave, read
+from calib.wand.bundle_adjustment.problem import Estimate, WandObservations
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
+from calib.wand.calibrate import check_recording, select_cameras
+from calib.wand.conclusion import adjusted_camera, clock_values
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.outcome import clock_values
+from calib.wand.labeling import WandRecording, label_recording
 from calib.wand.quality.checks import check_agreement, check_lenses
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
-from camera_node.geometry.pose import Pose, invert
+from camera_node.geometry.pose import invert
 from camera_node.protocol.messages import Detections
 
-MOMENTS = 300  # of the wave, that are used
+MAX_FRAME_SETS = 300
 
 
 @dataclass(frozen=True, slots=True)
 class Recalibration:
-    """The rig with one camera placed anew, and the adjustment.
+    """The rig with one recalibrated camera, and the adjustment.
 
     Attributes:
-        rig: the other cameras are as they were.
-        name: the camera.
-        moved_mm, turned_deg: from where it stood; None where it stood nowhere.
-        residual_px: RMS distance of seen from expected centres, of this camera.
-        sigma_mm: expected error of its position along one axis, the others taken as known.
+        rig: with the new camera; the other cameras are unchanged.
+        name: of the camera.
+        moved_mm, turned_deg: from its previous pose; None if it had none.
+        residual_px: RMS distance of its observed from predicted centres.
+        sigma_mm: standard deviation of its position along one axis, with exact other cameras.
         time_sigma_ms: standard deviation of its time offset.
-        adjusted, observations: the adjustment and its rows.
+        adjusted, observations: the adjustment and its observations.
     """
 
     rig: Rig
@@ -52,96 +55,104 @@ class Recalibration:
     observations: WandObservations
 
 
-def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Recalibration:
-    """Place camera `name` of a rig by a wand that it and placed cameras saw, and adjust its lens within what is known
-    of it; all others stay.
+def recalibrate_camera(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Recalibration:
+    """Estimate the pose, time offset and lens correction of one camera; all other cameras are fixed.
 
     Args:
-        rig: intrinsics of `name`, and other cameras with poses and time offsets.
+        rig: intrinsics of the camera, and other cameras with poses and time offsets.
         wand: its markers.
-        messages: detections of `name` and of others, any order.
+        messages: detections of the camera and of others, in any order.
+        name: of the camera.
 
     Raises:
-        CalibrationError: the camera or its intrinsics are missing or another's, or no placed camera saw enough with it.
+        CalibrationError: the camera is not in the rig or the recording, its intrinsics are those of another camera, or
+            no placed camera shares enough frame sets with it.
+        CameraFault: its lens differs from its file, or its observations contradict those of the others.
     """
+    recording = _label(rig, wand, messages, name)
+    this = recording.names.index(name)
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.frames.period_s())
+    cameras, offset_s = _initial_rig(rig, recording.names, pairs, this)
+    labeled = select_cameras(recording, pairs, list(range(len(recording.names))))
+    start = build_problem(labeled, cameras, offset_s, MAX_FRAME_SETS)
+    if start is None:
+        raise CalibrationError("the wand's lengths do not fit the detections; check the wand file")
+    solution = _adjust(labeled, start, this)
+    return _conclude(rig, name, this, solution)
+
+
+def _label(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> WandRecording:
+    """Label the detections of the camera and of all placed cameras."""
     if name not in rig.cameras:
         raise CalibrationError(
             f"camera '{name}' is not in the rig; run python -m calib intrinsics --camera {name}"
         )
-    placed = set(rig.placed()) - {name}
-    messages = [message for message in messages if message.camera in placed | {name}]
+    used = set(rig.placed()) | {name}
+    messages = [message for message in messages if message.camera in used]
     check_recording(rig, messages)
-    recording = read(rig, wand, messages)
+    recording = label_recording(rig, wand, messages)
     if name not in recording.names:
         raise CalibrationError(f"camera '{name}' is not in the recording, or never saw the wand")
-    this = recording.names.index(name)
-    pairs = TwoViewGeometry(recording.seen, recording.lenses, wand, recording.frames.period_s())
-    cameras, offset_s = _start(rig, recording.names, pairs, this)
-    wave = gather_wave(recording, pairs, wand, list(range(len(recording.names))))
-    found = wave.pose_problem(cameras, offset_s, MOMENTS)
-    if found is None:
-        raise CalibrationError("the wand's lengths do not fit what the cameras saw: is the wand file right?")
-    problem, state, observations = found
-    problem = replace(problem.with_free(POSE, OFFSET), estimated=(this,))
-    state = optimize_robustly(problem, observations, state)
-    observations = with_disc_centres(problem, state, observations, wand.diameter_m)
-    first = inflate_covariance(adjust(problem.with_free(POSE, OFFSET, LENS), observations, state))
-    check_lenses(recording.names, first)
-    adjusted = inflate_covariance(
-        adjust(estimate_lens_priors(first.problem, first), observations, first.state)
-    )
-    check_agreement(recording.names, adjusted, observations)
-    return _conclude(rig, name, this, adjusted, observations)
+    return recording
 
 
-def _start(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) -> tuple[Array, Array]:
-    """Poses and time offsets of all cameras; of the one that is sought, by the camera that shares most with it."""
-    shared = pairs.shared()[this]
+def _initial_rig(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) -> tuple[Array, Array]:
+    """Poses (C, 4, 4) and time offsets (C,) of all cameras: the rig's, and for the new camera from the two-view
+    geometry with the camera that shares most frame sets with it."""
+    shared = pairs.count_shared()[this]
     for other in np.argsort(-shared).tolist():
-        if (
-            other == this
-            or not shared[other]
-            or (pair := pairs.relate(other, this)) is None
-            or not pair.metric
-        ):
+        if other == this or not shared[other]:
             continue
-        known = [rig.cameras[n] for n in names]
-        cameras = np.array([np.eye(4) if k == this else c.matrix() for k, c in enumerate(known)])
-        offset_s = np.array([c.time_offset_ms for c in known]) * 1e-3
+        pair = pairs.relate(other, this)
+        if pair is None or not pair.metric:
+            continue
+        given = [rig.cameras[n] for n in names]
+        cameras = np.array([np.eye(4) if k == this else c.matrix() for k, c in enumerate(given)])
+        offset_s = np.array([c.time_offset_ms for c in given]) * 1e-3
         cameras[this] = cameras[other] @ pair.T_a_b
         offset_s[this] = offset_s[other] - pair.shift_s
         return cameras, offset_s
-    told = ", ".join(f"{shared[k]} with {n}" for k, n in enumerate(names) if k != this)
+    counts = ", ".join(f"{shared[k]} with {n}" for k, n in enumerate(names) if k != this)
     raise CalibrationError(
-        f"camera '{names[this]}' can't be placed: instants shared with placed cameras: {told}; "
-        "wave where its view overlaps theirs"
+        f"camera '{names[this]}' can't be placed: frame sets shared with placed cameras: {counts}; wave the wand where "
+        "its view overlaps theirs"
     )
 
 
-def _conclude(rig: Rig, name: str, this: int, adjusted: Adjusted, seen: WandObservations) -> Recalibration:
-    before, T = rig.cameras[name], adjusted.state.cameras[this]
-    covariance = camera_covariance(adjusted)
+def _adjust(recording: LabeledRecording, start: Estimate, this: int) -> Solution:
+    """Adjust the camera: robustly, with usual lens priors, and with estimated lens priors."""
+    problem = replace(start.problem.with_free(POSE, OFFSET), estimated=(this,))
+    state = optimize_robustly(problem, start.observations, start.state)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    first = inflate_covariance(adjust(problem.with_free(POSE, OFFSET, LENS), observations, state))
+    check_lenses(recording.names, first)
+    problem = estimate_lens_priors(first.problem, first)
+    adjusted = inflate_covariance(adjust(problem, observations, first.state))
+    check_agreement(recording.names, adjusted, observations)
+    return Solution(adjusted, observations)
+
+
+def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibration:
+    adjusted, observations, before = solution.adjusted, solution.observations, rig.cameras[name]
+    covariance, T = camera_covariance(adjusted), adjusted.state.cameras[this]
     cov = covariance.of(POSE)[this, :, this]
     offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted.state, covariance, OFFSET, 1e3))
-    lens_sigma = np.sqrt(np.diag(covariance.of(LENS)[this, :, this]))
-    lens = adjusted.state.lens(this, before)
-    camera = msgspec.structs.replace(
-        before.with_parameters(lens.parameters),
-        T_world_cam=Pose.from_matrix(T),
-        time_offset_ms=float(offset_ms),
-        covariance=tuple(tuple(row) for row in cov.tolist()),
-        lens_sigma=parameter_sigma(lens, before.lens_sigma, lens_sigma),
-    )
-    used = adjusted.used & (seen.camera == this)
+    camera = adjusted_camera(before, adjusted.state, covariance, this, float(offset_ms))
+    used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
     return Recalibration(
-        msgspec.structs.replace(rig, cameras={**rig.cameras, name: camera}),
-        name,
-        None if change is None else float(np.linalg.norm(change[:3, 3])) * 1e3,
-        None if change is None else float(np.degrees(np.arccos(np.clip((np.trace(change) - 2) / 2, -1, 1)))),
-        float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())),
-        float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
-        float(sigma_ms),
-        adjusted,
-        seen,
+        rig=msgspec.structs.replace(rig, cameras={**rig.cameras, name: camera}),
+        name=name,
+        moved_mm=None if change is None else float(np.linalg.norm(change[:3, 3])) * 1e3,
+        turned_deg=None if change is None else _angle_deg(change),
+        residual_px=float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())),
+        sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
+        time_sigma_ms=float(sigma_ms),
+        adjusted=adjusted,
+        observations=observations,
     )
+
+
+def _angle_deg(T: Array) -> float:
+    """Rotation angle of a rigid motion (4, 4), degrees."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(T) - 2) / 2, -1, 1))))

@@ -1,93 +1,119 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Markers from frame to frame of one camera: labels carried over, and where a marker was between two frames."""
+"""Image tracks of the wand's markers: their interpolation in time, and triangulation from several cameras."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from calib.wand.detections import FrameTable, WandDetections
+from calib.wand.detections import WandDetections
 from calib.wand.trajectory import hermite
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 
-FOLLOW_PX = 8.0  # how far a marker may be from between its neighbours, at least
-FOLLOW_SHARE = 0.15  # and of the way from one to the next
-FOLLOW_FRAMES = 3.5  # for how many frame periods labels are carried over
+ROUNDS = 8  # of reweighting in a triangulation
+CAUCHY = 0.003  # scale of the weights: angle between a ray and the point, radians
+AGREE = 4.0  # times the median of these angles: a ray within agrees with the point
+MIN_ANGLE = 1e-4  # ratio of the information along the worst and the best axis, below which rays are parallel
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerTrack:
-    """One marker in one camera: times (n,) ascending, and positions and velocities (n, 2)."""
+    """One marker in one camera: timestamps (n,) ascending, positions (n, 2) and their velocities (n, 2)."""
 
     t_s: Array
-    at: Array
+    xy: Array
     velocity: Array
 
     @classmethod
-    def of(cls, t_s: Array, at: Array) -> "MarkerTrack":
-        """Velocities by central differences."""
+    def of(cls, t_s: Array, xy: Array) -> "MarkerTrack":
+        """Compute velocities by central differences."""
         if len(t_s) < 2:
-            return cls(t_s, at, np.zeros_like(at))
-        step = np.diff(at, axis=0) / np.diff(t_s)[:, None]
+            return cls(t_s, xy, np.zeros_like(xy))
+        step = np.diff(xy, axis=0) / np.diff(t_s)[:, None]
         velocity = np.concatenate([step[:1], (step[1:] + step[:-1]) / 2, step[-1:]])
-        return cls(t_s, at, velocity)
+        return cls(t_s, xy, velocity)
 
     def interpolate(self, t_s: Array, gap_s: float) -> Array:
-        """Positions at times of any shape (...), (..., 2), by cubic Hermite polynomials; NaN in gaps above `gap_s`."""
+        """Return positions (..., 2) at timestamps (...), by cubic Hermite polynomials; NaN in gaps above `gap_s`."""
         if len(self.t_s) < 2:
             return np.full((*t_s.shape, 2), np.nan)
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         tau, dt = t_s - self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
         inside = (tau >= -1e-6) & (tau <= dt + 1e-6) & (dt <= gap_s)
         h = hermite(tau.ravel(), dt.ravel()).reshape(*t_s.shape, 4)
-        p, v = self.at, self.velocity
+        p, v = self.xy, self.velocity
         found = h[..., :1] * p[after - 1] + h[..., 1:2] * v[after - 1]
         found += h[..., 2:3] * p[after] + h[..., 3:] * v[after]
         return np.where(inside[..., None], found, np.nan)
 
 
-def tracks_of(seen: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
-    """Tracks by camera and marker, in undistorted image plane coordinates, by stamps."""
-    found = []
+def build_tracks(detections: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
+    """Return tracks by camera and marker, in undistorted image plane coordinates, by timestamps."""
+    tracks = []
     for camera in range(cameras):
-        mine = [np.flatnonzero((seen.camera == camera) & (seen.label == marker)) for marker in range(markers)]
-        found.append([MarkerTrack.of(seen.t_s[rows], seen.xy[rows]) for rows in mine])
+        mine = detections.camera == camera
+        rows = [np.flatnonzero(mine & (detections.label == marker)) for marker in range(markers)]
+        tracks.append([MarkerTrack.of(detections.t_s[k], detections.xy[k]) for k in rows])
+    return tracks
+
+
+def interpolate(tracks: Sequence[MarkerTrack], label: Index, t_s: Array, gap_s: float) -> Array:
+    """Return positions (..., n, 2) of the markers `label` (n,) at timestamps (..., n); `tracks` are by marker."""
+    found = np.full((*t_s.shape, 2), np.nan)
+    for marker, track in enumerate(tracks):
+        mine = label == marker
+        found[..., mine, :] = track.interpolate(t_s[..., mine], gap_s)
     return found
 
 
-def follow(frames: FrameTable, seen: WandDetections, labels: Index, markers: int) -> Index:
-    """Labels also for detections that lie where a marker must have been between two labelled frames of its camera.
+def triangulate(
+    tracks: Sequence[Sequence[MarkerTrack]], poses: Array, offset_s: Array, t_s: Array, gap_s: float
+) -> tuple[Array, Index]:
+    """Locate the markers at given times, robustly.
 
-    Each marker is sought linearly between its neighbours; the detection nearest to it takes its label if it is no
-    nearer to another marker.
+    Minimises the distances to all viewing rays, reweighted by a Cauchy kernel.
+
+    Args:
+        tracks: by camera and marker, by timestamps.
+        poses: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = timestamp + offset.
+        t_s: (K,) true times.
+        gap_s: the longest gap over which tracks are interpolated.
+
+    Returns:
+        points: (K, M, 3) markers, world; NaN if fewer than two cameras saw the marker near that time, or their rays
+            are nearly parallel.
+        agreeing: (K, M) number of rays that agree with the point.
     """
-    labels = labels.copy()
-    gap_s = FOLLOW_FRAMES * frames.period_s()
-    for camera in np.unique(frames.camera):
-        open_rows = np.flatnonzero((seen.camera == camera) & (labels < 0))
-        away = np.full((len(open_rows), markers), np.inf)
-        for marker in range(markers):
-            known = np.flatnonzero((seen.camera == camera) & (labels == marker))
-            if len(known) < 2:
-                continue
-            after = np.searchsorted(seen.t_s[known], seen.t_s[open_rows])
-            inside = (after > 0) & (after < len(known))
-            inside &= ~np.isin(seen.frame[open_rows], seen.frame[known])
-            a, b = known[np.clip(after - 1, 0, None)], known[np.clip(after, None, len(known) - 1)]
-            dt = np.maximum(seen.t_s[b] - seen.t_s[a], 1e-9)
-            share = ((seen.t_s[open_rows] - seen.t_s[a]) / dt)[:, None]
-            off = np.linalg.norm(seen.uv[open_rows] - (1 - share) * seen.uv[a] - share * seen.uv[b], axis=1)
-            gate = FOLLOW_PX + FOLLOW_SHARE * np.linalg.norm(seen.uv[b] - seen.uv[a], axis=1)
-            away[:, marker] = np.where(inside & (dt <= gap_s) & (off < gate), off, np.inf)
-        _assign(seen.frame[open_rows], away, labels, open_rows)
-    return labels
+    xy = np.array(
+        [
+            [track.interpolate(t_s - offset, gap_s) for track in markers]
+            for markers, offset in zip(tracks, offset_s, strict=True)
+        ]
+    )  # (C, M, K, 2)
+    known = np.isfinite(xy[..., 0])
+    ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:3], 1))], axis=3)
+    ray = np.einsum("cij,cmkj->cmki", poses[:, :3, :3], ray / np.linalg.norm(ray, axis=3, keepdims=True))
+    points, angle = _intersect(ray, poses[:, :3, 3], known)
+    usual = float(np.median(angle[known])) if known.any() else 0.0
+    agreeing = (known & (angle <= AGREE * usual)).sum(axis=0)
+    return np.swapaxes(points, 0, 1), agreeing.T
 
 
-def _assign(frame: Index, away: Array, labels: Index, rows: Index) -> None:
-    """Give each row its nearest marker, and each marker its nearest row of a frame."""
-    nearest = away.argmin(axis=1)
-    far = away[np.arange(len(away)), nearest] if len(away) else np.empty(0)
-    order = np.lexsort((far, nearest, frame))
-    key = frame[order] * (away.shape[1] + 1) + nearest[order]
-    first = np.diff(key, prepend=-1) != 0
-    chosen = order[first & np.isfinite(far[order])]
-    labels[rows[chosen]] = nearest[chosen]
+def _intersect(ray: Array, centre: Array, known: Mask) -> tuple[Array, Array]:
+    """Return points (M, K, 3) nearest to rays (C, M, K, 3) through centres (C, 3), and the rays' angles to them."""
+    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+    toward = np.einsum("cmkij,cj->cmki", across, centre)
+    weight = known.astype(float)
+    points, angle = np.full((*known.shape[1:], 3), np.nan), np.zeros(known.shape)
+    for _ in range(ROUNDS):
+        A, b = np.einsum("cmk,cmkij->mkij", weight, across), np.einsum("cmk,cmki->mki", weight, toward)
+        spread = np.linalg.eigvalsh(A)
+        solvable = (known.sum(axis=0) >= 2) & (spread[..., 0] > MIN_ANGLE * spread[..., 2])
+        points[:] = np.nan
+        points[solvable] = np.linalg.solve(A[solvable], b[solvable][:, :, None])[:, :, 0]
+        away = np.nan_to_num(points) - centre[:, None, None]
+        angle = np.linalg.norm(np.einsum("cmkij,cmkj->cmki", across, away), axis=3)
+        angle /= np.maximum(np.linalg.norm(away, axis=3), 1e-9)
+        weight = known / (angle**2 + CAUCHY**2) * CAUCHY**2
+    return points, angle

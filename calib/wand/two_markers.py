@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which end is which of a wand of two markers that look alike.
+"""Distinguishes the ends of a wand of two markers that look alike.
 
-To swap the ends in all frames of all cameras changes nothing; to swap them in one camera does. From frame to frame of a
-camera the stick turns little: frames chain into segments with one unknown sign each. Between cameras, rays to the same
-end meet and those to different ends do not: for two segments that overlap in time, the epipolar residuals of both
-namings say by how much one sign is likelier (`_evidence`). All signs together are a synchronisation over Z2 (Singer
-2011): the spanning tree of the surest evidence, then each sign by all that speaks for it.
+Swapping the ends in all frames of all cameras changes nothing; swapping them in one camera does. From frame to frame of
+a camera the wand turns little: frames are chained into segments with one unknown sign each. Between cameras, rays to
+the same end meet and rays to different ends do not: for two segments that overlap in time, the epipolar residuals of
+both labelings give a log likelihood ratio (`_epipolar_evidence`). All signs together are a synchronization over Z2
+(Singer 2011): the maximum spanning tree of the evidence, then a greedy flip of single signs.
 
-The cameras' places that this takes come from the stick's middle, waved as if it were one marker: the middle of two
-image points is nearly the image of the middle, with no need of names. Then once more from the named ends.
+The camera poses come from an initial rig of the wand's middle, treated as a wand of one marker: the middle of two image
+points is nearly the image of the middle and needs no labels. A second pass uses the labeled ends.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.wand.detections import FrameTable, WandDetections
-from calib.wand.initialization.initial_rig import InitialRig, find_start
-from calib.wand.initialization.two_view import INTERPOLATED, SLOWEST_S, TwoViewGeometry, sampson
+from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
+from calib.wand.initialization.two_view import TwoViewGeometry, longest_gap_s, sampson
 from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
@@ -31,26 +32,26 @@ if TYPE_CHECKING:
     from scipy.sparse import coo_array
 
 
-FIRM = 0.5  # of the change that a swap would be: a turn of 53 degrees; more, and the sign is open
-CHAINED_S = 0.2  # or a frame and a half: after so long a stick may lie anywhere
-CLEAR = 3.0  # times what the stick usually turns from frame to frame: a longer one was not turned around
-FASTEST = 1.0  # of the image plane a second, where no two frames tell how fast it turns
-SAME_S = 5e-4  # frames nearer to each other in time are taken at once
-ROUGH_PX, FINE_PX = 3.0, 1.5  # of epipolar residuals: by middles, and by ends
-SURE = 6.0  # in the logarithm of the likelihood: a sign that less speaks for is not told
-APART_S = 1e4  # that is set between runs, so that nothing is interpolated from one to the next
+MAX_TURN = 0.5  # change of the wand's image vector, relative to the change by a swap: a turn of 53 degrees
+CHAIN_S, CHAIN_PERIODS = 0.2, 1.5  # longest gap within a run: the larger of the two
+CLEAR = 3.0  # times the usual change between frames: a longer image vector has not reversed
+FASTEST = 1.0  # change of the image vector, image plane units per second, where no two frames give it
+SAME_S = 5e-4  # frames closer in time count as simultaneous
+COARSE_PX, FINE_PX = 3.0, 1.5  # scale of epipolar residuals with the poses of the middles, and of the ends
+MIN_EVIDENCE = 6.0  # log likelihood ratio of a sign that is accepted
+SEPARATION_S = 1e4  # added between runs, so that nothing is interpolated across them
 
 
 @dataclass(frozen=True, slots=True)
 class _Sticks:
-    """Frames with two detections, by camera and time.
+    """Frames with two detections, sorted by camera and time.
 
     Attributes:
-        rows: (n, 2) their sightings, in the order that makes neighbours of a segment alike.
-        camera, t_s: (n,).
+        rows: (n, 2) the detections, in an order that is constant within a segment.
+        camera, t_s: (n,) camera index and timestamp.
         xy: (n, 2, 2) both ends, image plane coordinates.
-        run: (n,) ascending: frames of a camera over which the stick turns little, between which it is interpolated.
-        segment: (n,) ascending: parts of runs over which it surely was not turned around.
+        run: (n,) ascending; consecutive frames of a camera between which the wand turns little.
+        segment: (n,) ascending; parts of runs within which the order is certain.
     """
 
     rows: Index
@@ -60,188 +61,215 @@ class _Sticks:
     run: Index
     segment: Index
 
-    def along(self) -> NDArray[np.complex128]:
-        """(n,) from the first end to the second, as complex numbers."""
+    @classmethod
+    def of(cls, detections: WandDetections, rows: Index, run: Index) -> "_Sticks":
+        """Collect the columns of `rows` (n, 2); each run is one segment."""
+        first = rows[:, 0]
+        return cls(rows, detections.camera[first], detections.t_s[first], detections.xy[rows], run, run)
+
+    def vectors(self) -> NDArray[np.complex128]:
+        """Return (n,) the image vectors from the first end to the second, as complex numbers."""
         gap = self.xy[:, 1] - self.xy[:, 0]
         return gap[:, 0] + 1j * gap[:, 1]
 
+    def usual_change(self) -> float:
+        """Return the upper limit of the usual change of the image vector, image plane units per second."""
+        within = np.flatnonzero(np.diff(self.run) == 0)
+        speed = abs(np.diff(self.vectors()))[within] / np.diff(self.t_s)[within]
+        return 2 * float(np.median(speed)) if len(speed) else FASTEST
 
-def label_ends(frames: FrameTable, seen: WandDetections, wand: Body, lenses: Sequence[Lens]) -> Index:
-    """The end (n,), 0 or 1, that each sighting in a frame of two is; -1 where nothing tells."""
-    sticks = _chain(seen, frames.period_s())
-    labels = np.full(len(seen), -1, np.intp)
-    if not len(sticks.rows):
-        return labels
+
+@dataclass(frozen=True, slots=True)
+class _StickTracks:
+    """Both ends over time: the frames, the velocities (n, 2, 2) at them, and the longest gap to interpolate."""
+
+    sticks: _Sticks
+    velocity: Array
+    gap_s: float
+
+    @classmethod
+    def of(cls, sticks: _Sticks, gap_s: float) -> "_StickTracks":
+        """Compute velocities by central differences within runs."""
+        separated_s = sticks.t_s + SEPARATION_S * sticks.run
+        return cls(sticks, finite_velocities(separated_s, sticks.xy, gap_s), gap_s)
+
+    def interpolate(self, rows: Index, t_s: Array) -> tuple[Array, Index]:
+        """Interpolate the frames `rows` of one camera at timestamps (m,).
+
+        Returns:
+            ends: (m, 2, 2) both ends; NaN outside of runs.
+            segment: (m,) the segment of the nearest frame.
+        """
+        sticks = self.sticks
+        after = np.clip(np.searchsorted(sticks.t_s[rows], t_s), 1, len(rows) - 1)
+        left, right = rows[after - 1], rows[after]
+        tau, dt = t_s - sticks.t_s[left], sticks.t_s[right] - sticks.t_s[left]
+        knots = np.stack(
+            [sticks.xy[left], self.velocity[left], sticks.xy[right], self.velocity[right]], axis=1
+        )
+        ends = np.einsum("nh,nhex->nex", hermite(tau, dt), knots)
+        inside = (sticks.run[left] == sticks.run[right]) & (dt <= self.gap_s) & (tau >= 0) & (tau <= dt)
+        nearest = np.where(tau > dt / 2, right, left)
+        simultaneous = np.abs(sticks.t_s[nearest] - t_s) < SAME_S
+        ends = np.where(simultaneous[:, None, None], sticks.xy[nearest], ends)
+        ends[~(inside | simultaneous)] = np.nan
+        return ends, sticks.segment[nearest]
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Log likelihood ratios (e,) of equal over opposite signs of the segments `a` and `b` (e,); pairs may repeat."""
+
+    a: Index
+    b: Index
+    gain: Array
+
+
+def label_ends(frames: FrameTable, detections: WandDetections, wand: Body, lenses: Sequence[Lens]) -> Index:
+    """Return the end (n,), 0 or 1, of each detection in a frame of two; -1 where the data do not determine it."""
     period_s, cameras = frames.period_s(), range(len(lenses))
-    light = Body(diameter_m=wand.diameter_m)
-    start = find_start(TwoViewGeometry(_middles(seen, sticks), lenses, light, period_s), cameras)
-    labels = _name(sticks, _signs(sticks, start, lenses, period_s, ROUGH_PX), len(seen))
+    sticks = _chain(detections, period_s)
+    if not len(sticks.rows):
+        return np.full(len(detections), -1, np.intp)
+    tracks, light = _StickTracks.of(sticks, longest_gap_s(period_s)), Body(diameter_m=wand.diameter_m)
+    middles = TwoViewGeometry(_middles(detections, sticks), lenses, light, period_s)
+    start = build_initial_rig(middles, cameras)
+    labels = _label(sticks, _estimate_signs(tracks, start, lenses, COARSE_PX), len(detections))
     if not (labels >= 0).any():
         return labels
-    named = replace(seen, label=labels).select(labels >= 0)
-    finer = find_start(TwoViewGeometry(named, lenses, wand, period_s), cameras)
-    if len(finer.poses) < len(start.poses):
+    labeled = replace(detections, label=labels).select(labels >= 0)
+    refined = build_initial_rig(TwoViewGeometry(labeled, lenses, wand, period_s), cameras)
+    if len(refined.poses) < len(start.poses):
         return labels
-    return _name(sticks, _signs(sticks, finer, lenses, period_s, FINE_PX), len(seen))
+    return _label(sticks, _estimate_signs(tracks, refined, lenses, FINE_PX), len(detections))
 
 
-def _chain(seen: WandDetections, period_s: float) -> _Sticks:
-    """Chain frames of two detections into runs, and cut these into segments."""
-    rows = np.flatnonzero((np.bincount(seen.frame) == 2)[seen.frame]).reshape(-1, 2)
-    camera, t_s = seen.camera[rows[:, 0]], seen.t_s[rows[:, 0]]
-    rows = rows[
-        (np.diff(camera, prepend=-1) != 0) | (np.diff(t_s, prepend=0) > 0)
-    ]  # without frames that came twice
-    sticks = _sticks(seen, rows, np.arange(len(rows)))
-    sign, run = _follow(sticks.camera, sticks.t_s, sticks.along(), max(CHAINED_S, 1.5 * period_s))
+def _chain(detections: WandDetections, period_s: float) -> _Sticks:
+    """Chain the frames of two detections into runs, and split these into segments."""
+    rows = np.flatnonzero((np.bincount(detections.frame) == 2)[detections.frame]).reshape(-1, 2)
+    camera, t_s = detections.camera[rows[:, 0]], detections.t_s[rows[:, 0]]
+    duplicate = (np.diff(camera, prepend=-1) == 0) & (np.diff(t_s, prepend=0) <= 0)
+    rows = rows[~duplicate]
+    sign, run = _follow(
+        _Sticks.of(detections, rows, np.arange(len(rows))), max(CHAIN_S, CHAIN_PERIODS * period_s)
+    )
     rows = np.where(sign[:, None] > 0, rows, rows[:, ::-1])
-    whole = run == np.minimum.accumulate(run[::-1])[::-1]  # without what lies within another run
-    return _cut(_sticks(seen, rows[whole], run[whole]))
+    whole = run == np.minimum.accumulate(run[::-1])[::-1]  # without runs inside of another run
+    return _split(_Sticks.of(detections, rows[whole], run[whole]))
 
 
-def _sticks(seen: WandDetections, rows: Index, run: Index) -> _Sticks:
-    return _Sticks(rows, seen.camera[rows[:, 0]], seen.t_s[rows[:, 0]], seen.xy[rows], run, run)
+def _split(sticks: _Sticks) -> _Sticks:
+    """Split runs where the image vector is so short that it may have reversed between two frames."""
+    length = abs(sticks.vectors())
+    shorter = np.minimum(length[1:], length[:-1])
+    split = (np.diff(sticks.run) > 0) | (shorter < CLEAR * sticks.usual_change() * np.diff(sticks.t_s))
+    return replace(sticks, segment=np.concatenate([[0], np.cumsum(split)])[: len(sticks.run)])
 
 
-def _cut(sticks: _Sticks) -> _Sticks:
-    """Runs cut where the stick is so short in the image that it may have been turned around from frame to frame."""
-    shorter = np.minimum(abs(sticks.along()[1:]), abs(sticks.along()[:-1]))
-    cut = (np.diff(sticks.run) > 0) | (shorter < CLEAR * _usual_turn(sticks) * np.diff(sticks.t_s))
-    return replace(sticks, segment=np.concatenate([[0], np.cumsum(cut)])[: len(sticks.run)])
+def _follow(sticks: _Sticks, limit_s: float) -> tuple[Array, Index]:
+    """Return signs (n,) that align each frame with its predecessor, and its run, numbered by the first frame.
 
-
-def _usual_turn(sticks: _Sticks) -> float:
-    """By how much a second a stick's image usually changes at the most."""
-    within = np.flatnonzero(np.diff(sticks.run) == 0)
-    speed = abs(np.diff(sticks.along()))[within] / np.diff(sticks.t_s)[within]
-    return 2 * float(np.median(speed)) if len(speed) else FASTEST
-
-
-def _follow(camera: Index, t_s: Array, along: NDArray[np.complex128], limit_s: float) -> tuple[Array, Index]:
-    """Signs (n,) that make each stick like the one before it, and the number of its run, that of its first frame.
-
-    A frame that does not fit stands alone, and what comes after is chained to the one before it: of two detections,
-    one may be wrong.
+    A frame that fits neither sign stays alone, and the next frame is chained to the one before it: one of the two
+    detections may be wrong.
     """
-    sign, run = np.ones(len(along)), np.arange(len(along))
+    camera, t_s, vectors = sticks.camera, sticks.t_s, sticks.vectors()
+    sign, run = np.ones(len(vectors)), np.arange(len(vectors))
     last = alone = -1
-    for k in range(len(along)):
+    for k in range(len(vectors)):
         for j in (last, alone):
             near = j >= 0 and camera[j] == camera[k] and t_s[k] - t_s[j] <= limit_s
-            if near and (told := _same_way(sign[j] * along[j], along[k])):
-                sign[k], run[k] = told, run[j]
+            if near and (relative := _relative_sign(sign[j] * vectors[j], vectors[k])):
+                sign[k], run[k] = relative, run[j]
                 break
         fresh = last < 0 or camera[last] != camera[k] or t_s[k] - t_s[last] > limit_s
         last, alone = (k, -1) if run[k] != k or fresh else (last, k)
     return sign, run
 
 
-def _same_way(before: complex, now: complex) -> int:
-    """1 where a stick in the image is as it was, -1 where its ends are the other way round, 0 where it is not clear."""
-    kept, swapped = abs(now - before), abs(now + before)
-    return 1 if kept < FIRM * swapped else -1 if swapped < FIRM * kept else 0
+def _relative_sign(before: complex, now: complex) -> int:
+    """Return 1 if an image vector kept its direction, -1 if it reversed, 0 if neither is clear."""
+    same, swapped = abs(now - before), abs(now + before)
+    return 1 if same < MAX_TURN * swapped else -1 if swapped < MAX_TURN * same else 0
 
 
-def _middles(seen: WandDetections, sticks: _Sticks) -> WandDetections:
-    """The sticks' middles, as sightings of one marker without a size."""
-    first = seen.select(sticks.rows[:, 0])
+def _middles(detections: WandDetections, sticks: _Sticks) -> WandDetections:
+    """Return the middles of the two detections as detections of one marker of unknown size."""
+    first = detections.select(sticks.rows[:, 0])
     unknown = np.full(len(first), np.nan)
     return replace(
         first,
         label=np.zeros(len(first), np.intp),
-        uv=seen.uv[sticks.rows].mean(axis=1),
+        uv=detections.uv[sticks.rows].mean(axis=1),
         xy=sticks.xy.mean(axis=1),
         axes_px=np.column_stack([unknown, unknown]),
         angle_rad=unknown,
     )
 
 
-def _name(sticks: _Sticks, signs: Index, sightings: int) -> Index:
-    """Labels (n,) of all sightings, by the sign of every segment, 0 where it is not known."""
-    labels, sign = np.full(sightings, -1, np.intp), signs[sticks.segment]
+def _label(sticks: _Sticks, signs: Index, count: int) -> Index:
+    """Return labels (count,) of all detections from the sign of each segment; -1 where it is 0."""
+    labels, sign = np.full(count, -1, np.intp), signs[sticks.segment]
     known = sign != 0
     labels[sticks.rows[known]] = np.where(sign[known, None] > 0, [0, 1], [1, 0])
     return labels
 
 
-def _signs(
-    sticks: _Sticks, start: InitialRig, lenses: Sequence[Lens], period_s: float, sigma_px: float
+def _estimate_signs(
+    tracks: _StickTracks, start: InitialRig, lenses: Sequence[Lens], sigma_px: float
 ) -> Index:
-    """(S,) 1 or -1 by segment, 0 where what speaks for it is not enough. Of cameras that have no place, segments stay
-    as they are: what is wrong with these is told by those who look for it."""
-    count, edges, placed = int(sticks.segment.max()) + 1, [], sorted(start.poses)
-    gap_s = min(INTERPOLATED * period_s, SLOWEST_S) if period_s else SLOWEST_S
-    apart_s = sticks.t_s + APART_S * sticks.run
-    velocity = finite_velocities(apart_s, sticks.xy, gap_s)
-    for a in placed:
-        for b in placed:
-            if a < b:
-                sigma = sigma_px / np.mean([lenses[a].fx, lenses[b].fx])
-                edges.append(_evidence(sticks, velocity, start, (a, b), gap_s, float(sigma)))
-    edges += [_turns(sticks, gap_s, lag) for lag in (1, 2)]  # of three frames, the middle one may be wrong
-    signs = _synchronise(count, *(np.concatenate(column) for column in zip(*edges, strict=True)))
-    signs[sticks.segment[~np.isin(sticks.camera, placed)]] = 1
+    """Return (S,) the sign of each segment, 1 or -1; 0 where the evidence is too small.
+
+    Segments of cameras without a pose keep their order; `diagnosis` explains later why they have none.
+    """
+    sticks, evidence = tracks.sticks, []
+    for a, b in combinations(start.placed, 2):
+        sigma = sigma_px / np.mean([lenses[a].fx, lenses[b].fx])
+        evidence.append(_epipolar_evidence(tracks, start, (a, b), float(sigma)))
+    evidence += [
+        _turn_evidence(tracks, lag) for lag in (1, 2)
+    ]  # of three frames, the middle one may be wrong
+    signs = _synchronize(int(sticks.segment.max()) + 1, evidence)
+    signs[sticks.segment[~np.isin(sticks.camera, start.placed)]] = 1
     return signs
 
 
-def _turns(sticks: _Sticks, gap_s: float, lag: int) -> tuple[Index, Index, Array]:
-    """What frames of a camera, `lag` apart, say of their segments' signs, by Cauchy's density of the stick's turn."""
+def _turn_evidence(tracks: _StickTracks, lag: int) -> _Evidence:
+    """Compare segments of a camera by the change of the image vector between frames `lag` apart (Cauchy density)."""
+    sticks, vectors = tracks.sticks, tracks.sticks.vectors()
     k = np.arange(len(sticks.rows) - lag)
     k = k[(sticks.segment[k] < sticks.segment[k + lag]) & (sticks.camera[k] == sticks.camera[k + lag])]
-    k = k[sticks.t_s[k + lag] - sticks.t_s[k] <= gap_s]
-    before, now = sticks.along()[k], sticks.along()[k + lag]
-    usual = _usual_turn(sticks) * (sticks.t_s[k + lag] - sticks.t_s[k])
-    kept, swapped = (np.log1p((abs(now + sign * before) / usual) ** 2) for sign in (-1, 1))
-    return sticks.segment[k], sticks.segment[k + lag], swapped - kept
+    k = k[sticks.t_s[k + lag] - sticks.t_s[k] <= tracks.gap_s]
+    before, now = vectors[k], vectors[k + lag]
+    usual = sticks.usual_change() * (sticks.t_s[k + lag] - sticks.t_s[k])
+    same, swapped = (np.log1p((abs(now + sign * before) / usual) ** 2) for sign in (-1, 1))
+    return _Evidence(sticks.segment[k], sticks.segment[k + lag], swapped - same)
 
 
-def _evidence(
-    sticks: _Sticks, velocity: Array, start: InitialRig, pair: tuple[int, int], gap_s: float, sigma: float
-) -> tuple[Index, Index, Array]:
-    """Segments of two cameras that overlap in time, (e,) each, and by how much their signs are likelier alike than
-    unlike, in the logarithm, by Cauchy's density of epipolar residuals at `sigma`."""
-    a, b = pair
+def _epipolar_evidence(
+    tracks: _StickTracks, start: InitialRig, pair: tuple[int, int], sigma: float
+) -> _Evidence:
+    """Compare segments of two cameras that overlap in time by their epipolar residuals (Cauchy density)."""
+    (a, b), sticks = pair, tracks.sticks
     mine, theirs = np.flatnonzero(sticks.camera == a), np.flatnonzero(sticks.camera == b)
     if not len(mine) or len(theirs) < 2:
-        return mine[:0], mine[:0], np.empty(0)
+        return _Evidence(mine[:0], mine[:0], np.empty(0))
     t_s = sticks.t_s[mine] + start.offset_s[a] - start.offset_s[b]
-    other, segment = _at(t_s, sticks, velocity, theirs, gap_s)
+    other, segment = tracks.interpolate(theirs, t_s)
     T = invert(start.poses[b]) @ start.poses[a]
     E = skew(T[:3, 3]) @ T[:3, :3]
-    far = [
-        [np.log1p((sampson(E, sticks.xy[mine, i], other[:, j]) / sigma) ** 2) for j in (0, 1)] for i in (0, 1)
-    ]
-    gain = far[0][1] + far[1][0] - far[0][0] - far[1][1]
+    ends = sticks.xy[mine]
+    cost = [[np.log1p((sampson(E, ends[:, i], other[:, j]) / sigma) ** 2) for j in (0, 1)] for i in (0, 1)]
+    gain = cost[0][1] + cost[1][0] - cost[0][0] - cost[1][1]
     known = np.isfinite(gain)
-    return sticks.segment[mine[known]], segment[known], gain[known]
+    return _Evidence(sticks.segment[mine[known]], segment[known], gain[known])
 
 
-def _at(t_s: Array, sticks: _Sticks, velocity: Array, rows: Index, gap_s: float) -> tuple[Array, Index]:
-    """Both ends (n, 2, 2) in the camera of the sticks `rows`, at its stamps `t_s` (n,), NaN where no segment is; and
-    the segment."""
-    stamps = sticks.t_s[rows]
-    after = np.clip(np.searchsorted(stamps, t_s), 1, len(rows) - 1)
-    left, right = rows[after - 1], rows[after]
-    tau, dt = t_s - sticks.t_s[left], sticks.t_s[right] - sticks.t_s[left]
-    h = hermite(tau, dt)
-    ends = np.stack([sticks.xy[left], velocity[left], sticks.xy[right], velocity[right]], axis=1)
-    found = np.einsum("nh,nhex->nex", h, ends)
-    inside = (sticks.run[left] == sticks.run[right]) & (dt <= gap_s) & (tau >= 0) & (tau <= dt)
-    nearest = np.where(tau > dt / 2, right, left)
-    at_once = np.abs(sticks.t_s[nearest] - t_s) < SAME_S
-    found = np.where(at_once[:, None, None], sticks.xy[nearest], found)
-    found[~(inside | at_once)] = np.nan
-    return found, sticks.segment[nearest]
-
-
-def _synchronise(count: int, a: Index, b: Index, gain: Array) -> Index:
-    """Signs (count,) that most evidence speaks for, 0 where it is not enough.
-
-    Args:
-        a, b, gain: (e,) by how much the signs of a and b are likelier alike than unlike; pairs may come again.
-    """
+def _synchronize(count: int, evidence: Sequence[_Evidence]) -> Index:
+    """Return the signs (count,) that agree with most evidence; 0 where it is too small."""
     from scipy.sparse import coo_array
 
+    a, b = (np.concatenate([getattr(e, name) for e in evidence]) for name in ("a", "b"))
+    gain = np.concatenate([e.gain for e in evidence])
     graph = coo_array((np.tile(gain, 2), (np.append(a, b), np.append(b, a))), (count, count)).tocsr()
     signs = _span(graph.tocoo(), count)
     for _ in range(count):
@@ -249,11 +277,11 @@ def _synchronise(count: int, a: Index, b: Index, gain: Array) -> Index:
         if agreement[worst := int(agreement.argmin())] >= 0:
             break
         signs[worst] *= -1
-    return np.where(signs * (graph @ signs) >= SURE, signs, 0).astype(np.intp)
+    return np.where(signs * (graph @ signs) >= MIN_EVIDENCE, signs, 0).astype(np.intp)
 
 
 def _span(graph: "coo_array", count: int) -> Array:
-    """Signs (count,) along the spanning trees of the surest evidence (Kruskal)."""
+    """Return signs (count,) along the maximum spanning trees of the absolute evidence (Kruskal)."""
     group = [[k] for k in range(count)]
     signs = np.ones(count)
     for e in np.argsort(-np.abs(graph.data)).tolist():

@@ -64,7 +64,7 @@ class Detect:
             roundels = detector.detect(image)
             rows = [_describe(roundel) for roundel in roundels]
             if lens is not None and self.diameter is not None:
-                _add_poses(rows, roundels, detector, lens, self.diameter)
+                _add_poses(rows, roundels, lens, self.diameter)
             self._print(path, rows)
             self._draw(image, roundels)
         return 0
@@ -114,9 +114,9 @@ def _describe(roundel: Roundel) -> dict[str, Any]:
     }
 
 
-def _add_poses(rows: list, roundels: Roundels, detector: Detector, lens: Lens, diameter_m: float) -> None:
+def _add_poses(rows: list, roundels: Roundels, lens: Lens, diameter_m: float) -> None:
     """Add `centre_u`, `centre_v` (of the likelier pose) and `poses`: None and empty where the lens has no inverse."""
-    located = locate_all(roundels, lens, diameter_m, detector.disc_offsets())
+    located = locate_all(roundels, lens, diameter_m)
     for row, both in zip(rows, located, strict=True):
         poses = both or ()
         centre = poses[0].centre_uv.tolist() if poses else (None, None)

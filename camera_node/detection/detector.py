@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The typed face of the native detector."""
+"""Detects roundels in grey images: the Python interface of the native detector."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
@@ -10,96 +11,101 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
 from camera_node.arrays import Array, Grey
-from camera_node.detection.roundels import Roundels
+from camera_node.detection.roundels import DetectedRoundels
 from camera_node.errors import ConfigError
 
 
-class Detector:
-    """Finds roundels in grey images, and keeps what it learnt from frame to frame.
-
-    Args:
-        detector: which search; "chords" looks along rows and columns at once, "paper" is that of Faigl et al.,
-            ICRA 2013, made local: the reference, a tenth as fast.
-        inner_ratios: inner over outer diameters of the prints in use.
-        ratio_tolerance: how far a measured ratio may be from one of them.
-        min_diameter_px, max_diameter_px: of the outer ellipse's major axis.
-        min_contrast: bright less dark, grey levels; less finds more in the dark, and costs time in noise.
-        search_share: of each frame that is searched for new roundels at most. What has not changed since it was
-            searched is left out for up to 15 frames; those that were in the last frame are looked for where they are
-            expected. Less bounds the cost where much changes, and finds what is new then within 1 / share frames (if
-            it is larger than 64 px and two frames share it, perhaps later).
-        mask: polygons (N, 2) of raw pixels; a roundel whose centre lies in one is left out.
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Settings of a detector that can be changed while it runs.
 
     Attributes:
-        settings: what is in force, by the names above.
+        inner_ratios: inner over outer diameters of the prints in use.
+        ratio_tolerance: largest difference between a measured ratio and that of a print.
+        min_diameter_px, max_diameter_px: limits on the major axis of the outer ellipse.
+        min_contrast: least difference of the bright and the dark level, grey levels. A lower value finds more in poor
+            light, and costs time in noisy images.
+        search_share: largest share of a frame that is searched for new roundels. Parts that do not change are
+            searched in every 16th frame only; tracked roundels are fitted at their predicted positions in any case. A
+            lower value bounds the time spent when much of the image changes: a new roundel is then found within
+            1 / share frames (possibly later if it is larger than 64 px and lies across two bands).
+        mask: polygons (N, 2) in raw pixels; roundels with their centre inside are discarded.
 
     Raises:
         ConfigError: a setting is out of its range.
     """
 
-    def __init__(
-        self,
-        *,
-        detector: Literal["chords", "paper"] = "chords",
-        inner_ratios: tuple[float, ...] = (0.6, 0.41),
-        ratio_tolerance: float = 0.08,
-        min_diameter_px: float = 8.0,
-        max_diameter_px: float = 400.0,
-        min_contrast: float = 25.0,
-        search_share: float = 1.0,
-        mask: Sequence[ArrayLike] = (),
-    ) -> None:
+    inner_ratios: tuple[float, ...] = (0.6, 0.41)
+    ratio_tolerance: float = 0.08
+    min_diameter_px: float = 8.0
+    max_diameter_px: float = 400.0
+    min_contrast: float = 25.0
+    search_share: float = 1.0
+    mask: Sequence[ArrayLike] = ()
+
+    def __post_init__(self) -> None:
+        smallest, largest = self.min_diameter_px, self.max_diameter_px
+        if not self.inner_ratios or not all(0.1 <= ratio <= 0.95 for ratio in self.inner_ratios):
+            raise ConfigError(
+                f"inner_ratios are {self.inner_ratios}; give one or more numbers in [0.1, 0.95]"
+            )
+        if not 0 < self.ratio_tolerance <= 0.5:
+            raise ConfigError(f"ratio_tolerance is {self.ratio_tolerance}; give a number in (0, 0.5]")
+        if not 6 <= smallest < largest <= 10000:
+            raise ConfigError(
+                f"min_diameter_px is {smallest} and max_diameter_px {largest}; give two rising numbers in [6, 10000]"
+            )
+        if not 5 <= self.min_contrast <= 250:
+            raise ConfigError(f"min_contrast is {self.min_contrast}; give grey levels in [5, 250]")
+        if not 0.01 <= self.search_share <= 1:
+            raise ConfigError(f"search_share is {self.search_share}; give a number in [0.01, 1]")
+
+    @property
+    def polygons(self) -> list[NDArray[np.float32]]:
+        """The mask's polygons (N, 2). Raises ConfigError for one that is not a polygon."""
+        return [_check_polygon(polygon) for polygon in self.mask]
+
+    @property
+    def limits(self) -> _core.RoundelLimits:
+        """The limits of the native detector."""
+        diameters = self.min_diameter_px, self.max_diameter_px
+        return _core.RoundelLimits(
+            list(self.inner_ratios), self.ratio_tolerance, *diameters, self.min_contrast
+        )
+
+
+class Detector:
+    """Finds roundels in a sequence of grey images and tracks them from frame to frame.
+
+    Args:
+        detector: the search method. "chords" scans all rows, columns and diagonals. "paper" is the reference: the
+            method of Faigl et al. (ICRA 2013) with local thresholds, at about a tenth of the speed.
+        settings: see `DetectorSettings`.
+
+    Attributes:
+        settings: the settings in use, by name.
+
+    Raises:
+        ConfigError: a setting is out of its range.
+    """
+
+    def __init__(self, *, detector: Literal["chords", "paper"] = "chords", **settings: Any) -> None:
         if detector not in ("chords", "paper"):
             raise ConfigError(f"there is no detector '{detector}'; choose chords or paper")
-        if not inner_ratios or not all(0.1 <= ratio <= 0.95 for ratio in inner_ratios):
-            raise ConfigError(f"inner_ratios are {inner_ratios}; give one or more numbers in [0.1, 0.95]")
-        if not 0 < ratio_tolerance <= 0.5:
-            raise ConfigError(f"ratio_tolerance is {ratio_tolerance}; give a number in (0, 0.5]")
-        if not 6 <= min_diameter_px < max_diameter_px <= 10000:
-            raise ConfigError(
-                f"diameters of {min_diameter_px} to {max_diameter_px} px; give two in rising order in [6, 10000]"
-            )
-        self._mask = [_check_polygon(polygon) for polygon in mask]
-        if not 5 <= min_contrast <= 250:
-            raise ConfigError(f"min_contrast is {min_contrast}; give grey levels in [5, 250]")
-        if not 0.01 <= search_share <= 1:
-            raise ConfigError(f"search_share is {search_share}; give a number in [0.01, 1]")
-        self._core = _core.Detector(
-            list(inner_ratios),
-            ratio_tolerance,
-            min_diameter_px,
-            max_diameter_px,
-            min_contrast,
-            search_share,
-            detector == "paper",
-        )
+        used = DetectorSettings(**settings)
         self._name: Literal["chords", "paper"] = detector
-        self._offsets, self._covariance = np.empty((0, 2)), np.empty((0, 7, 7))
-        self.settings: dict[str, Any] = {
-            "inner_ratios": tuple(inner_ratios),
-            "ratio_tolerance": ratio_tolerance,
-            "min_diameter_px": min_diameter_px,
-            "max_diameter_px": max_diameter_px,
-            "min_contrast": min_contrast,
-            "search_share": search_share,
-            "mask": tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in self._mask),
-        }
+        self._mask = used.polygons
+        self._core = _core.Detector(used.limits, used.search_share, detector == "paper")
+        mask = tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in self._mask)
+        self.settings: dict[str, Any] = {**vars(used), "inner_ratios": tuple(used.inner_ratios), "mask": mask}
 
     @property
-    def threshold(self) -> float:
-        """The paper's theta, grey levels."""
+    def threshold(self) -> float | None:
+        """The threshold theta of the "paper" detector for the next frame, grey levels; None for "chords"."""
         return self._core.theta
 
-    @property
-    def postponed(self) -> int:
-        """Places of the last frame that may hold a roundel and were left for the next frame, which begins there.
-
-        Not 0 only where a picture has hundreds of ring-like places that are not tracked: a frame's work is bounded.
-        """
-        return self._core.postponed
-
     def adjusted(self, **changes: Any) -> "Detector":
-        """One with other settings, by the names of the constructor, that carries on this one's tracks.
+        """A detector with other settings, by the names of the constructor, that continues the tracks of this one.
 
         Raises:
             ConfigError: a setting is out of its range.
@@ -108,39 +114,26 @@ class Detector:
         other._core.take_over(self._core)
         return other
 
-    def disc_offsets(self) -> tuple[Array, Array]:
-        """Of the last frame's roundels, in their order: where the discs' own centres project, from `uv`.
+    def detect(self, image: Grey) -> DetectedRoundels:
+        """Detect all roundels in a grey image.
 
-        Measured by the inner ellipse's place in the outer one.
-
-        Returns:
-            (N, 2) offsets, pixels, and (N, 7, 7) the covariance of all that tells a pose: of `uv`, of the ellipse's
-            shape xx, xy, yy (it is `uv` + A q, |q| = 1, A symmetric), and of the offset; pixels.
-        """
-        return self._offsets, self._covariance
-
-    def detect(self, image: Grey) -> Roundels:
-        """Detect all roundels of a grey image (h, w), uint8; its rows may be apart in memory.
+        Args:
+            image: (h, w), uint8; its rows may be apart in memory.
 
         Raises:
-            ValueError: the array is no such image; `camera_node.sources.grey.to_grey` converts other formats.
+            ValueError: the array is not a grey image; `camera_node.sources.grey.to_grey` converts other formats.
         """
         if image.dtype != np.uint8 or image.ndim != 2:
             raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
-        table = self._core.detect(image if image.strides[1] == 1 else np.ascontiguousarray(image))
-        table = table[[not self._is_masked(row[:2]) for row in table]] if self._mask else table
-        self._offsets, self._covariance = table[:, 7:9], _symmetric(table[:, 10:])
-        none = np.full(len(table), -1, np.int32)
-        return Roundels(
-            table[:, :2],
-            self._covariance[:, :2, :2],
-            table[:, 2:4],
-            table[:, 4],
-            table[:, 5],
-            table[:, 6],
-            none,
-            table[:, 9].astype(np.int32),
+        columns = self._core.detect(image if image.strides[1] == 1 else np.ascontiguousarray(image))
+        roundels = DetectedRoundels(
+            cov=columns["pose_cov"][:, :2, :2],
+            id=np.full(len(columns["track"]), -1, np.int32),
+            **columns,
         )
+        if not self._mask:
+            return roundels
+        return roundels.select(np.array([not self._is_masked(uv) for uv in roundels.uv], bool))
 
     def _is_masked(self, uv: Array) -> bool:
         at = (float(uv[0]), float(uv[1]))
@@ -150,13 +143,5 @@ class Detector:
 def _check_polygon(polygon: ArrayLike) -> NDArray[np.float32]:
     corners = np.asarray(polygon, np.float32)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
-        raise ConfigError("mask must be polygons of three or more [u, v], in pixels")
+        raise ConfigError("mask has a polygon without three finite [u, v]; give three or more, in pixels")
     return corners
-
-
-def _symmetric(upper: Array) -> Array:
-    """Matrices (N, 7, 7) from their upper triangles (N, 28)."""
-    full = np.empty((len(upper), 7, 7))
-    i, j = np.triu_indices(7)
-    full[:, i, j] = full[:, j, i] = upper
-    return full

@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from camera_node import _core
 from camera_node.arrays import Array
 from camera_node.detection.disc_adjustment import adjust, covariance_through, shape_of
-from camera_node.detection.roundels import Roundel, Roundels
+from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
 from camera_node.geometry.lens import Lens
 
 BOUNDARY = 24  # points of an ellipse that are undistorted
@@ -66,37 +65,39 @@ class DiscPoses:
         return first, second
 
 
-def locate(
-    roundel: Roundel,
-    lens: Lens,
-    diameter_m: float,
-    offset: tuple[ArrayLike, ArrayLike] | None = None,
-) -> tuple[DiscPose, DiscPose] | None:
-    """Both poses of one disc, the likelier first, as `locate_all` has them; None where the lens has no inverse."""
+@dataclass(frozen=True, slots=True)
+class _Offsets:
+    """Measured positions of N discs' centres: `offset_px` (N, 2) and `pose_cov` (N, 7, 7) of `DetectedRoundels`."""
+
+    offset_px: Array
+    pose_cov: Array
+
+
+def locate(roundel: Roundel, lens: Lens, diameter_m: float) -> tuple[DiscPose, DiscPose] | None:
+    """Compute both poses of one disc, as in `locate_all`; None where the lens has no inverse."""
     ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
-    offsets = None if offset is None else (np.asarray([offset[0]], float), np.asarray([offset[1]], float))
+    offsets = None
+    if roundel.offset_px is not None and roundel.pose_cov is not None:
+        offsets = _Offsets(roundel.offset_px[None], roundel.pose_cov[None])
     return _locate(ellipse, lens, diameter_m, offsets)[0]
 
 
-def locate_all(
-    roundels: Roundels,
-    lens: Lens,
-    diameter_m: float,
-    offsets: tuple[Array, Array] | None = None,
-) -> DiscPoses:
-    """Both poses of each disc of outer diameter `diameter_m`, the likelier first.
+def locate_all(roundels: Roundels, lens: Lens, diameter_m: float) -> DiscPoses:
+    """Compute both poses of each disc of outer diameter `diameter_m`, the likelier first.
 
-    The ellipse's boundary goes through the lens, point by point: that a circle's image through distortion is no
-    ellipse then costs nothing to first order. The conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et al.
+    Points of each ellipse are undistorted and a conic is fitted to them, because the image of a circle through a lens
+    with distortion is not an ellipse. Decomposing the conic gives both poses (Forsyth et al. 1991; Safaee-Rad et al.
     1992).
 
-    The outer ellipse does not tell the two poses apart. Where the disc's centre projects does: `offsets` are those from
-    the ellipses' centres (N, 2) and the covariance (N, 7, 7) of all that was measured, as `Detector.disc_offsets` gives
-    them. Both poses are then adjusted to ellipse and offset, and the probability is that of the chi-square with two
-    degrees that is left, widened by `SCATTER`. Without them all are 0.5.
+    The outer ellipse does not distinguish the two poses; the image of the disc's own centre does. For
+    `DetectedRoundels`, both poses are adjusted to the ellipse and the measured offset, and their probabilities follow
+    from the remaining chi-square with two degrees of freedom, divided by `SCATTER`. Otherwise both are 0.5.
     """
     ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
-    return _locate(ellipses, lens, diameter_m, offsets)
+    measured = isinstance(roundels, DetectedRoundels)
+    return _locate(
+        ellipses, lens, diameter_m, _Offsets(roundels.offset_px, roundels.pose_cov) if measured else None
+    )
 
 
 def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
@@ -123,42 +124,39 @@ def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) 
     return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
 
 
-def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: tuple[Array, Array] | None) -> DiscPoses:
+def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | None) -> DiscPoses:
     """Both poses of ellipses (N, 5): u, v, major, minor, angle."""
     n = len(ellipses)
     xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
-    seen = np.isfinite(xy).all(axis=(1, 2))
+    valid = np.isfinite(xy).all(axis=(1, 2))
     position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
     odds = np.full((n, 2), 0.5)
-    if seen.any():
-        Q, radius = _fit_conics(xy[seen]), diameter_m / 2
-        position[seen], normal[seen] = decompose(Q, radius)
+    if valid.any():
+        Q, radius = _fit_conics(xy[valid]), diameter_m / 2
+        position[valid], normal[valid] = decompose(Q, radius)
         if offsets is not None:
-            parts = position[seen], normal[seen], ellipses[seen], offsets[0][seen], offsets[1][seen]
-            position[seen], normal[seen], odds[seen] = _adjust(Q, radius, lens, *parts)
+            offsets = _Offsets(offsets.offset_px[valid], offsets.pose_cov[valid])
+            measured, cov = _measure(Q, lens, ellipses[valid], offsets)
+            poses = _adjust(position[valid], normal[valid], radius, measured, cov)
+            position[valid], normal[valid], odds[valid] = poses
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
-    order = np.argsort(-odds, axis=1, kind="stable")
-    pick = np.arange(n)[:, None], order
+    pick = np.arange(n)[:, None], np.argsort(-odds, axis=1, kind="stable")
     return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick])
 
 
+def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[Array, Array]:
+    """Measurements (N, 7) for `adjust`, and their covariances (N, 7, 7)."""
+    centres = lens.normalise(ellipses[:, :2] + offsets.offset_px)
+    shapes = shape_of(np.asarray(np.linalg.inv(Q), float))
+    return np.concatenate([shapes, centres], axis=1), covariance_through(lens, ellipses, offsets.pose_cov)
+
+
 def _adjust(
-    Q: Array,
-    radius: float,
-    lens: Lens,
-    position: Array,
-    normal: Array,
-    ellipses: Array,
-    offset: Array,
-    covariance: Array,
+    position: Array, normal: Array, radius: float, measured: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Positions and normals (N, 2, 3) adjusted to ellipse and offset at once, and their odds (N, 2)."""
-    centre = lens.normalise(ellipses[:, :2] + offset)
-    dual = np.asarray(np.linalg.inv(Q), float)
-    seen = np.concatenate([shape_of(dual), centre], axis=1)
-    cov = covariance_through(lens, ellipses, covariance)
-    seen, cov = np.repeat(seen, 2, axis=0), np.repeat(cov, 2, axis=0)  # of both poses
-    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, seen, cov)
+    """Adjust both poses (N, 2, 3) of each disc to its measurements; also returns their probabilities (N, 2)."""
+    measured, covariance = np.repeat(measured, 2, axis=0), np.repeat(covariance, 2, axis=0)
+    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, measured, covariance)
     return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a detector sees in one frame: columns for programs, objects for people."""
+"""The roundels of one frame: as columns for computation, as objects for display."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,15 @@ class Roundel:
     """One roundel in an image, in raw pixels.
 
     Attributes:
-        uv: (2,) centre of the outer ellipse. Where the disc's own centre projects is another point.
+        uv: (2,) centre of the outer ellipse, which is not the image of the disc's own centre.
         cov: (2, 2) covariance of `uv`, square pixels.
         axes_px: (2,) full major and minor axis of the outer ellipse.
         angle_rad: direction of the major axis from +u towards +v, in (-pi/2, pi/2].
         ratio: inner over outer diameter.
-        contrast: bright level less dark level, grey levels of 255.
+        contrast: bright minus dark, grey levels of 255.
         id: the number printed in the roundel or given by a file, or None.
-        track: a number that stays with the roundel from frame to frame, or None.
+        track: number of the roundel in all frames in which it is tracked, or None.
+        offset_px, pose_cov: as in `DetectedRoundels`; None unless a detector measured them.
     """
 
     uv: Array
@@ -33,6 +34,8 @@ class Roundel:
     contrast: float
     id: int | None = None
     track: int | None = None
+    offset_px: Array | None = None
+    pose_cov: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +43,7 @@ class Roundels:
     """All roundels of one frame, as columns of N rows. `id` and `track` are -1 where there is none.
 
     Shapes: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), angle_rad, ratio, contrast, id and track (N,).
-    What a source of detections does not know is NaN.
+    Unknown values are NaN.
     """
 
     uv: Array
@@ -54,7 +57,7 @@ class Roundels:
 
     @classmethod
     def from_points(cls, uv: Array, sigma_px: float, id: NDArray[np.int32] | None = None) -> "Roundels":
-        """Detections of which only the centre (N, 2) is known, each coordinate to `sigma_px`."""
+        """Detections with centres (N, 2) alone, each coordinate with the standard deviation `sigma_px`."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         n = len(uv)
         unknown, none = np.full(n, np.nan), np.full(n, -1, np.int32)
@@ -67,8 +70,8 @@ class Roundels:
         return len(self.uv)
 
     def select(self, rows: NDArray) -> "Roundels":
-        """The rows that a mask or an index array names."""
-        return Roundels(*(getattr(self, name)[rows] for name in self.__slots__))
+        """The rows that a mask or an index array selects."""
+        return Roundels(*(getattr(self, name)[rows] for name in Roundels.__slots__))
 
     def __getitem__(self, k: int) -> Roundel:
         number, track = int(self.id[k]), int(self.track[k])
@@ -85,3 +88,32 @@ class Roundels:
 
     def __iter__(self) -> Iterator[Roundel]:
         return (self[k] for k in range(len(self)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedRoundels(Roundels):
+    """The N roundels that a detector found in one image, with the measurements that only a fit to the image gives.
+
+    Attributes:
+        offset_px: (N, 2) vectors from the outer ellipses' centres `uv` to the images of the discs' own centres,
+            measured by the position of the inner ellipse in the outer one.
+        pose_cov: (N, 7, 7) covariance of the measurements of a pose, pixels: `uv`, the ellipse's shape as xx, xy, yy
+            of A (the ellipse is `uv` + A q, |q| = 1, A symmetric), and the offset.
+        n_postponed: positions in the image that may hold a roundel and were not fitted, because the work for a frame
+            is bounded. The next frame begins with them. It is 0 unless the image has hundreds of untracked ring-like
+            shapes.
+    """
+
+    offset_px: Array
+    pose_cov: Array
+    n_postponed: int = 0
+
+    def select(self, rows: NDArray) -> "DetectedRoundels":
+        """The rows that a mask or an index array selects."""
+        names = (*Roundels.__slots__, "offset_px", "pose_cov")
+        columns = {name: getattr(self, name)[rows] for name in names}
+        return DetectedRoundels(**columns, n_postponed=self.n_postponed)
+
+    def __getitem__(self, k: int) -> Roundel:
+        # Dataclasses with slots do not support super() without arguments.
+        return replace(Roundels.__getitem__(self, k), offset_px=self.offset_px[k], pose_cov=self.pose_cov[k])

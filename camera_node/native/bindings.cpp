@@ -1,58 +1,65 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include "detector.hpp"
-#include "table.hpp"
+#include "frame_columns.hpp"
 
 namespace nb = nanobind;
-using Grey = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
-using Table = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
+using GreyImage = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
 
-static roundel::ImageView view(const Grey& image) {
+static roundel::ImageView view(const GreyImage& image) {
     if (image.size() == 0) return {nullptr, 0, 0, 0};
     if (image.shape(1) > 1 && image.stride(1) != 1) throw nb::value_error("image rows must be contiguous");
     return {image.data(), int(image.shape(1)), int(image.shape(0)), ptrdiff_t(image.stride(0))};
 }
 
-/// One row a roundel.
-static Table table(const std::vector<roundel::Roundel>& roundels) {
-    auto* rows = new double[roundels.size() * roundel::kColumns + 1];
-    const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
-    double* to = rows;
-    for (const auto& roundel : roundels)
-        for (const double value : row_of(roundel)) *to++ = value;
-    return Table(rows, {roundels.size(), roundel::kColumns}, owner);
+/// An array of shape (rows, ...) that takes over the memory of a column.
+template <typename T>
+static nb::object array(std::vector<T>& column, size_t rows, std::initializer_list<size_t> shape = {}) {
+    auto* values = new std::vector<T>(std::move(column));
+    values->reserve(1);  // the pointer of an empty array must not be null
+    const nb::capsule owner(values, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    std::vector<size_t> full{rows};
+    full.insert(full.end(), shape);
+    return nb::cast(nb::ndarray<nb::numpy, T>(values->data(), full.size(), full.data(), owner));
+}
+
+static nb::dict detect(roundel::Detector& detector, const GreyImage& image) {
+    const auto pixels = view(image);
+    roundel::FrameResult result;
+    {
+        nb::gil_scoped_release release;
+        result = detector.detect(pixels);
+    }
+    roundel::FrameColumns columns(result.roundels);
+    const size_t n = result.roundels.size();
+    nb::dict named;
+    named["uv"] = array(columns.uv, n, {2});
+    named["axes_px"] = array(columns.axes_px, n, {2});
+    named["angle_rad"] = array(columns.angle_rad, n);
+    named["ratio"] = array(columns.ratio, n);
+    named["contrast"] = array(columns.contrast, n);
+    named["offset_px"] = array(columns.offset_px, n, {2});
+    named["pose_cov"] = array(columns.pose_cov, n, {roundel::kPoseCount, roundel::kPoseCount});
+    named["track"] = array(columns.track, n);
+    named["n_postponed"] = result.n_postponed;
+    return named;
 }
 
 NB_MODULE(_core, m) {
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
+    nb::class_<roundel::RoundelLimits>(m, "RoundelLimits")
+        .def(nb::init<std::vector<double>, double, double, double, double>(), nb::arg("inner_ratios"),
+             nb::arg("ratio_tolerance"), nb::arg("min_diameter"), nb::arg("max_diameter"),
+             nb::arg("min_contrast"));
     nb::class_<roundel::Detector>(m, "Detector")
-        .def(
-            "__init__",
-            [](roundel::Detector* self, std::vector<double> ratios, double tolerance, double min_diameter,
-               double max_diameter, double min_contrast, double share, bool by_paper) {
-                new (self) roundel::Detector({std::move(ratios), tolerance, min_diameter, max_diameter,
-                                              min_contrast, share, by_paper});
-            },
-            nb::arg("inner_ratios"), nb::arg("ratio_tolerance"), nb::arg("min_diameter"),
-            nb::arg("max_diameter"), nb::arg("min_contrast"), nb::arg("search_share"), nb::arg("by_paper"))
-        .def(
-            "detect",
-            [](roundel::Detector& self, const Grey& image) {
-                const auto pixels = view(image);
-                std::vector<roundel::Roundel> roundels;
-                {
-                    nb::gil_scoped_release release;
-                    roundels = self.detect(pixels);
-                }
-                return table(roundels);
-            },
-            nb::arg("image").noconvert())
+        .def(nb::init<roundel::RoundelLimits, double, bool>(), nb::arg("limits"), nb::arg("search_share"),
+             nb::arg("by_paper"))
+        .def("detect", &detect, nb::arg("image").noconvert())
         .def("take_over", &roundel::Detector::take_over, nb::arg("other"))
-        .def_prop_ro("theta", &roundel::Detector::theta)
-        .def_prop_ro("postponed", &roundel::Detector::postponed);
+        .def_prop_ro("theta", &roundel::Detector::theta);
 }

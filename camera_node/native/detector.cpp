@@ -3,191 +3,215 @@
 
 #include <algorithm>
 #include <cmath>
-#include <optional>
 
 #include "search/ray_fit.hpp"
-#include "verify/acceptance.hpp"
-#include "blur/moving.hpp"
 #include "verify/level_check.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr size_t kMaxRoundels = 4096;  // as many as a message may hold
-constexpr int kOverlap = 64;           // pixels that a searched band reaches into the one before
-constexpr int kFramesOfTrust = 16;     // in which what did not change is searched once
-constexpr double kMostInParts = 0.5;   // of a frame that are searched apart, not as a whole
-constexpr double kStill = 1 / 8.0;     // of the least contrast, by which a tile's mean may move
-constexpr int kMaxFits = 512;          // to new places of a frame
-constexpr size_t kMaxSmeared = 8;      // lost roundels of a frame that are looked for smeared
-constexpr int kMaxMoving = 32;         // fits of new smeared ones, of which
-constexpr int kMaxFailed = 3;          // so many may fail
-constexpr double kNoiseSpan = 9.5;     // standard deviations
+constexpr size_t kMaxRoundels = 4096;  // limit of a message
+constexpr int kMaxFits = 512;          // of seeds in a frame
+constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are searched with motion blur
+constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
+constexpr int kMaxFailures = 3;        // of which so many may fail
+
+constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
+constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
+constexpr double kMaxPartsShare = 0.5;  // of a frame: beyond it the whole frame is searched
+constexpr double kMinChange = 1 / 8.0;  // of the least contrast: change of a tile's mean
+// Noise alone spans 8 standard deviations in 10,000 pixels, and 9 in the widest tile of a frame.
+constexpr double kNoiseSpan = 9.5;
 
 }  // namespace
 
-std::vector<Roundel> Detector::detect(const ImageView& image) {
+Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
+    : limits_(std::move(limits)), search_share_(search_share), chords_(limits_), matcher_(limits_) {
+    if (by_paper) paper_.emplace();
+}
+
+Detector::FrameState::FrameState(const ImageView& view)
+    : image(view), noise(noise_level(view)), suppression(view.width, view.height) {}
+
+FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
-    found_.clear(), lost_.clear(), places_.clear(), streaks_.clear();
-    fits_ = 0;
-    if (image.width < 3 || image.height < 3) return found_;
-    noise_ = noise_level(image);
-    claims_ = Claims(image.width, image.height);
-    follow(image);
-    search(image);
-    follow_smeared(image);
-    search_smeared(image);
-    tracks_.update(found_);
-    settle();
-    update_theta();
-    return found_;
+    if (image.width < 3 || image.height < 3) return {};
+    FrameState frame(image);
+    fit_tracked(frame);
+    if (paper_)
+        search_by_paper(frame);
+    else
+        search_by_chords(frame);
+    fit_moving_tracked(frame);
+    fit_moving_streaks(frame);
+    tracks_.update(frame.found);
+    if (paper_)
+        update_theta(frame);
+    else
+        mark_searched(frame);
+    return {std::move(frame.found), n_postponed_};
 }
 
-void Detector::follow(const ImageView& image) {
-    for (const auto& expected : tracks_.expect())
-        if (!(expected.steady && accept(image, expected.start(), expected.track)) &&
-            !accept(image, fit_circles(image, expected.seed, settings_), expected.track))
-            lost_.push_back(expected);
+/// Fits the roundels of the last frame: steady ones from their last model, others by rays from their
+/// predicted positions.
+void Detector::fit_tracked(FrameState& frame) const {
+    for (const ExpectedRoundel& expected : tracks_.expect())
+        if (!(expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) &&
+            !fit_and_accept(fit_rays(frame.image, expected.seed, limits_), expected.track, frame))
+            frame.lost.push_back(expected);
 }
 
-/// Those that were in the last frame, and are not to be seen sharp in this one; the fastest, where a light
-/// that went out took all of them.
-void Detector::follow_smeared(const ImageView& image) {
-    const auto speed = [](const Tracks::Expected& e) { return std::hypot(e.vx, e.vy); };
-    const auto last = lost_.begin() + std::ptrdiff_t(std::min(lost_.size(), kMaxSmeared));
-    std::partial_sort(lost_.begin(), last, lost_.end(),
-                      [&](const auto& a, const auto& b) { return speed(a) > speed(b); });
-    for (auto expected = lost_.begin(); expected != last; ++expected) {
-        const auto is_it = [&](const Roundel& r) {
-            const double apart = std::hypot(r.fit.outer.x - double(expected->seed.x),
-                                            r.fit.outer.y - double(expected->seed.y));
-            return r.track < 0 && apart < r.fit.outer.major;
-        };
-        if (std::none_of(found_.begin(), found_.end(), is_it))
-            keep(image, follow_moving(image, *expected, settings_, noise_), expected->track);
-    }
+void Detector::search_by_chords(FrameState& frame) {
+    frame.parts = parts_to_search(frame);
+    for (const Box& part : frame.parts) search_part(part, frame);
+    fit_seeds(frame);
 }
 
-/// The rows of the image that are searched where all of it changed.
+/// The parts that changed, except for those under roundels that were found already; a band of the frame if
+/// they are too large.
+std::vector<Box> Detector::parts_to_search(const FrameState& frame) {
+    if (n_frames_ == kSearchInterval || n_postponed_) change_mask_.invalidate(), n_frames_ = 0;
+    ++n_frames_;
+    change_mask_.update(frame.image);
+    for (const TrackedFit& roundel : frame.found) change_mask_.mask(roundel.fit.outer);
+    auto parts =
+        change_mask_.changed(kMinChange * limits_.min_contrast, std::min(kMaxPartsShare, search_share_));
+    const double area = double(frame.image.width) * frame.image.height;
+    const bool whole = parts.size() == 1 && parts[0].area() == area;
+    return whole ? std::vector{next_band(frame.image)} : parts;
+}
+
+/// The rows that are searched if all of the image changed.
 Box Detector::next_band(const ImageView& image) {
-    if (settings_.search_share >= 1) return {0, 0, image.width, image.height};
+    if (search_share_ >= 1) return {0, 0, image.width, image.height};
     if (searched_to_ > 1 - 1e-9) searched_to_ = 0;
-    int top = std::max(0, int(searched_to_ * image.height) - kOverlap);
-    searched_to_ = std::min(1.0, searched_to_ + settings_.search_share);
+    const int top = std::max(0, int(searched_to_ * image.height) - kOverlap);
+    searched_to_ = std::min(1.0, searched_to_ + search_share_);
     const int bottom = std::clamp(int(std::ceil(searched_to_ * image.height)), 3, image.height);
     return {0, std::min(top, bottom - 3), image.width, bottom};
 }
 
-/// What changed and is not where a roundel was found already; a band of the frame where that is too much.
-std::vector<Box> Detector::parts_to_search(const ImageView& image) {
-    if (frames_ == kFramesOfTrust || postponed_) watch_.forget(), frames_ = 0;
-    ++frames_;
-    watch_.look(image);
-    for (const Roundel& roundel : found_) watch_.explain(roundel.fit.outer);
-    const double share = std::min(kMostInParts, settings_.search_share);
-    auto parts = watch_.changed(kStill * settings_.min_contrast, share);
-    const bool all = parts.size() == 1 && parts[0].area() == double(image.width) * image.height;
-    return all ? std::vector{next_band(image)} : parts;
+static ImageView window(const ImageView& image, const Box& part) {
+    return image.window(part.left, part.top, part.right - part.left, part.bottom - part.top);
 }
 
-/// What was searched need not be again while it stays as it is, but for where roundels are or were of late.
-void Detector::settle() {
-    if (settings_.by_paper) return;
-    for (const Roundel& roundel : found_) watch_.explain(roundel.fit.outer);
-    for (const Box& part : parts_) watch_.settle(part);
-    for (const Ellipse& lost : tracks_.lost()) watch_.doubt(lost);
+/// The contrast that a tile needs for a threshold of its own: more than noise alone makes.
+static double tile_contrast(double noise, const RoundelLimits& limits) {
+    return std::clamp(kNoiseSpan * noise, limits.min_contrast, 255.0);
 }
 
-void Detector::search(const ImageView& image) {
-    parts_ = settings_.by_paper ? std::vector{next_band(image)} : parts_to_search(image);
-    postponed_ = 0;
-    for (const Box& part : parts_) search_part(image, part);
-    fit_places(image);
+/// Collects the seeds and streaks of a part.
+void Detector::search_part(const Box& part, FrameState& frame) {
+    const ImageView view = window(frame.image, part);
+    chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
+    const float left = float(part.left), top = float(part.top);
+    for (Seed seed : chords_.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
+    for (Streak streak : chords_.streaks())
+        streak.x += left, streak.y += top, frame.streaks.push_back(streak);
 }
 
-/// Seeds and streaks are kept for later; what the paper's search finds is fitted at once.
-void Detector::search_part(const ImageView& image, const Box& part) {
-    const ImageView view = image.window(part.left, part.top, part.right - part.left, part.bottom - part.top);
-    const auto theta = uint8_t(std::lround(std::clamp(theta_.value(), 1.0, 255.0)));
-    // Ten thousand pixels that only noise tells apart span eight deviations, the widest tile of a frame nine.
-    const double contrast = std::clamp(kNoiseSpan * noise_, settings_.min_contrast, 255.0);
-    const ThresholdMap threshold = local_threshold(view, contrast, settings_.by_paper ? theta : 0);
-    if (settings_.by_paper) {
-        for (Start start : find_by_segments(view, threshold, settings_)) {
-            start.outer.y += part.top;
-            accept(image, start, -1);
-        }
-        return;
+/// Fits the seeds. If there are more than the fits allowed, the next frame begins with those that are left.
+void Detector::fit_seeds(FrameState& frame) {
+    const size_t n = frame.seeds.size(), first = size_t(begin_at_ * double(n));
+    const int most = frame.n_fits + kMaxFits;
+    size_t done = 0;
+    for (; done < n && frame.n_fits < most; ++done) {
+        const Seed& seed = frame.seeds[(first + done) % n];
+        if (frame.suppression.contains_fast(double(seed.x), double(seed.y))) continue;
+        fit_and_accept(fit_rays(frame.image, seed, limits_), -1, frame);
     }
-    chords_.run(view, threshold);
-    for (Seed seed : chords_.seeds()) {
-        seed.x += float(part.left), seed.y += float(part.top);
-        places_.push_back(seed);
-    }
-    for (Streak streak : chords_.streaks()) {
-        streak.x += float(part.left), streak.y += float(part.top);
-        streaks_.push_back(streak);
+    n_postponed_ = int(n - done);
+    begin_at_ = n_postponed_ ? double((first + done) % n) / double(n) : 0;
+}
+
+void Detector::search_by_paper(FrameState& frame) {
+    const Box part = next_band(frame.image);
+    const ImageView view = window(frame.image, part);
+    for (InitialGuess guess : paper_->find(view, tile_contrast(frame.noise, limits_), limits_)) {
+        guess.outer.y += part.top;
+        fit_and_accept(guess, -1, frame);
     }
 }
 
-/// Where there are more places than fits are allowed, the next frame begins with those that were left.
-void Detector::fit_places(const ImageView& image) {
-    const size_t n = places_.size(), first = size_t(begin_at_ * double(n));
-    const int most = fits_ + kMaxFits;
-    size_t looked_at = 0;
-    for (; looked_at < n && fits_ < most; ++looked_at) {
-        const Seed& seed = places_[(first + looked_at) % n];
-        if (claims_.cover_quickly(double(seed.x), double(seed.y))) continue;
-        accept(image, fit_circles(image, seed, settings_), -1);
-    }
-    postponed_ = int(n - looked_at);
-    begin_at_ = postponed_ ? double((first + looked_at) % n) / double(n) : 0;
-}
-
-/// What is new and smeared: the streaks that look most like it are fitted.
-void Detector::search_smeared(const ImageView& image) {
-    std::vector<SmearedStart> starts;
-    for (const Streak& streak : streaks_) {
-        if (claims_.cover_quickly(double(streak.x), double(streak.y))) continue;
-        if (const auto start = smeared_.match(image, streak)) starts.push_back(*start);
-    }
-    std::sort(starts.begin(), starts.end(), [](const auto& a, const auto& b) { return a.misfit < b.misfit; });
-    int fits = 0, failed = 0;
-    for (const auto& [start, misfit] : starts) {
-        if (failed == kMaxFailed || fits == kMaxMoving) break;
-        if (claims_.cover(start.still.outer.x, start.still.outer.y)) continue;
-        ++fits, failed += !keep(image, fit_moving(image, start, settings_, noise_), -1);
+/// Fits lost roundels with motion blur: the fastest ones, if a light that went out took many.
+void Detector::fit_moving_tracked(FrameState& frame) const {
+    const auto speed = [](const ExpectedRoundel& e) { return std::hypot(e.vx, e.vy); };
+    auto& lost = frame.lost;
+    const auto last = lost.begin() + std::ptrdiff_t(std::min(lost.size(), kMaxLost));
+    std::partial_sort(lost.begin(), last, lost.end(),
+                      [&](const auto& a, const auto& b) { return speed(a) > speed(b); });
+    for (auto expected = lost.begin(); expected != last; ++expected) {
+        const auto is_same = [&](const TrackedFit& r) {
+            const double apart = std::hypot(r.fit.outer.x - double(expected->seed.x),
+                                            r.fit.outer.y - double(expected->seed.y));
+            return r.track < 0 && apart < r.fit.outer.major;
+        };
+        if (std::any_of(frame.found.begin(), frame.found.end(), is_same)) continue;
+        const KnownRoundel known{expected->fit, expected->vx, expected->vy};
+        accept(fit_known_moving(frame.image, known, context(frame)), expected->track, frame);
     }
 }
 
-/// Fits, tests and keeps a roundel, unless it was found before; whether it is there.
-bool Detector::accept(const ImageView& image, const std::optional<Start>& start, int track) {
-    if (!start) return false;
-    if (claims_.cover(start->outer.x, start->outer.y)) return true;
-    ++fits_;
-    return keep(image, fit_roundel(image, *start, settings_, noise_, track >= 0), track);
+/// Fits new moving roundels at the streaks that match best.
+void Detector::fit_moving_streaks(FrameState& frame) const {
+    std::vector<MovingMatch> matches;
+    for (const Streak& streak : frame.streaks) {
+        if (frame.suppression.contains_fast(double(streak.x), double(streak.y))) continue;
+        if (const auto match = matcher_.match_streak(frame.image, streak)) matches.push_back(*match);
+    }
+    std::sort(matches.begin(), matches.end(),
+              [](const auto& a, const auto& b) { return a.misfit < b.misfit; });
+    int fits = 0, failures = 0;
+    for (const auto& [guess, misfit] : matches) {
+        if (failures == kMaxFailures || fits == kMaxMovingFits) break;
+        if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
+        ++fits, failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
+    }
 }
 
-bool Detector::keep(const ImageView& image, const std::optional<Fit>& fit, int track) {
-    if (!fit || found_.size() >= kMaxRoundels || claims_.cover(fit->outer.x, fit->outer.y)) return false;
-    if (is_bullseye(image, *fit)) return false;
-    claims_.add(fit->outer);
-    found_.push_back({*fit, track});
+/// Section III-B of the paper: theta follows the mean levels of the roundels.
+void Detector::update_theta(const FrameState& frame) {
+    if (frame.found.empty()) return paper_->step();
+    double dark = 0, bright = 0;
+    for (const TrackedFit& roundel : frame.found) dark += roundel.fit.dark, bright += roundel.fit.bright;
+    paper_->set_levels(dark / double(frame.found.size()), bright / double(frame.found.size()));
+}
+
+/// Marks the searched parts, except under roundels and where tracks were lost.
+void Detector::mark_searched(const FrameState& frame) {
+    for (const TrackedFit& roundel : frame.found) change_mask_.mask(roundel.fit.outer);
+    for (const Box& part : frame.parts) change_mask_.mark_searched(part);
+    for (const Ellipse& lost : tracks_.lost()) change_mask_.invalidate(lost);
+}
+
+/// Whether there is a roundel at the guess: one found before, or one that the fit accepts and adds.
+bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const {
+    if (!guess) return false;
+    if (frame.suppression.contains(guess->outer.x, guess->outer.y)) return true;
+    ++frame.n_fits;
+    return accept(fit_roundel(frame.image, *guess, context(frame), track >= 0), track, frame);
+}
+
+bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
+    if (!fit || frame.found.size() >= kMaxRoundels) return false;
+    if (frame.suppression.contains(fit->outer.x, fit->outer.y) || is_bullseye(frame.image, *fit))
+        return false;
+    frame.suppression.add(fit->outer);
+    frame.found.push_back({*fit, track});
     return true;
+}
+
+std::optional<double> Detector::theta() const {
+    const std::lock_guard lock(mutex_);
+    return paper_ ? std::optional(paper_->theta()) : std::nullopt;
 }
 
 void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
-    tracks_ = from.tracks_, theta_ = from.theta_;
-}
-
-void Detector::update_theta() {
-    if (found_.empty()) return theta_.step();
-    double dark = 0, bright = 0;
-    for (const Roundel& roundel : found_) dark += roundel.fit.dark, bright += roundel.fit.bright;
-    theta_.settle(dark / double(found_.size()), bright / double(found_.size()));
+    tracks_ = from.tracks_;
+    if (paper_ && from.paper_) paper_ = from.paper_;
 }
 
 }  // namespace roundel

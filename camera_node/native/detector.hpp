@@ -1,65 +1,87 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <mutex>
+#include <optional>
 #include <vector>
 
-#include "search/chords.hpp"
-#include "search/suppression.hpp"
+#include "blur/acceptance.hpp"
+#include "blur/matcher.hpp"
+#include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
 #include "reference/faigl2013.hpp"
-#include "search/threshold.hpp"
-#include "tracks.hpp"
 #include "search/change_mask.hpp"
+#include "search/chords.hpp"
+#include "search/suppression.hpp"
+#include "tracks.hpp"
 
 namespace roundel {
 
-/// Roundels of grey images, frame after frame: those of the last frame where they are expected, then what
-/// changed since it was searched under a local threshold, each one fitted to its grey levels. Every 16th
-/// frame all counts as changed. Calls from several threads wait for each other.
+/// The roundels of a frame.
+struct FrameResult {
+    std::vector<TrackedFit> roundels;
+    /// The number of seeds that were not fitted because a frame's work is bounded. The next frame begins with
+    /// them.
+    int n_postponed = 0;
+};
+
+/// Detects roundels in a sequence of grey images. Calls from several threads wait for each other.
+///
+/// Tracked roundels are fitted first, at their predicted positions. Then the parts of the image that changed
+/// since they were searched are searched for new ones. Every 16th frame all of the image counts as changed.
 class Detector {
   public:
-    explicit Detector(Settings settings)
-        : settings_(std::move(settings)), chords_(settings_), smeared_(settings_) {}
-    std::vector<Roundel> detect(const ImageView& image);
-    /// The paper's theta, in force for the next frame.
-    double theta() const { return theta_.value(); }
-    /// How many places of the last frame were left for the next ones, which begin with them.
-    int postponed() const { return postponed_; }
-    /// Carries on another's tracks and theta, under settings of its own.
+    /// `search_share`: share of a frame's rows that is searched at most, if all changed. `by_paper`: search
+    /// by the paper's segments instead of chords.
+    explicit Detector(RoundelLimits limits, double search_share = 1, bool by_paper = false);
+    FrameResult detect(const ImageView& image);
+    /// The threshold of the paper's search in the next frame; none with another search.
+    std::optional<double> theta() const;
+    /// Continues another detector's tracks and theta with this one's settings.
     void take_over(Detector& from);
 
   private:
-    void follow(const ImageView& image);
-    void search(const ImageView& image);
-    void follow_smeared(const ImageView& image);
-    void search_smeared(const ImageView& image);
-    void search_part(const ImageView& image, const Box& part);
-    void fit_places(const ImageView& image);
-    std::vector<Box> parts_to_search(const ImageView& image);
-    void settle();
-    bool accept(const ImageView& image, const std::optional<Start>& start, int track);
-    bool keep(const ImageView& image, const std::optional<Fit>& fit, int track);
-    Box next_band(const ImageView& image);
-    void update_theta();
+    /// The state of one frame's detection.
+    struct FrameState {
+        explicit FrameState(const ImageView& view);
+        const ImageView& image;
+        double noise;  // grey levels
+        Suppression suppression;
+        std::vector<TrackedFit> found;
+        std::vector<ExpectedRoundel> lost;
+        std::vector<Box> parts;  // of the image, that are searched
+        std::vector<Seed> seeds;
+        std::vector<Streak> streaks;
+        int n_fits = 0;
+    };
 
-    Settings settings_;
+    void fit_tracked(FrameState& frame) const;
+    void search_by_paper(FrameState& frame);
+    void search_by_chords(FrameState& frame);
+    std::vector<Box> parts_to_search(const FrameState& frame);
+    Box next_band(const ImageView& image);
+    void search_part(const Box& part, FrameState& frame);
+    void fit_seeds(FrameState& frame);
+    void fit_moving_tracked(FrameState& frame) const;
+    void fit_moving_streaks(FrameState& frame) const;
+    void update_theta(const FrameState& frame);
+    void mark_searched(const FrameState& frame);
+
+    bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
+    bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
+    AcceptanceContext context(const FrameState& frame) const { return {limits_, frame.noise}; }
+
+    RoundelLimits limits_;
+    double search_share_;
     ChordSearch chords_;
-    StreakMatcher smeared_;
-    Theta theta_;
+    MotionBlurMatcher matcher_;
+    std::optional<PaperSearch> paper_;
     Tracks tracks_;
-    Watch watch_;
-    Claims claims_{0, 0};
-    std::vector<Roundel> found_;
-    std::vector<Box> parts_;
-    std::vector<Seed> places_;
-    std::vector<Tracks::Expected> lost_;
-    std::vector<Streak> streaks_;
-    double noise_ = 0;        // grey levels
-    double searched_to_ = 0;  // share of the height
-    double begin_at_ = 0;     // share of the places to look at, where a frame had too many
-    int postponed_ = 0, fits_ = 0;
-    int frames_ = 0;  // since all counted as changed
-    std::mutex mutex_;
+    ChangeMask change_mask_;
+    double searched_to_ = 0;  // share of the height, of the bands searched in turns
+    double begin_at_ = 0;     // share of the seeds at which the next frame begins
+    int n_postponed_ = 0;     // in the last frame
+    int n_frames_ = 0;        // since all of the image counted as changed
+    mutable std::mutex mutex_;
 };
 
 }  // namespace roundel

@@ -8,14 +8,14 @@ namespace roundel {
 
 namespace {
 
-constexpr int kPatience = 30;      // frames that a lost track keeps its number
-constexpr int kNumbers = 1 << 30;  // numbers begin anew after these
-constexpr double kSteady = 0.3;    // pixels off its expected place: a fit's step converges from there
+constexpr int kMaxMissed = 30;     // frames after which a lost track is deleted
+constexpr int kNumbers = 1 << 30;  // numbers restart at 0 after these
+constexpr double kSteady = 0.3;  // pixels from the predicted position: one step of a fit converges from there
 
 }  // namespace
 
-std::vector<Tracks::Expected> Tracks::expect() const {
-    std::vector<Expected> expected;
+std::vector<ExpectedRoundel> Tracks::expect() const {
+    std::vector<ExpectedRoundel> expected;
     for (const Track& t : tracks_) {
         if (t.missed) continue;
         const auto x = float(t.fit.outer.x + t.vx), y = float(t.fit.outer.y + t.vy);
@@ -33,46 +33,46 @@ std::vector<Ellipse> Tracks::lost() const {
     return lost;
 }
 
-Start Tracks::Expected::start() const {
-    Start start{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise};
-    start.outer.x += vx, start.outer.y += vy;
-    (*start.model)[kX] += vx, (*start.model)[kY] += vy;
-    return start;
+InitialGuess ExpectedRoundel::guess() const {
+    InitialGuess guess{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise};
+    guess.outer.x += vx, guess.outer.y += vy;
+    (*guess.model)[kX] += vx, (*guess.model)[kY] += vy;
+    return guess;
 }
 
-/// How far from where a track is expected a roundel is seen, pixels.
-double Tracks::off(const Track& t, const Fit& fit) {
+/// The distance of a roundel from a track's predicted position, pixels.
+double Tracks::distance(const Track& t, const RoundelFit& fit) {
     return std::hypot(t.fit.outer.x + t.vx - fit.outer.x, t.fit.outer.y + t.vy - fit.outer.y);
 }
 
-/// The free track that is expected nearest to a roundel, within a diameter.
-const Tracks::Track* Tracks::nearest(const Fit& fit, const std::vector<bool>& taken) const {
+/// The nearest of the tracks that are not taken, within a diameter.
+const Tracks::Track* Tracks::nearest(const RoundelFit& fit, const std::vector<bool>& taken) const {
     const Track* best = nullptr;
     double least = fit.outer.major;
     for (size_t k = 0; k < tracks_.size(); ++k) {
         const Track& t = tracks_[k];
         if (taken[k]) continue;
-        const double apart = off(t, fit);
+        const double apart = distance(t, fit);
         if (apart < least) least = apart, best = &t;
     }
     return best;
 }
 
-void Tracks::update(std::vector<Roundel>& found) {
+void Tracks::update(std::vector<TrackedFit>& found) {
     std::vector<bool> taken(tracks_.size(), false);
     std::vector<Track> now;
-    const auto continue_track = [&](Roundel& roundel, const Track& t) {
+    const auto continue_track = [&](TrackedFit& roundel, const Track& t) {
         taken[size_t(&t - tracks_.data())] = true;
         roundel.track = t.number;
         const double frames = t.missed + 1;
         now.push_back({t.number, roundel.fit, (roundel.fit.outer.x - t.fit.outer.x) / frames,
                        (roundel.fit.outer.y - t.fit.outer.y) / frames, 0,
-                       roundel.fit.plain && off(t, roundel.fit) < kSteady});
+                       roundel.fit.unoccluded && distance(t, roundel.fit) < kSteady});
     };
-    for (Roundel& roundel : found)
+    for (TrackedFit& roundel : found)
         for (const Track& t : tracks_)
             if (roundel.track >= 0 && t.number == roundel.track) continue_track(roundel, t);
-    for (Roundel& roundel : found) {
+    for (TrackedFit& roundel : found) {
         if (roundel.track >= 0) continue;
         if (const Track* t = nearest(roundel.fit, taken)) {
             continue_track(roundel, *t);
@@ -82,11 +82,10 @@ void Tracks::update(std::vector<Roundel>& found) {
         }
     }
     for (size_t k = 0; k < tracks_.size(); ++k)
-        if (!taken[k] && tracks_[k].missed < kPatience) {
+        if (!taken[k] && tracks_[k].missed < kMaxMissed) {
             now.push_back(tracks_[k]);
             now.back().missed += 1;
-            now.back().vx = now.back().vy =
-                0;  // where it went is not known: it is looked for where it was last
+            now.back().vx = now.back().vy = 0;  // unknown: a lost roundel is expected where it was last seen
         }
     tracks_.swap(now);
 }

@@ -2,47 +2,49 @@
 #pragma once
 #include <vector>
 
-#include "search/chords.hpp"
 #include "fit/photometric_fit.hpp"
+#include "search/chords.hpp"
 
 namespace roundel {
 
-/// A roundel of a frame; its number stays with it from frame to frame.
-struct Roundel {
-    Fit fit;
+/// A roundel of a frame and the number of its track.
+struct TrackedFit {
+    RoundelFit fit;
     int track;
 };
 
-/// Roundels of the frames before, each expected where its last motion takes it.
+/// A roundel of the last frame, predicted by its last velocity.
+struct ExpectedRoundel {
+    Seed seed;  // at the predicted position
+    int track;
+    RoundelFit fit;  // of the last frame
+    double vx, vy;   // pixels per frame
+    bool steady;     // was at its predicted position and unoccluded
+    /// The last frame's model, moved to the predicted position.
+    InitialGuess guess() const;
+};
+
+/// Tracks of roundels in the image, with constant velocity.
 class Tracks {
   public:
-    /// Where to look for those that the last frame showed, and their numbers. A lost one is not looked for.
-    struct Expected {
-        Seed seed;
-        int track;
-        Fit fit;        // of the last frame
-        double vx, vy;  // pixels a frame
-        bool steady;    // was where it was expected, and all of it was seen
-        /// The last frame's model, moved to where it is expected.
-        Start start() const;
-    };
-    std::vector<Expected> expect() const;
-    /// Where those were seen last that keep their numbers and were not found.
+    /// The roundels of the last frame. Lost ones are not predicted.
+    std::vector<ExpectedRoundel> expect() const;
+    /// The last ellipses of lost tracks that are not deleted yet.
     std::vector<Ellipse> lost() const;
-    /// Takes the roundels of a frame. Those without a number (below 0) get that of a track that is expected
-    /// within a diameter, the nearest first, or a new one. A lost track keeps its number for a while.
-    void update(std::vector<Roundel>& found);
+    /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that
+    /// is predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
+    void update(std::vector<TrackedFit>& found);
 
   private:
     struct Track {
         int number;
-        Fit fit;
-        double vx, vy;  // pixels a frame
+        RoundelFit fit;
+        double vx, vy;  // pixels per frame
         int missed;     // frames
         bool steady;
     };
-    static double off(const Track& track, const Fit& fit);
-    const Track* nearest(const Fit& fit, const std::vector<bool>& taken) const;
+    static double distance(const Track& track, const RoundelFit& fit);
+    const Track* nearest(const RoundelFit& fit, const std::vector<bool>& taken) const;
 
     std::vector<Track> tracks_;
     int next_ = 0;

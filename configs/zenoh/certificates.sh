@@ -1,11 +1,11 @@
 #!/bin/sh
 # SPDX-License-Identifier: BSD-3-Clause
-# An authority of your own and what it signs, for server.json5 and member.json5:
+# Creates a certificate authority and the certificates for server.json5 and member.json5:
 #   sh certificates.sh FOLDER HOST [NAME...]
-# HOST is how the others reach the server, a name or an IPv4 address. Each NAME is a role: camera, viewer or operator
-# (these three unless given). Run again with the same FOLDER, it keeps the authority and adds what is missing.
-# FOLDER/server/tls goes to the server, FOLDER/camera/tls to the cameras' machines, and so on; FOLDER/authority.key stays
-# with you: whoever has it lets anybody in.
+# HOST is the server's name or IPv4 address, as clients use it. Each NAME is a role: camera, viewer or operator (by
+# default all three). A second run with the same FOLDER uses the same authority and adds missing certificates.
+# Copy FOLDER/server/tls to the server, FOLDER/camera/tls to the cameras' machines, and so on. Do not distribute
+# FOLDER/authority.key: it can sign certificates for any role.
 set -eu
 [ $# -ge 2 ] || { echo "use: sh certificates.sh FOLDER HOST [camera|viewer|operator...]" >&2; exit 2; }
 folder=$1 host=$2
@@ -23,7 +23,7 @@ case $host in
 *) names="IP:$host" ;;
 esac
 
-sign() { # NAME EXTENSIONS: the name in the certificate is what server.json5 gives rights to
+sign() { # NAME EXTENSIONS: server.json5 grants rights by the name in the certificate
     [ ! -f "$1/tls/member.pem" ] || return 0
     mkdir -p "$1/tls"
     openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj "/CN=$1" \

@@ -12,7 +12,7 @@ from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
 from fusion.model.states import POSITION, THETA, States
 from fusion.protocol.messages import ShardPoses, TrackingState
-from fusion.protocol.shards import Shard, states_of, told_of
+from fusion.protocol.shards import Shard, shard_poses_of, states_of
 from fusion.tracking.gating import START_S, START_SIGMAS
 
 MAX_COAST_S = 30.0  # limit of the prediction interval, and so of the growth of the covariance
@@ -132,7 +132,9 @@ class TrackTable:
         """The poses of this shard's robots for the other shards; valid after the first frame set."""
         assert self.t_ns is not None
         known = np.array([status is not None for status in self.status], bool)
-        return told_of(self.names, self.t_ns, self.states, self.status, np.flatnonzero(known & self.owned))
+        return shard_poses_of(
+            self.names, self.t_ns, self.states, self.status, np.flatnonzero(known & self.owned)
+        )
 
     def receive(self, poses: ShardPoses) -> None:
         """Queue another shard's poses; `apply_received` takes them."""

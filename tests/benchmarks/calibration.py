@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How well and how fast a wand places cameras: `python -m tests.benchmarks.calibration [ROW ...]`.
+"""Accuracy and speed of the wand calibration: `python -m tests.benchmarks.calibration [ROW ...]`.
 
-Simulated waves (`tests.calib.wave`), and the real recordings of ../shared/data where they lie beside the checkout.
-Times are processor seconds, and in brackets as multiples of a Cholesky factorisation of 1500 x 1500 in the same run.
+Rows are simulated recordings (`tests.calib.recordings`), and the real recordings of ../shared/data if they are beside
+the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the
+same run.
 """
 
 import sys
@@ -19,13 +20,13 @@ from rich.table import Table
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations
+from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
-from tests.calib.wave import Recorded, Wave, record
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SQUARE_M = 0.054
@@ -34,31 +35,33 @@ T = TypeVar("T")
 
 
 def reference_s() -> float:
-    """Processor seconds of the unit in which times are also given."""
+    """Processor seconds of the Cholesky factorization, the unit of relative times."""
     A = np.random.default_rng(0).standard_normal((1500, 1500))
     A = A @ A.T + 1500 * np.eye(1500)
     return min(timed(lambda: np.linalg.cholesky(A))[1] for _ in range(3))
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What `work` returns, and its processor seconds."""
+    """The result of `work`, and its processor seconds."""
     start = time.process_time()
     result = work()
     return result, time.process_time() - start
 
 
 def simulated(
-    wave: Wave, goal_s: float, lenses: Callable[[Recorded], Rig] = lambda recorded: recorded.intrinsics
+    scenario: WandScenario,
+    goal_s: float,
+    lenses: Callable[[SimulatedRecording], Rig] = lambda recorded: recorded.intrinsics,
 ) -> tuple[list[Row], float]:
-    """Errors against the truth, given its lenses or others; offsets against their mean, as nothing observes what all
-    clocks share."""
-    recorded = record(wave)
-    result, cost = timed(lambda: calibrate(lenses(recorded), wave.wand, recorded.messages))
+    """Errors against the truth, with true or other lenses; of offsets against their mean, because the offset that all
+    clocks share is unobservable."""
+    recorded = record(scenario)
+    result, cost = timed(lambda: calibrate(lenses(recorded), scenario.wand, recorded.messages))
     placed = list(result.rig.placed())
     shift, turn = camera_errors(result.rig, recorded.truth)
     squared, degrees = joint_error(result, recorded.truth)
     rows = [
-        ("cameras placed", f"{len(placed)}", f"{wave.cameras}"),
+        ("cameras placed", f"{len(placed)}", f"{scenario.cameras}"),
         ("centres, mm RMS", f"{1e3 * np.sqrt((shift**2).mean()):.3f}", "<= 1"),
         ("rotations, degrees RMS", f"{np.degrees(np.sqrt((turn**2).mean())):.4f}", "<= 0.02"),
         ("time offsets, ms RMS", f"{offset_error(result, recorded):.3f}", "<= 0.3"),
@@ -68,7 +71,7 @@ def simulated(
     return rows, cost
 
 
-def offset_error(result: WandCalibration, recorded: Recorded) -> float:
+def offset_error(result: WandCalibration, recorded: SimulatedRecording) -> float:
     """RMS error of the time offsets, ms."""
     cameras = result.rig.placed()
     error = np.array(
@@ -78,7 +81,7 @@ def offset_error(result: WandCalibration, recorded: Recorded) -> float:
 
 
 def waved_led() -> tuple[list[Row], float]:
-    """A real light, one point a frame."""
+    """A real LED, one marker."""
     rig, messages = recording(DATA / "waved_led" / "observations.csv")
     result, cost = timed(lambda: calibrate(rig, Body(diameter_m=0.1), messages))
     adjusted = result.adjusted
@@ -93,7 +96,7 @@ def waved_led() -> tuple[list[Row], float]:
 
 
 def webcams_wand() -> tuple[list[Row], float]:
-    """Two corners of a real board as a wand; then all corners, triangulated, against the board."""
+    """Two corners of a real board as a wand; then distances of all triangulated corners against the board."""
     rig, messages = recording(DATA / "webcams" / "wand_observations.csv")
     length = SQUARE_M * np.hypot(2, 3)
     wand = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (float(length), 0.0, 0.0)))
@@ -109,7 +112,7 @@ def webcams_wand() -> tuple[list[Row], float]:
 
 
 def webcams_board() -> tuple[list[Row], float]:
-    """The same board, all its corners, as a wand of twelve markers."""
+    """All corners of the same board as a wand of twelve markers."""
     rig, messages = recording(DATA / "webcams" / "corners_observations.csv")
     result, cost = timed(lambda: calibrate(rig, Body(diameter_m=0.05, markers=board_corners()), messages))
     adjusted = result.adjusted
@@ -130,7 +133,11 @@ def board_corners() -> tuple[tuple[float, float, float], ...]:
 
 
 def recording(path: Path) -> tuple[Rig, list[Detections]]:
-    """Lenses and observations; `FileNotFoundError` where they are not beside the checkout."""
+    """Lenses and observations.
+
+    Raises:
+        FileNotFoundError: the recording is not beside the checkout.
+    """
     if not path.exists():
         raise FileNotFoundError(path)
     rig = load_rig(path.parent / "cameras.yaml")
@@ -138,20 +145,20 @@ def recording(path: Path) -> tuple[Rig, list[Detections]]:
 
 
 def corner_errors(rig: Rig, messages: list[Detections], step_s: float = 0.17) -> Array:
-    """Distances between corners that were triangulated at the same moment, less what they are; metres.
+    """Errors of the distances between corners that are triangulated at the same time, metres.
 
-    Moments are the frames of every camera, once in `step_s`; the other cameras' corners are interpolated between two
-    frames, each at its own corrected time.
+    Corners are triangulated at the time of one frame in each `step_s`; the other cameras' corners are interpolated
+    between two frames, at their corrected times.
     """
     tracks = {name: _tracks(camera, name, messages) for name, camera in rig.placed().items()}
     times = np.unique(np.concatenate([t for track in tracks.values() for t, _ in track.values()]))
-    moments = times[np.diff(times // step_s, prepend=-1) > 0]
+    sampled = times[np.diff(times // step_s, prepend=-1) > 0]
     board, errors = np.array(board_corners()), []
-    for moment in moments:
+    for t_s in sampled:
         found = {
             corner: point
             for corner in range(12)
-            if (point := _triangulate(rig, tracks, corner, moment, 2 * step_s)) is not None
+            if (point := _triangulate(rig, tracks, corner, t_s, 2 * step_s)) is not None
         }
         errors += [
             np.linalg.norm(found[a] - found[b]) - np.linalg.norm(board[a] - board[b])
@@ -173,16 +180,16 @@ def _tracks(camera: Camera, name: str, messages: list[Detections]):
     return {corner: (table[:, 0], camera.normalise(table[:, 1:])) for corner, table in tables.items()}
 
 
-def _triangulate(rig: Rig, tracks, corner: int, moment: float, gap_s: float) -> Array | None:
+def _triangulate(rig: Rig, tracks, corner: int, t_s: float, gap_s: float) -> Array | None:
     centres, rays = [], []
     for name, track in tracks.items():
         if corner not in track:
             continue
         t, xy = track[corner]
-        k = int(np.searchsorted(t, moment, side="right"))
+        k = int(np.searchsorted(t, t_s, side="right"))
         if not 0 < k < len(t) or t[k] - t[k - 1] > gap_s:
             continue
-        share = (moment - t[k - 1]) / (t[k] - t[k - 1])
+        share = (t_s - t[k - 1]) / (t[k] - t[k - 1])
         T = rig.cameras[name].matrix()
         centres.append(T[:3, 3])
         rays.append(T[:3, :3] @ np.append((1 - share) * xy[k - 1] + share * xy[k], 1.0))
@@ -196,14 +203,18 @@ def _intersect(centres: Array, rays: Array) -> Array:
 
 
 ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
-    "simulated-8": lambda: simulated(Wave(cameras=8), 5),
-    "simulated-16": lambda: simulated(Wave(cameras=16), 10),
-    "lenses-as-told": lambda: simulated(
-        Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, CAREFUL, told=True)
+    "simulated-8": lambda: simulated(WandScenario(cameras=8), 5),
+    "simulated-16": lambda: simulated(WandScenario(cameras=16), 10),
+    "lenses-as-calibrated": lambda: simulated(
+        WandScenario(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, CAREFUL, with_sigma=True)
     ),
-    "lenses-0.4-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, OLD)),
-    "lenses-2-%": lambda: simulated(Wave(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, SHEET)),
-    "simulated-numbered": lambda: simulated(Wave(cameras=8, numbered=True, sized=False, seed=1), 5),
+    "lenses-0.4-%": lambda: simulated(
+        WandScenario(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, OLD)
+    ),
+    "lenses-2-%": lambda: simulated(
+        WandScenario(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, SHEET)
+    ),
+    "simulated-numbered": lambda: simulated(WandScenario(cameras=8, numbered=True, sized=False, seed=1), 5),
     "waved-led": waved_led,
     "webcams-wand": webcams_wand,
     "webcams-board": webcams_board,
@@ -211,9 +222,9 @@ ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
 
 
 def main(names: list[str]) -> None:
-    """Print what was measured beside its goal."""
+    """Print the measured figures beside their goals."""
     console, unit = Console(), reference_s()
-    table = Table("what", "figure", "measured", "goal")
+    table = Table("row", "figure", "measured", "goal")
     for name in names or ROWS:
         try:
             rows, cost = ROWS[name]()
@@ -221,8 +232,8 @@ def main(names: list[str]) -> None:
             console.print(f"{name}: {missing} is absent")
             continue
         for figure, measured, goal in rows:
-            told = f"{measured} ({cost / unit:.0f})" if figure == "seconds" else measured
-            table.add_row(name, figure, told, goal)
+            value = f"{measured} ({cost / unit:.0f})" if figure == "seconds" else measured
+            table.add_row(name, figure, value, goal)
         table.add_section()
     console.print(table)
 

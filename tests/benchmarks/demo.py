@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The demo beside other work: by how much stamps are off, and what poses that gives.
+"""The demo under load: errors of the frames' timestamps, and of the poses.
 
 `python -m tests.benchmarks.demo [--browser] [--loops 3] [--apart] [--runs 5]`. All programs are real and share one
-clock, so that a stamp should be the middle of its exposure to the nanosecond; what it is off is its node's doing.
+clock, so an exact timestamp equals the middle of the simulated exposure; any difference is an error of the node.
 """
 
 import contextlib
@@ -23,22 +23,26 @@ import zenoh
 
 from camera_node.protocol.messages import CameraStatus, Detections, decode
 from camera_node.simulation.scene import Scene
-from tests.conftest import free_port, wait_for_port
-from tests.web.test_view import CHROMIUM, FLAGS
+from tests.conftest import free_port
+from tests.waiting import wait_for_port
+from tests.web.browser import CHROMIUM, FLAGS
 from web.demo import Demo, default_scene
-from web.processes import Processes, ended_by_signals
+from web.demo_server import ANY_PORT, start_server
+from web.processes import Processes, interrupt_on_signals
 
 BUSY = "while True: pass"
-STAYS = "--remote-debugging-port=0"  # until it is stopped
+STAY_OPEN = "--remote-debugging-port=0"
 
 
-class Stamps:
-    """What stamps of a demo's frames are off, microseconds, and what the cameras claim of it."""
+class TimestampErrors:
+    """Errors of the timestamps of a demo's frames, microseconds, and the bounds that the cameras report."""
 
     def __init__(self, demo: Demo) -> None:
-        self._scene, self._epoch_ns = demo.scene, demo.epoch_ns
-        self._frames: list[tuple[str, int, float]] = []  # camera, exposure, microseconds off
-        self._claimed: list[float] = []
+        self._scene, self._epoch_ns = demo.scene, demo.clock.epoch_ns
+        self._frames: list[
+            tuple[str, int, float]
+        ] = []  # camera, index of the exposure, error in microseconds
+        self._bounds: list[float] = []
         keys = demo.feed.keys
         self._subscribers = [
             demo.session.declare_subscriber(keys.detections(), self._take_frame),
@@ -56,40 +60,41 @@ class Stamps:
     def _take_status(self, sample: zenoh.Sample) -> None:
         message = decode(sample.payload.to_bytes(), CameraStatus)
         if message.clock_error_ms is not None:
-            self._claimed.append(1e3 * message.clock_error_ms)
+            self._bounds.append(1e3 * message.clock_error_ms)
 
-    def summarise(self) -> str:
-        """RMS and worst while the wand is waved and after, exposures that are missing, and the bound as it was told."""
+    def summarize(self) -> str:
+        """RMS and largest error with the wand and with the robots, missing frames, and the reported bounds."""
         parts, wave_s = [], self._scene.wave_s
-        for what, begin_s, end_s in (("wave", 0.0, wave_s), ("robots", wave_s, np.inf)):
-            off, missing = self._during(begin_s, end_s)
-            rms, worst = np.sqrt(np.mean(np.square(off))), np.abs(off).max()
-            parts.append(f"{what} {rms:.0f} RMS {worst:.0f} max us, {missing:.0%} of frames missing")
-        median, worst = np.percentile(self._claimed, [50, 100])
-        return f"stamps: {'; '.join(parts)}; bound {median:.0f} median {worst:.0f} max us"
+        for step, begin_s, end_s in (("wand", 0.0, wave_s), ("robots", wave_s, np.inf)):
+            errors, missing = self._between(begin_s, end_s)
+            rms, worst = np.sqrt(np.mean(np.square(errors))), np.abs(errors).max()
+            parts.append(f"{step} {rms:.0f} RMS {worst:.0f} max us, {missing:.0%} of frames missing")
+        median, worst = np.percentile(self._bounds, [50, 100])
+        return f"timestamps: {'; '.join(parts)}; bound {median:.0f} median {worst:.0f} max us"
 
-    def _during(self, begin_s: float, end_s: float) -> tuple[np.ndarray, float]:
-        off: list[float] = []
-        due = 0
+    def _between(self, begin_s: float, end_s: float) -> tuple[np.ndarray, float]:
+        """Errors between two scene times, and the share of missing frames."""
+        errors: list[float] = []
+        expected = 0
         for name in self._scene.cameras:
             fps = self._scene.camera(name).fps
-            mine = {i: us for camera, i, us in self._frames if camera == name and begin_s <= i / fps < end_s}
-            off += mine.values()
-            due += max(mine) - min(mine) + 1
-        return np.array(off), 1 - len(off) / due
+            own = {i: us for camera, i, us in self._frames if camera == name and begin_s <= i / fps < end_s}
+            errors += own.values()
+            expected += max(own) - min(own) + 1
+        return np.array(errors), 1 - len(errors) / expected
 
 
 def main(
     loops: int = 0, browser: bool = False, apart: bool = False, runs: int = 5, seconds: float = 10.0
 ) -> None:
-    """Print a line a run, then how far robots were off in all of them.
+    """Print one line per run, then the position errors of the robots over all runs.
 
     Args:
-        loops: programs that are busy all the while.
-        browser: whether a browser shows the page.
-        apart: programs are not told that they share a clock, and estimate it as on machines of their own.
-        runs: of the demo.
-        seconds: that robots are followed in each.
+        loops: number of busy programs beside the demo.
+        browser: open the page in a browser.
+        apart: hide from the programs that they share a clock, so that they estimate the offset.
+        runs: number of runs.
+        seconds: duration of the tracking in each run.
     """
     if browser and CHROMIUM is None:
         sys.exit("chromium is not installed")
@@ -97,41 +102,40 @@ def main(
         os.environ["PYTHONPATH"] = str(Path(__file__).parent / "apart")
     errors: list[float] = []
     for run in range(runs):
-        # In a process of its own, as a demo times how long its own took to come up.
-        with ended_by_signals(), busy(loops), get_context("spawn").Pool(1) as process:
-            told, stamps = process.apply(play, (browser, seconds))
-        mm = [float(text) for text in re.findall(r"position ([0-9.]+|nan) mm RMS", told)]
+        with interrupt_on_signals(), busy(loops), get_context("spawn").Pool(1) as process:
+            text, timestamps = process.apply(play, (browser, seconds))
+        mm = [float(text) for text in re.findall(r"position ([0-9.]+|nan) mm RMS", text)]
         errors += mm
-        placed = re.search(r"([0-9.]+) mm from their true places", told)
-        widened = re.search(r"taken ([0-9.]+) times as large", told)
-        drifts = re.search(r"clocks drift apart, in ppm: (.*)", told)
+        cameras = re.search(r"position errors up to ([0-9.]+) mm", text)
+        inflated = re.search(r"inflated by ([0-9.]+)", text)
+        drifts = re.search(r"clock drift, ppm: (.*)", text)
         print(
-            f"{run + 1}: robots {' '.join(f'{x:.2f}' for x in mm)} mm RMS; cameras {placed and placed[1]} mm; "
-            f"widened {widened[1] if widened else 'no'}; drifts {drifts[1] if drifts else 'none'}; {stamps}",
+            f"{run + 1}: robots {' '.join(f'{x:.2f}' for x in mm)} mm RMS; cameras {cameras and cameras[1]} mm; "
+            f"inflated {inflated[1] if inflated else 'no'}; drifts {drifts[1] if drifts else 'none'}; {timestamps}",
             flush=True,
         )
-    print(f"robots off: median {np.median(errors):.2f}, most {max(errors):.2f} mm RMS")
+    print(f"position error: median {np.median(errors):.2f}, max {max(errors):.2f} mm RMS")
 
 
 def play(browser: bool, seconds: float) -> tuple[str, str]:
-    """One demo: what it and its calibration said, and what its stamps were off."""
-    path, said, port = default_scene(), io.StringIO(), free_port()
+    """Run the demo once; return its output with the log of its calibration, and the summary of its timestamps."""
+    path, output, port = default_scene(), io.StringIO(), free_port()
     with (
-        ended_by_signals(),
+        interrupt_on_signals(),
         tempfile.TemporaryDirectory() as folder,
         Processes(Path(folder)) as processes,
     ):
-        demo = Demo(Scene.load(path), path.parent, processes, f"tcp/127.0.0.1:{free_port()}")
-        stamps = Stamps(demo)
-        with contextlib.redirect_stdout(said), browsing(port) if browser else contextlib.nullcontext():
-            demo.play(("127.0.0.1", port) if browser else None, seconds)
-        told = said.getvalue() + (Path(folder) / "calib.log").read_text()
-        return told, stamps.summarise()
+        server = start_server(processes, path.parent / "arena.yaml", ANY_PORT)
+        demo = Demo(Scene.load(path), path.parent, processes, server)
+        errors = TimestampErrors(demo)
+        with contextlib.redirect_stdout(output), browsing(port) if browser else contextlib.nullcontext():
+            demo.run(("127.0.0.1", port) if browser else None, seconds)
+        return output.getvalue() + (Path(folder) / "calib.log").read_text(), errors.summarize()
 
 
 @contextlib.contextmanager
 def busy(loops: int) -> Iterator[None]:
-    """Other work of the machine."""
+    """Run busy programs."""
     programs = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(loops)]
     try:
         yield
@@ -141,11 +145,11 @@ def busy(loops: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def browsing(port: int) -> Iterator[None]:
-    """A browser on the page, as soon as it is served."""
+    """Open the page in a browser as soon as it is served."""
     programs: list[subprocess.Popen] = []
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         assert CHROMIUM is not None
-        options = ["--headless=new", "--no-first-run", "--window-size=1000,700", STAYS]
+        options = ["--headless=new", "--no-first-run", "--window-size=1000,700", STAY_OPEN]
         command = [CHROMIUM, *FLAGS, *options, f"--user-data-dir={profile}", f"http://127.0.0.1:{port}"]
 
         def open_page() -> None:

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A synthetic arena: cameras in a ring, a wand on a smooth path, and what an ideal detector would say of it."""
+"""A synthetic arena: a ring of cameras, a wand on a smooth path, and the detections of an ideal detector."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig
-from calib.wand.outcome import WandCalibration
-from calib.wand.quality.agreement import Placed, compare
+from calib.wand.quality.agreement import CameraPoses, compare_calibrations
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
@@ -18,13 +19,13 @@ from camera_node.protocol.messages import Detections
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
-# How far off lenses are, 1 sigma: part of the focal length, pixels of the centre, k1.
+# Standard deviations of lens errors: relative focal length, principal point in pixels, k1.
 EXACT, CAREFUL, OLD, SHEET = (0.0, 0.0, 0.0), (6e-4, 0.5, 5e-4), (4e-3, 2.0, 5e-3), (0.02, 10.0, 0.03)
 
 
 @dataclass(frozen=True)
 class Arena:
-    """A rig whose poses are the truth, and a wand before it."""
+    """The true rig, and a wand that moves in front of it."""
 
     truth: Rig
     wand: Body = WAND
@@ -32,12 +33,12 @@ class Arena:
 
     @property
     def intrinsics(self) -> Rig:
-        """The rig as a calibration starts: without poses."""
+        """The rig before a wand calibration: without poses."""
         bare = {n: msgspec.structs.replace(c, T_world_cam=None) for n, c in self.truth.cameras.items()}
         return Rig(cameras=bare)
 
     def wand_pose(self, t_s: float) -> Array:
-        """T_world_wand (4, 4): a Lissajous path of about a metre and a tumbling stick."""
+        """Return T_world_wand (4, 4): a Lissajous path of about a metre, with rotation about all axes."""
         w = self.speed * t_s
         T = np.eye(4)
         T[:3, :3] = rotation_from_vector([0.7 * np.sin(0.9 * w), 0.6 * np.cos(1.1 * w), 0.8 * w])
@@ -45,8 +46,13 @@ class Arena:
         return T
 
     def see(self, name: str, t_ns: int, sized: bool = True) -> tuple[Array, Array, Array, Mask]:
-        """Centres (M, 2), full axes (M, 2), angles (M,), and which are in the image of an eye that sees through the
-        wand (both sides of a roundel are printed). Centres are those of ellipses if `sized`, else the discs' own."""
+        """Project the markers into a camera; both sides of the wand are visible.
+
+        Returns:
+            uv: (M, 2) centres of the ellipses if `sized`, else of the discs.
+            axes, angle: (M, 2) full axes and (M,) angles of the ellipses.
+            visible: (M,) whether the marker is inside of the image and large enough.
+        """
         camera = self.truth.cameras[name]
         T = invert(camera.matrix()) @ self.wand_pose(t_ns * 1e-9)
         points = transform(T, self.wand.points)
@@ -58,10 +64,10 @@ class Arena:
 
 
 def outlines(camera: Camera, points: Array, normals: Array, radius: float) -> tuple[Array, Array, Array]:
-    """Ellipses of discs: centres (n, 2), full axes (n, 2) and angles (n,), raw pixels.
+    """Return ellipses of discs: centres (n, 2), full axes (n, 2) and angles (n,), raw pixels.
 
-    The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane, whose
-    last column is the ellipse's centre (Hartley and Zisserman, section 8.3); the lens is linear across so small a disc.
+    The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane; its
+    last column is the centre of the ellipse (Hartley and Zisserman, section 8.3). The lens is linear across the disc.
     """
     dual = points[:, :, None] * points[:, None] - radius**2 * (
         np.eye(3) - normals[:, :, None] * normals[:, None]
@@ -78,7 +84,7 @@ def outlines(camera: Camera, points: Array, normals: Array, radius: float) -> tu
 
 
 def ring(cameras: int = 4, **options) -> Arena:
-    """Cameras with distorted lenses on a ring of 2.6 m radius, 2.4 m high, looking at the middle."""
+    """Build an arena: cameras with distorted lenses on a ring of 2.6 m radius, 2.4 m high, that look at its middle."""
     rng = np.random.default_rng(5)
     entries = {}
     for k in range(cameras):
@@ -97,48 +103,51 @@ def ring(cameras: int = 4, **options) -> Arena:
     return Arena(Rig(cameras=entries), **options)
 
 
-def record(
-    arena: Arena,
-    seconds: float = 10.0,
-    sigma_px: float = 0.0,
-    seed: int = 0,
-    free_running: bool = True,
-    numbered: bool = False,
-    sized: bool = True,
-    outliers: float = 0.0,
-    clutter: int = 0,
-    missing: float = 0.0,
-    period_ns: int = PERIOD_NS,
-) -> list[Detections]:
-    """What the cameras see: `outliers` is a share of gross errors, `clutter` the number of false roundels a frame."""
-    rng = np.random.default_rng(seed)
+@dataclass(frozen=True, kw_only=True)
+class DetectorOptions:
+    """Options of `record`: the noise of centres, the share of gross errors, of missing markers, and the number of false
+    roundels per frame; with marker numbers if `numbered`, with axes if `sized`."""
+
+    sigma_px: float = 0.0
+    seed: int = 0
+    free_running: bool = True
+    numbered: bool = False
+    sized: bool = True
+    outliers: float = 0.0
+    clutter: int = 0
+    missing: float = 0.0
+    period_ns: int = PERIOD_NS
+
+
+def record(arena: Arena, seconds: float = 10.0, **options: Any) -> list[Detections]:
+    """Record the wand with all cameras; see `DetectorOptions`."""
+    chosen = DetectorOptions(**options)
+    rng, period_ns = np.random.default_rng(chosen.seed), chosen.period_ns
     messages = []
     for k, (name, camera) in enumerate(arena.truth.cameras.items()):
-        phase = k * period_ns // (3 * len(arena.truth.cameras)) if free_running else 0
+        phase = k * period_ns // (3 * len(arena.truth.cameras)) if chosen.free_running else 0
+        header = {"camera": name, "width": camera.width, "height": camera.height}
         for seq in range(int(seconds * 1e9 / period_ns)):
             t_ns = seq * period_ns + phase
-            uv, axes, angles, seen = arena.see(name, t_ns, sized)
-            seen &= rng.random(len(uv)) >= missing
-            rows = rng.permutation(np.flatnonzero(seen))
-            uv = uv[rows] + sigma_px * rng.standard_normal((len(rows), 2))
-            gross = rng.random(len(rows)) < outliers
-            uv[gross] += rng.uniform(-60, 60, (int(gross.sum()), 2))
-            columns = Roundels.from_points(
-                uv, max(sigma_px, 0.02), rows.astype(np.int32) if numbered else None
-            )
-            if sized:
-                columns = _with_sizes(columns, axes[rows], angles[rows])
-            if clutter:
-                columns = _add_clutter(columns, clutter, rng)
-            header = {
-                "camera": name,
-                "seq": seq,
-                "t_ns": t_ns,
-                "width": camera.width,
-                "height": camera.height,
-            }
-            messages.append(Detections.pack(columns, **header))
+            roundels = _detect(arena, name, t_ns, chosen, rng)
+            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
     return messages
+
+
+def _detect(
+    arena: Arena, name: str, t_ns: int, options: DetectorOptions, rng: np.random.Generator
+) -> Roundels:
+    uv, axes, angles, seen = arena.see(name, t_ns, options.sized)
+    seen &= rng.random(len(uv)) >= options.missing
+    rows = rng.permutation(np.flatnonzero(seen))
+    uv = uv[rows] + options.sigma_px * rng.standard_normal((len(rows), 2))
+    gross = rng.random(len(rows)) < options.outliers
+    uv[gross] += rng.uniform(-60, 60, (int(gross.sum()), 2))
+    numbers = rows.astype(np.int32) if options.numbered else None
+    roundels = Roundels.from_points(uv, max(options.sigma_px, 0.02), numbers)
+    if options.sized:
+        roundels = _with_sizes(roundels, axes[rows], angles[rows])
+    return _add_clutter(roundels, options.clutter, rng) if options.clutter else roundels
 
 
 def _with_sizes(roundels: Roundels, axes: Array, angles: Array) -> Roundels:
@@ -155,35 +164,35 @@ def _add_clutter(roundels: Roundels, count: int, rng: np.random.Generator) -> Ro
     return Roundels(*(np.concatenate([getattr(roundels, n), getattr(false, n)]) for n in Roundels.__slots__))
 
 
-def roughly(rig: Rig, off: tuple[float, float, float], told: bool = False, seed: int = 0) -> Rig:
-    """The rig with lenses that are off by so much (1 sigma: part of the focal length, pixels of the centre, k1), and
-    say so if `told`; otherwise they have no figures."""
+def roughly(rig: Rig, off: tuple[float, float, float], with_sigma: bool = False, seed: int = 0) -> Rig:
+    """Return the rig with random lens errors of the standard deviations `off`: relative focal length, principal point
+    in pixels, and k1. The lenses state these if `with_sigma`, else no standard deviations."""
     rng, cameras, (focal, centre_px, k1) = np.random.default_rng(seed), {}, off
     for name, camera in rig.cameras.items():
         change = rng.standard_normal(4) * [focal, centre_px, centre_px, k1]
         parameters = np.array(camera.parameters)
         parameters[:2] *= np.exp(change[0])
         parameters[2:5] += change[1:]
-        sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1) if told else None
+        sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1) if with_sigma else None
         cameras[name] = msgspec.structs.replace(camera.with_parameters(parameters), lens_sigma=sigma)
     return Rig(cameras=cameras)
 
 
 def errors(found: Rig, truth: Rig) -> tuple[float, float]:
-    """Largest error of a camera's position, m, and orientation, rad, after the best rigid motion of the world."""
+    """Return the largest position error, m, and orientation error, rad, after the best rigid motion of the world."""
     shift, turn = camera_errors(found, truth)
     return float(shift.max()), float(turn.max())
 
 
 def assert_near(found: Rig, truth: Rig, metres: float, radians: float) -> None:
-    """Every camera is where it should be, and turned as it should be."""
+    """Assert that no camera's position or orientation error exceeds a limit."""
     shift, turn = errors(found, truth)
     assert shift < metres
     assert turn < radians
 
 
 def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
-    """Errors of positions, m, and orientations, rad, by camera, after the best rigid motion of the world."""
+    """Return position errors, m, and orientation errors, rad, by camera, after the best rigid motion of the world."""
     names = list(found.placed())
     A = np.array([found.cameras[n].matrix() for n in names])
     B = np.array([truth.cameras[n].matrix() for n in names])
@@ -197,13 +206,31 @@ def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
 
 
 def joint_error(result: WandCalibration, truth: Rig) -> tuple[float, int]:
-    """Squared Mahalanobis error of all poses together, and its degrees of freedom: the choice of the world, which no
-    covariance speaks of, is projected out, and its scale, where a distance that is exact carries it."""
+    """Return the squared Mahalanobis error of all poses, and its degrees of freedom, without the gauge: the world
+    frame, and the scale if an exact distance fixes it."""
     there = np.array([truth.cameras[n].matrix() for n in result.names])
     poses = np.array([result.rig.cameras[n].matrix() for n in result.names])
     metric = result.adjusted.problem.fixed_distance is None
-    told = compare(
-        Placed(result.names, poses, result.covariance, metric=metric),
-        Placed(result.names, there, np.zeros_like(result.covariance)),
+    agreement = compare_calibrations(
+        CameraPoses(result.names, poses, result.covariance, metric=metric),
+        CameraPoses(result.names, there, np.zeros_like(result.covariance)),
     )
-    return told.chi2, told.degrees
+    return agreement.chi2, agreement.degrees
+
+
+def random_covariance(cameras: int, rng: np.random.Generator) -> Array:
+    """Return a (6C, 6C) covariance of poses with common and independent errors of 0.1 to 1 mm and mrad."""
+    A = rng.standard_normal((6 * cameras, 6 * cameras)) / np.sqrt(6 * cameras)
+    return (A @ A.T + 0.05 * np.eye(6 * cameras)) * 0.5e-6
+
+
+def disturb(cameras: Array, off: Array, rng: np.random.Generator) -> Array:
+    """Return cameras (C, 4, 4) rotated and shifted by `off` (6C,) in their own frames, in a random world frame."""
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = rotation_from_vector(rng.uniform(-2, 2, 3)), rng.uniform(-3, 3, 3)
+    out = []
+    for T, xi in zip(cameras, off.reshape(-1, 6), strict=True):
+        D = np.eye(4)
+        D[:3, :3], D[:3, 3] = rotation_from_vector(xi[:3]), xi[3:]
+        out.append(world @ T @ D)
+    return np.array(out)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Fixtures: Zenoh routers and clients on loopback, and waiting with a deadline."""
+"""Fixtures: Zenoh routers and clients on loopback, and waiting."""
 
-import threading
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -11,35 +9,7 @@ import zenoh
 from camera_node.errors import NetworkError
 from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port
-
-DEADLINE_S = 15.0  # enough for a loaded machine; only a failing test waits this long
-
-
-class Inbox:
-    """Collects the arguments of a Zenoh callback, and waits for them."""
-
-    def __init__(self) -> None:
-        self.items: list = []
-        self._changed = threading.Condition()
-
-    def put(self, item: object) -> None:
-        with self._changed:
-            self.items.append(item)
-            self._changed.notify_all()
-
-    def until(self, happened: Callable[[list], object]) -> bool:
-        """Wait until `happened(items)` is true; return False after the deadline."""
-        with self._changed:
-            return bool(self._changed.wait_for(lambda: happened(self.items), DEADLINE_S))
-
-
-def eventually(happened: Callable[[], object], act: Callable[[], object] = lambda: None) -> bool:
-    """Call `act` every 10 ms until `happened()` is true; return False after the deadline."""
-    pause, end = threading.Event(), time.monotonic() + DEADLINE_S
-    while not happened() and time.monotonic() < end:
-        act()
-        pause.wait(0.01)
-    return bool(happened())
+from tests.waiting import Inbox, poll
 
 
 class Network:
@@ -83,7 +53,7 @@ def network() -> Iterator[Network]:
 
 @pytest.fixture(name="eventually")
 def _eventually() -> Callable[..., bool]:
-    return eventually
+    return poll
 
 
 @pytest.fixture

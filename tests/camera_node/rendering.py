@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Images of roundels for the detector's tests, by brute force: every pixel is cut into 8 x 8 and each piece looked up
-on the printed sheet, then blurred. Nothing is shared with the detector's own model of an edge."""
+"""Renders images of roundels for tests: 8 x 8 samples per pixel are looked up on the printed sheet, then blurred.
+
+The renderer is independent of the detector's model of an edge."""
 
 from dataclasses import dataclass
 
@@ -15,9 +16,13 @@ FINE = 8
 
 @dataclass(frozen=True)
 class Disc:
-    """A printed roundel before a pinhole camera of focal length `f` whose axis meets pixel `centre`.
+    """A printed roundel in front of a pinhole camera of focal length `f`.
 
-    `tilt` turns it about the axis `turn` in the image, both in radians; `diameter` is seen in pixels when frontal.
+    Attributes:
+        uv: pixel of the image of the disc's centre.
+        diameter: of the frontal disc, pixels.
+        tilt: angle between the normal and the optical axis, radians; `turn` is its direction in the image.
+        ratio: inner over outer diameter; `card` is that of the card over the outer one.
     """
 
     uv: tuple[float, float]
@@ -35,9 +40,9 @@ class Disc:
 
 
 def _radius_squared(disc: Disc, u: Array, v: Array, principal: Array) -> Array:
-    """Squared distance on the printed plane from the disc's centre, in outer radii, of what pixels (u, v) see."""
+    """Squared distance from the disc's centre, in outer radii, of the points of its plane at pixels (u, v)."""
     rays = np.stack([u - principal[0], v - principal[1], np.full(u.shape, disc.f)], axis=-1) / disc.f
-    centre = np.array([*(np.array(disc.uv) - principal) / disc.f, 1.0])  # one unit before the camera
+    centre = np.array([*(np.array(disc.uv) - principal) / disc.f, 1.0])  # at a depth of 1
     depth = (centre @ disc.normal) / (rays @ disc.normal)
     offset = depth[..., None] * rays - centre
     return (offset**2).sum(axis=-1) / (disc.diameter / disc.f / 2) ** 2

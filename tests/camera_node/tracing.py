@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Images of one roundel by brute force through any lens, smooth enough to be differentiated numerically.
+"""Ray-traced images of one roundel through any lens, smooth enough for numerical derivatives.
 
-Every pixel is cut into pieces; the ray of each piece meets the printed plane at some radius, and an edge's part of a
-piece falls linearly over the piece. No ellipse and no model of a blurred edge stands in here, so it can judge both.
+Each pixel is divided into samples. The ray of a sample meets the printed plane at some radius, and the coverage of an
+edge falls linearly over one sample. The ray tracer uses neither ellipses nor a model of blurred edges, so it is a
+reference for both.
 """
 
 from dataclasses import dataclass, replace
@@ -16,15 +17,15 @@ from camera_node.geometry.lens import Lens
 
 @dataclass(frozen=True)
 class Sight:
-    """A roundel before a camera, and its light.
+    """A roundel in front of a camera, and its grey levels.
 
     Attributes:
-        uv: raw pixel where the disc's own centre projects.
+        uv: raw pixel of the image of the disc's centre.
         distance_m: of the disc's centre from the camera, along the optical axis.
         diameter_m: d_o; `ratio` is d_i / d_o, `card` d / d_o.
         tilt: between the printed side's normal and the line of sight, radians; `turn` its direction.
-        dark, bright, ground: grey levels; the card lies on the ground.
-        blur: standard deviation of the Gaussian that the lens spreads a point by, pixels; a pixel's own width adds.
+        dark, bright, ground: grey levels; the ground surrounds the card.
+        blur: standard deviation of the lens's Gaussian point spread, pixels, without the pixel's own width.
     """
 
     lens: Lens
@@ -55,13 +56,13 @@ class Sight:
         ]
 
     def with_normal(self, normal: Array) -> "Sight":
-        """The same with another normal (3,), of any length."""
+        """The same roundel with another normal (3,) of any length."""
         x, y, z = self._axes @ normal
         return replace(self, tilt=float(np.arctan2(np.hypot(x, y), -z)), turn=float(np.arctan2(y, x)))
 
     @property
     def _axes(self) -> Array:
-        """Rows: two directions across the line of sight, the first level with the image's rows, and the line."""
+        """Rows: two directions perpendicular to the line of sight, the first parallel to the rows, and the line."""
         line = self.position / np.linalg.norm(self.position)
         down = np.cross(line, [1.0, 0.0, 0.0])
         down /= np.linalg.norm(down)
@@ -74,7 +75,7 @@ def pixels_across(lens: Lens, diameter_m: float, px: float) -> float:
 
 
 def trace(sight: Sight, pieces: int = 6) -> Array:
-    """Grey levels (h, w) of the whole image of `sight.lens`, without noise; each pixel is cut into pieces squared."""
+    """Grey levels (h, w) of the image of `sight.lens`, without noise, from `pieces` squared samples per pixel."""
     margin = int(np.ceil(4 * sight.blur)) + 1
     radius = _trace_radius(sight, margin, pieces)
     card, black, white = (_part(radius, r) for r in (sight.card, 1.0, sight.ratio))
@@ -87,7 +88,7 @@ def trace(sight: Sight, pieces: int = 6) -> Array:
 
 
 def _trace_radius(sight: Sight, margin: int, pieces: int) -> Array:
-    """Distance from the disc's centre, in outer radii, of what each piece sees; one piece more on every side."""
+    """Distance from the disc's centre, in outer radii, at each sample, with one more sample on every side."""
     lens = sight.lens
     u, v = (_pieces(n, margin, pieces) for n in (lens.width, lens.height))
     if lens.distortion:
@@ -105,7 +106,7 @@ def _pieces(n: int, margin: int, pieces: int) -> Array:
 
 
 def _part(radius: Array, edge: float) -> Array:
-    """What part of each piece lies within an edge: it falls from 1 to 0 over one piece along the steeper axis."""
+    """The coverage of each sample by the disc inside of an edge: it falls from 1 to 0 over one sample."""
     across = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2])
     down = np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
     return np.clip(0.5 + (edge - radius[1:-1, 1:-1]) / (np.maximum(across, down) / 2 + 1e-12), 0, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Children are watched, their faults are told, and none is left behind."""
+"""Child processes are watched, their failures are reported, and all of them are stopped at the end."""
 
 import os
 import signal
@@ -11,16 +11,16 @@ import psutil
 import pytest
 
 from tests.conftest import free_port
-from tests.web.conftest import wait_for
+from tests.waiting import wait_for
 from web.errors import WebError
-from web.processes import Processes, ProgramFailed, ended_by_signals
+from web.processes import Processes, ProgramFailed, interrupt_on_signals
 
-# Small modules that stand for the programs of an arena: they are run as `python -m NAME`.
+# Small modules in place of the programs of an arena, run as `python -m NAME`.
 PROGRAMS = {
     "lasting": "import threading; print('up', flush=True); threading.Event().wait()",
     "stubborn": "import signal, threading; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); "
     "threading.Event().wait()",
-    "mendable": "import sys; print('error: robots.yaml: no such key', file=sys.stderr); sys.exit(2)",
+    "invalid": "import sys; print('error: robots.yaml: no such key', file=sys.stderr); sys.exit(2)",
     "crashing": "raise ValueError('odd')",
     "done": "pass",
 }
@@ -28,19 +28,15 @@ PROGRAMS = {
 
 @pytest.fixture
 def processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Processes:
-    """Nothing started yet; the modules above can be."""
+    """No process yet; it can start the modules above."""
     for name, text in PROGRAMS.items():
         (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return Processes(tmp_path)
 
 
-def ended(processes: Processes, name: str) -> bool:
-    return processes.finished(name)
-
-
-def test_leaving_stops_everything(processes: Processes, monkeypatch: pytest.MonkeyPatch):
-    """Those that end when asked, and those that don't."""
+def test_leaving_the_block_stops_all_processes(processes: Processes, monkeypatch: pytest.MonkeyPatch):
+    """Both a process that ends at SIGTERM and one that ignores it."""
     monkeypatch.setattr("web.processes.GRACE_S", 0.3)
     with processes:
         for name in ("lasting", "stubborn"):
@@ -48,45 +44,43 @@ def test_leaving_stops_everything(processes: Processes, monkeypatch: pytest.Monk
             wait_for(lambda name=name: (processes.folder / f"{name}.log").read_text() == "up\n")
         processes.check()
         pids = processes.pids()
-        assert processes.processor_seconds() > 0
+        assert processes.measure() > 0
         assert processes.peak_bytes > 10e6
     assert len(pids) == 2
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
-def test_what_a_person_can_mend_is_passed_on(processes: Processes):
-    """A child's own line becomes ours."""
+def test_a_fault_that_the_user_can_correct_is_passed_on(processes: Processes):
+    """The message of the child becomes the message of the error."""
     with processes:
-        processes.start("fusion", "mendable", [])
+        processes.start("fusion", "invalid", [])
         with pytest.raises(WebError, match=r"^fusion: robots.yaml: no such key$"):
-            wait_for(lambda: ended(processes, "fusion"))
+            wait_for(lambda: processes.finished("fusion"))
 
 
-def test_a_crash_is_told_with_its_last_lines(processes: Processes):
-    """And with the place of its log."""
+def test_a_crash_quotes_the_log(processes: Processes):
+    """With the exit code and the path of the log."""
     with processes:
         processes.start("cam0", "crashing", [])
-        with pytest.raises(
-            ProgramFailed, match=r"cam0 stopped with code 1; its log is .*cam0.log\n(.*\n)*.*odd"
-        ):
-            wait_for(lambda: ended(processes, "cam0"))
+        with pytest.raises(ProgramFailed, match=r"cam0.* 1; .*cam0.log\n(.*\n)*.*odd"):
+            wait_for(lambda: processes.finished("cam0"))
 
 
-def test_an_end_that_was_not_expected_is_a_failure(processes: Processes):
-    """A camera that ends well has failed; a calibration that does has not."""
+def test_an_unexpected_end_is_a_failure(processes: Processes):
+    """A camera that ends with exit code 0 has failed; a calibration has not."""
     with processes:
         processes.start("calib", "done", [])
-        wait_for(lambda: ended(processes, "calib"))
+        wait_for(lambda: processes.finished("calib"))
         processes.check("calib")
-        with pytest.raises(ProgramFailed, match="stopped with code 0"):
+        with pytest.raises(ProgramFailed, match="calib stopped with code 0"):
             processes.check()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_signals_leave_in_order(number: signal.Signals):
-    """Each becomes KeyboardInterrupt, and the handlers of before are put back."""
+def test_signals_raise_keyboard_interrupt(number: signal.Signals):
+    """And the previous handlers are restored."""
     before = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt), ended_by_signals():
+    with pytest.raises(KeyboardInterrupt), interrupt_on_signals():
         os.kill(os.getpid(), number)
     assert signal.getsignal(number) == before
 
@@ -96,16 +90,16 @@ def run_web(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_faults_of_the_command_line_are_one_line(tmp_path: Path):
+def test_a_missing_scene_is_one_line(tmp_path: Path):
     """Exit code 2 and one line that names the file."""
     result = run_web("--demo", "--headless", "--scene", str(tmp_path / "none.yaml"))
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
-    assert "none.yaml does not exist" in result.stderr
+    assert "none.yaml" in result.stderr
 
 
 def test_the_status_line_needs_no_server():
-    """Without one it says so, and ends by itself."""
+    """Without a server it says so, and ends after the given time."""
     result = run_web("--headless", "--seconds", "1.5", "--connect", f"tcp/127.0.0.1:{free_port()}")
     assert result.returncode == 0
-    assert result.stdout.splitlines()[0].startswith("no server answers yet | no camera")
+    assert result.stdout.splitlines()[0].startswith("no server found yet | no camera")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A recording is told as it was: at its pace, from any moment, with what was in force then."""
+"""A recording is played with its timing, from any position, with the calibration that was in use there."""
 
 import threading
 from collections.abc import Iterator
@@ -11,10 +11,11 @@ import pytest
 from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
 from tests.conftest import free_port
-from tests.web.conftest import Said, four_cameras, wait_for
-from web.__main__ import Options, replay
+from tests.waiting import wait_for
+from tests.web.arena import ArenaMessages, four_cameras
+from web.__main__ import Options, show_recording
+from web.controls import ReplayControls
 from web.feed import Feed
-from web.playback import ReplayControls
 from web.replay import RecordingPlayer
 from web.tables import tabulate_robots
 from web.view import View
@@ -23,8 +24,8 @@ HZ, SECONDS = 10, 20
 START_NS = 1_700_000_000 * 10**9
 
 
-class Recorded(Said):
-    """Into a recording, at the moment `now_s` of it."""
+class RecordedArena(ArenaMessages):
+    """Writes the messages to a recording at the time `now_s`."""
 
     def __init__(self, writer: RecordingWriter) -> None:
         self.writer, self.now_s = writer, 0.0
@@ -35,117 +36,129 @@ class Recorded(Said):
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """A robot that drives along x at 1 m/s for 20 s; a rig at the start, and another with three cameras after 10 s."""
+    """A robot that drives along x at 1 m/s for 20 s; a rig at the start, and after 10 s one with three cameras."""
     path = tmp_path / "arena.mcap"
     with RecordingWriter(path) as writer:
-        said, rig = Recorded(writer), four_cameras()
-        said.rig(rig)
+        arena, rig = RecordedArena(writer), four_cameras()
+        arena.rig(rig)
         for k in range(HZ * SECONDS + 1):
-            said.now_s = k / HZ
-            said.pose("rover", (said.now_s, 0.0, 0.0))
+            arena.now_s = k / HZ
+            arena.pose("rover", (arena.now_s, 0.0, 0.0))
             if k % HZ == 0:
-                said.status()
-            if said.now_s == 10.0:
-                said.rig(type(rig)(cameras={n: c for n, c in rig.cameras.items() if n != "west"}))
+                arena.status()
+            if arena.now_s == 10.0:
+                arena.rig(type(rig)(cameras={n: c for n, c in rig.cameras.items() if n != "west"}))
     return path
 
 
 @contextmanager
-def told(recording: Path) -> Iterator[tuple[RecordingPlayer, Feed]]:
-    replay, stop = RecordingPlayer(recording), threading.Event()
-    feed = Feed(replay.arena, clock=replay.seconds)
-    thread = threading.Thread(target=replay.run, args=(feed, stop))
+def playing(recording: Path) -> Iterator[tuple[RecordingPlayer, Feed]]:
+    player, stop = RecordingPlayer(recording), threading.Event()
+    feed = Feed(player.arena, clock=player.seconds)
+    thread = threading.Thread(target=player.run, args=(feed, stop))
     thread.start()
     try:
-        yield replay, feed
+        yield player, feed
     finally:
         stop.set()
         thread.join()
 
 
-def place(feed: Feed) -> float:
-    """Where the robot is, m; by the recording that is the moment of its last pose."""
-    poses = feed.latest().poses
+def position(feed: Feed) -> float:
+    """The robot's x, m, which equals the time of its pose in the recording, s."""
+    poses = feed.state().poses
     return poses["rover"].message.position[0] if poses else -1.0
 
 
-def test_a_recording_is_told_at_its_pace_or_faster(recording: Path):
-    """What is known never runs ahead of the clock, and is behind it by no more than what was not told yet."""
-    with told(recording) as (replay, feed):
-        assert (replay.arena, round(replay.duration_s, 6)) == ("test", SECONDS)
-        replay.set_speed(8.0)
-        wait_for(lambda: place(feed) >= 2.0)
-        assert place(feed) <= replay.seconds() < SECONDS
-        wait_for(lambda: place(feed) == SECONDS)
-        assert not replay.playing
-        assert replay.seconds() == replay.duration_s
-        replay.play()  # anew
-        wait_for(lambda: 0.0 <= place(feed) < SECONDS)
+def test_a_recording_plays_at_its_own_speed_or_faster(recording: Path):
+    """The feed is never ahead of the clock."""
+    with playing(recording) as (player, feed):
+        assert (player.arena, round(player.duration_s, 6)) == ("test", SECONDS)
+        player.set_speed(8.0)
+        wait_for(lambda: position(feed) >= 2.0)
+        assert position(feed) <= player.seconds() < SECONDS
+        wait_for(lambda: position(feed) == SECONDS)
+        assert not player.playing
+        assert player.seconds() == player.duration_s
+        player.play()  # from the beginning
+        wait_for(lambda: 0.0 <= position(feed) < SECONDS)
 
 
-@pytest.mark.parametrize(("moment", "placed"), [(15.0, 3), (5.0, 4), (0.0, 4), (99.0, 3)])
-def test_any_moment_can_be_jumped_to(recording: Path, moment: float, placed: int):
-    """Paused there, everything is as it was: the last pose, the rig then in force, and nobody grows old."""
-    with told(recording) as (replay, feed):
-        replay.play(False)
-        replay.seek(12.0)
-        wait_for(lambda: place(feed) == 12.0)
-        replay.seek(moment)
-        wait_for(lambda: place(feed) == min(moment, SECONDS) and feed.latest().rig)
-        latest = feed.latest()
-        assert latest.rig is not None
-        assert len(latest.rig.placed()) == placed
-        assert latest.now == feed.latest().now == min(moment, replay.duration_s)
-        assert tabulate_robots(latest).rows[0].cells[1] == "tracked"
-        assert latest.server_alive
-        assert not latest.faults
+@pytest.mark.parametrize(("seconds", "calibrated"), [(15.0, 3), (5.0, 4), (0.0, 4), (99.0, 3)])
+def test_a_jump_restores_the_state(recording: Path, seconds: float, calibrated: int):
+    """While paused: the latest pose and rig at that position, and no message becomes too old."""
+    with playing(recording) as (player, feed):
+        player.play(False)
+        player.seek(12.0)
+        wait_for(lambda: position(feed) == 12.0)
+        player.seek(seconds)
+        wait_for(lambda: position(feed) == min(seconds, SECONDS) and feed.state().rig)
+        state = feed.state()
+        assert state.rig is not None
+        assert len(state.rig.placed()) == calibrated
+        assert state.now_s == feed.state().now_s == min(seconds, player.duration_s)
+        assert tabulate_robots(state).rows[0].cells[1] == "tracked"
+        assert state.server_alive
+        assert not state.faults
 
 
-def test_a_recording_that_was_cut_off_is_told_to_its_end(recording: Path, tmp_path: Path):
-    """And that it was cut off is told too."""
+def test_a_truncated_recording_plays_to_its_end(recording: Path, tmp_path: Path):
+    """And counts a fault."""
     short = tmp_path / "short.mcap"
     short.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
-    with told(short) as (replay, feed):
-        replay.play(False)
-        replay.seek(SECONDS)
-        wait_for(lambda: place(feed) > 0)
-        assert 1 < replay.duration_s < SECONDS
-        assert feed.latest().faults["end: the recording was cut off"] == 1
+    with playing(short) as (player, feed):
+        player.play(False)
+        player.seek(SECONDS)
+        wait_for(lambda: position(feed) > 0)
+        assert 1 < player.duration_s < SECONDS
+        assert list(feed.state().faults.values()) == [1]
 
 
-def test_without_a_page_it_ends_with_the_recording(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-):
-    """One line a second, the last of them on the recording's end."""
+def test_other_keys_in_a_recording_are_ignored(tmp_path: Path):
+    """Keys that the feed does not decode, and text that is not a Zenoh key."""
+    path = tmp_path / "mixed.mcap"
+    with RecordingWriter(path) as writer:
+        arena = RecordedArena(writer)
+        for key in ("weather", "", "test//pose", "test/robot/a/b/pose", "test/camera/north/#"):
+            arena.put(key, b"other data")
+        arena.pose("rover", (0.5, 0.0, 0.0))
+    with playing(path) as (_, feed):
+        wait_for(lambda: position(feed) == 0.5)
+        assert not feed.state().faults
+
+
+def test_without_a_page_it_ends_with_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """It prints one line per second; the last one shows the end of the recording."""
     with RecordingWriter(tmp_path / "short.mcap") as writer:
-        Recorded(writer).pose("rover", (0.5, 0.0, 0.0))
-    replay(tmp_path / "short.mcap", Options(headless=True), threading.Event())
+        RecordedArena(writer).pose("rover", (0.5, 0.0, 0.0))
+    show_recording(tmp_path / "short.mcap", Options(headless=True), threading.Event())
     assert "rover tracked at +0.50 +0.00 +0.00" in capsys.readouterr().out.splitlines()[-1]
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"none.mcap can't be read: No such file.*check the path"):
+def test_an_invalid_recording_is_an_error(tmp_path: Path):
+    """The message names the file: a missing one, one that is not MCAP, and one without an arena."""
+    with pytest.raises(ConfigError, match=r"none\.mcap"):
         RecordingPlayer(tmp_path / "none.mcap")
-    (tmp_path / "text.mcap").write_text("no recording")
-    with pytest.raises(ConfigError, match="is no MCAP recording"):
+    (tmp_path / "text.mcap").write_text("not a recording")
+    with pytest.raises(ConfigError, match=r"text\.mcap"):
         RecordingPlayer(tmp_path / "text.mcap")
     with RecordingWriter(tmp_path / "other.mcap") as writer:
         writer.put("weather", b"rain", START_NS)
-    with pytest.raises(ConfigError, match="holds no arena; record with"):
+    with pytest.raises(ConfigError, match=r"other\.mcap.*python -m fusion record"):
         RecordingPlayer(tmp_path / "other.mcap")
 
 
-def test_the_page_has_controls_that_follow_the_recording(recording: Path):
-    """The slider stands at the moment, the button says what it would do."""
-    with told(recording) as (replay, feed):
+def test_the_controls_follow_the_recording(recording: Path):
+    """The slider shows the position, the button its action."""
+    with playing(recording) as (player, feed):
         view = View(feed, port=free_port())
-        controls = ReplayControls(view.server, replay)
+        controls = ReplayControls(view.server, player)
         view.add(controls)
-        replay.play(False)
-        replay.seek(7.5)
-        wait_for(lambda: place(feed) == 7.5)
+        player.play(False)
+        player.seek(7.5)
+        wait_for(lambda: position(feed) == 7.5)
         view.update()
-        assert controls._moment.value == 7.5
+        assert controls._position.value == 7.5
         assert controls._button.label == "Play"
-        assert replay.seconds() == 7.5, "the page's own update is no jump"
+        assert player.seconds() == 7.5, "an update of the page is not a jump"
         view.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What panel and status line say."""
+"""The panel's tables, the status line, coverage pictures and trails."""
 
 import time
 from dataclasses import replace
@@ -9,38 +9,46 @@ import numpy as np
 
 from camera_node.protocol.messages import CameraStatus
 from fusion.protocol.messages import CameraHealth, FusionStatus
-from tests.web.conftest import Played, wait_for
-from web.coverage import Coverage, montage
-from web.feed import Feed, Latest, Seen
+from tests.waiting import wait_for
+from tests.web.arena import LiveArena
+from web.coverage import CoveragePicture, montage
+from web.feed import ArenaState, Feed, TimedMessage
 from web.tables import (
     STALE_S,
-    Row,
-    describe,
+    TableRow,
+    describe_arena,
     describe_server,
-    describe_sigma,
+    format_sigma,
     tabulate_cameras,
     tabulate_robots,
 )
 from web.trails import LENGTH, Trails, fade
 
 
-def test_the_tables_show_what_was_sent(played: Played, feed: Feed):
-    """Each figure stands in its column, and the covariance as millimetres."""
-    played.pose("rover", (0.5, -0.25, 0.125))
-    played.camera("north", advice="too dark")
-    played.status()
-    wait_for(lambda: (x := feed.latest()).poses and x.cameras and x.status)
-    latest = feed.latest()
+def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
+    """Each figure is in its column, and the covariance is a standard deviation in millimetres."""
+    arena.pose("rover", (0.5, -0.25, 0.125))
+    arena.camera("north", advice="too dark")
+    arena.status()
+    wait_for(lambda: (x := feed.state()).poses and x.cameras and x.status)
+    state = feed.state()
     robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")
-    assert tabulate_robots(latest).rows == [Row(robot, "ok")]
+    assert tabulate_robots(state).rows == [TableRow(robot, "ok")]
     camera = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1")
-    assert tabulate_cameras(latest).rows == [Row(camera, "warn", "too dark")]
+    assert tabulate_cameras(state).rows == [TableRow(camera, "warn", "too dark")]
 
 
-def test_a_camera_that_does_not_count_is_told():
-    """Silent, not placed, or moved; else what its node advises."""
+def test_an_unused_camera_has_a_note():
+    """Offline, not calibrated, moved, or a duplicate name; else the advice of its node."""
     health = CameraHealth(
-        fps=30.0, lateness_ms=5.0, residual_px=None, used=0, unused=0, late=0, calibrated=True, aside=True
+        fps=30.0,
+        lateness_ms=5.0,
+        residual_px=None,
+        assigned=0,
+        unassigned=0,
+        late=0,
+        calibrated=True,
+        excluded=True,
     )
     own = CameraStatus(
         camera="north",
@@ -59,7 +67,7 @@ def test_a_camera_that_does_not_count_is_told():
     def advice(health: CameraHealth, now: float = 0.0) -> str:
         status = FusionStatus(
             t_ns=0,
-            instants_per_s=30.0,
+            frame_sets_per_s=30.0,
             latency_ms=None,
             cpu=0.1,
             memory_mb=100.0,
@@ -67,86 +75,92 @@ def test_a_camera_that_does_not_count_is_told():
             robots={},
             faults={},
         )
-        latest = Latest(now=now, cameras={"north": Seen(own, 0.0)}, status=Seen(status, 0.0))
-        return tabulate_cameras(latest).rows[0].note
+        state = ArenaState(
+            now_s=now, cameras={"north": TimedMessage(own, 0.0)}, status=TimedMessage(status, 0.0)
+        )
+        return tabulate_cameras(state).rows[0].note
 
-    assert advice(health) == "moved: set aside until it is placed anew"
-    assert advice(msgspec.structs.replace(health, calibrated=False)) == "not placed"
-    assert advice(msgspec.structs.replace(health, aside=False, shared=True)) == "two nodes have this name"
-    assert advice(msgspec.structs.replace(health, aside=False)) == "too dark"
-    assert advice(health, now=2 * STALE_S) == "away"
+    assert advice(health).startswith("moved")
+    assert advice(msgspec.structs.replace(health, calibrated=False)) == "not calibrated"
+    assert (
+        advice(msgspec.structs.replace(health, excluded=False, duplicate_publisher=True))
+        == "two nodes use this name"
+    )
+    assert advice(msgspec.structs.replace(health, excluded=False)) == "too dark"
+    assert advice(health, now=2 * STALE_S) == "offline"
 
 
 def test_names_are_escaped():
-    """A camera's name can't bring a script into the page."""
-    status = {"<script>": Seen(None, -1e9)}
-    html = tabulate_cameras(Latest(cameras=status)).html()
+    """A camera's name cannot add a script to the page."""
+    status = {"<script>": TimedMessage(None, -1e9)}
+    html = tabulate_cameras(ArenaState(cameras=status)).html()
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
 
 
-def test_a_robot_whose_markers_are_off_is_told(played: Played, feed: Feed):
-    """By how much, and not as one that is well."""
-    played.pose("rover", (0, 0, 0))
-    played.status(misfits={"rover": 2.34})
-    wait_for(lambda: (x := feed.latest()).poses and x.status)
-    (row,) = tabulate_robots(feed.latest()).rows
-    assert (row.cells[1], row.hue) == ("tracked", "warn")
-    assert row.note.startswith("its markers are off by 2.3 px")
+def test_a_robot_with_misplaced_markers_has_a_note(arena: LiveArena, feed: Feed):
+    """The row is a warning with the difference in pixels."""
+    arena.pose("rover", (0, 0, 0))
+    arena.status(misfits={"rover": 2.34})
+    wait_for(lambda: (x := feed.state()).poses and x.status)
+    (row,) = tabulate_robots(feed.state()).rows
+    assert (row.cells[1], row.level) == ("tracked", "warn")
+    assert "2.3 px" in row.note
 
 
-def test_where_a_lost_robot_may_be_is_no_column_of_digits():
-    assert [describe_sigma(mm) for mm in (0.44, 999.0, 1_327_600.6)] == ["0.4", "999.0", "> 1 m"]
+def test_a_large_standard_deviation_is_short():
+    assert [format_sigma(mm) for mm in (0.44, 999.0, 1_327_600.6)] == ["0.4", "999.0", "> 1 m"]
 
 
-def test_a_silent_robot_is_away(played: Played, feed: Feed):
-    """A pose that is too old tells no state, whatever it says."""
-    played.pose("rover", (0, 0, 0))
-    wait_for(lambda: feed.latest().poses)
-    latest = feed.latest()
-    latest.poses["rover"] = replace(latest.poses["rover"], at=time.monotonic() - 2 * STALE_S)
-    (row,) = tabulate_robots(latest).rows
-    assert (row.cells[1], row.hue) == ("away", "bad")
+def test_an_old_pose_has_no_state(arena: LiveArena, feed: Feed):
+    arena.pose("rover", (0, 0, 0))
+    wait_for(lambda: feed.state().poses)
+    state = feed.state()
+    state.poses["rover"] = replace(state.poses["rover"], received_s=time.monotonic() - 2 * STALE_S)
+    (row,) = tabulate_robots(state).rows
+    assert (row.cells[1], row.level) == ("no data", "bad")
 
 
-def test_the_status_line_of_nothing():
-    """An empty arena is told as one, on one line."""
-    assert describe(Latest()) == "no server answers yet | no camera | 0 placed | no robot | 0 faults"
+def test_the_status_line_of_an_empty_arena():
+    assert (
+        describe_arena(ArenaState()) == "no server found yet | no camera | 0 calibrated | no robot | 0 faults"
+    )
 
 
-def test_a_server_that_left_is_told(played: Played, feed: Feed):
-    """Old figures are not shown as present ones."""
-    token = played.session.liveliness().declare_token(played.keys.fusion_alive)
-    played.status()
-    wait_for(lambda: feed.latest().status and feed.latest().server_alive)
-    assert describe_server(feed.latest()).startswith("30 instants/s, latency 7.7 ms")
+def test_an_absent_server_is_offline(arena: LiveArena, feed: Feed):
+    """Its last figures are not shown."""
+    token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
+    arena.status()
+    wait_for(lambda: feed.state().status and feed.state().server_alive)
+    assert describe_server(feed.state()).startswith("30 poses/s, latency 7.7 ms")
     token.undeclare()
-    wait_for(lambda: not feed.latest().server_alive)
-    assert describe_server(feed.latest()) == "the server is away"
+    wait_for(lambda: not feed.state().server_alive)
+    assert describe_server(feed.state()) == "the server is offline"
 
 
-def test_coverage_counts_cells_and_ignores_the_outside(played: Played, feed: Feed):
-    """A detection at every cell's middle covers all; one outside the image covers nothing."""
+def test_coverage_counts_cells_and_ignores_the_outside(arena: LiveArena, feed: Feed):
+    """Detections at the centres of all cells cover the image; those outside cover nothing."""
     grid = (np.arange(8) + 0.5) / 8
-    played.detections("north", [(640 * u - 0.5, 480 * v - 0.5) for u in grid for v in grid])
-    played.detections("east", [(-5.0, 10.0), (639.6, 10.0), (1e4, 1e4)])
-    wait_for(lambda: len(feed.latest().coverage) == 2)
-    coverage = feed.latest().coverage
+    arena.detections("north", [(640 * u - 0.5, 480 * v - 0.5) for u in grid for v in grid])
+    arena.detections("east", [(-5.0, 10.0), (639.6, 10.0), (1e4, 1e4)])
+    wait_for(lambda: len(feed.state().coverage) == 2)
+    coverage = feed.state().coverage
     assert coverage["north"].share == 1.0
     assert coverage["east"].share == 0.0
-    assert coverage["north"].image().shape == (120, 160, 3)
+    assert coverage["north"].pixels().shape == (120, 160, 3)
 
 
-def test_coverage_of_an_odd_image():
-    """A line of pixels has a picture too."""
-    assert Coverage(32768, 1).image().shape == (1, 160, 3)
-    assert Coverage(1, 32768).image().shape == (640, 160, 3)
+def test_coverage_of_a_row_or_a_column_of_pixels():
+    assert CoveragePicture(32768, 1).pixels().shape == (1, 160, 3)
+    assert CoveragePicture(1, 32768).pixels().shape == (640, 160, 3)
 
 
-def test_a_montage_has_room_for_all():
-    """Two in a row, whatever their shapes; and none is a picture as well."""
+def test_a_montage_contains_all_pictures():
+    """Two in a row, of any shapes; without cameras it is a line."""
     assert montage({}).shape == (1, 328, 3)
-    assert montage({"a": Coverage(640, 480), "b": Coverage(480, 640), "c": Coverage(640, 480)}).shape == (
+    assert montage(
+        {"a": CoveragePicture(640, 480), "b": CoveragePicture(480, 640), "c": CoveragePicture(640, 480)}
+    ).shape == (
         2 * (18 + 213),
         328,
         3,
@@ -154,7 +168,7 @@ def test_a_montage_has_room_for_all():
 
 
 def test_trails_are_bounded_and_end_at_the_robot():
-    """However long it drives, a trail has as many points; its last one is where the robot is."""
+    """A trail has a fixed number of points; the last one is the robot's position."""
     trails = Trails()
     for k in range(5 * LENGTH):
         trails.add("rover", (k, 0.0, 0.0))
@@ -162,20 +176,20 @@ def test_trails_are_bounded_and_end_at_the_robot():
     segments = trails.segments(["rover", "drone"])
     assert segments.shape == (2 * (LENGTH - 1), 2, 3)
     assert segments[LENGTH - 2, 1].tolist() == [5 * LENGTH - 1, 0.0, 0.0]
-    assert (segments[1 : LENGTH - 1, 0] == segments[: LENGTH - 2, 1]).all(), "a trail is one line"
+    assert (segments[1 : LENGTH - 1, 0] == segments[: LENGTH - 2, 1]).all(), "the segments are connected"
     assert (segments[LENGTH - 1 :] == [0.0, 1.0, 0.0]).all()
 
 
-def test_a_robot_that_is_put_elsewhere_leaves_no_line():
-    """All of its trail is where it is now."""
+def test_a_jump_restarts_the_trail():
+    """The whole trail is at the new position."""
     trails = Trails()
     for place in ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 2.0, 0.0)):
         trails.add("rover", place)
     assert (trails.segments(["rover"]) == [0.5, 2.0, 0.0]).all()
 
 
-def test_fading_ends_in_the_robots_colour():
-    """From the background to the robot's own."""
+def test_a_trail_fades_into_the_background():
+    """From the background's colour to the robot's."""
     colours = fade(np.array([[10, 200, 30], [0, 0, 255]], np.uint8), (5, 5, 5))
     assert colours.shape == (2 * (LENGTH - 1), 2, 3)
     assert colours[0, 0].tolist() == [5, 5, 5]

@@ -31,8 +31,9 @@ class CameraCovariance:
     Attributes:
         free: indices of the d parameters (`calib.rig.camera`).
         noise: (C, d, C, d) the part from measurement noise, as the residuals show it.
-        by_prior: (C, d, S d) P: change of each parameter when a parameter's given value, last axis, is off by its
-            claimed standard deviation. P P^T is the part from priors: more recordings of the wand do not reduce it.
+        by_prior: (C, d, S d) P: change of each parameter when the given value of a parameter, last axis, is off by its
+            standard deviation (`Problem.covariance_prior_sigma`). P P^T is the part from priors: more recordings of the
+            wand do not reduce it.
         joint: (C, d, C, d) the sum of both.
     """
 
@@ -56,8 +57,8 @@ def camera_covariance(adjusted: Adjusted) -> CameraCovariance:
     problem, inverse, root = adjusted.problem, inverse_information(adjusted), _prior_root(adjusted)
     by_root = inverse * root
     noise = adjusted.scale**2 * adjusted.inflation * (inverse - by_root @ by_root.T)
-    claimed = problem.claimed_prior_sigma()[list(problem.estimated_cameras())].ravel()
-    by_prior = _all_cameras(adjusted, inverse * (root**2 * np.where(root > 0, claimed, 0.0)), 1)
+    given = problem.covariance_prior_sigma()[list(problem.estimated_cameras())].ravel()
+    by_prior = _all_cameras(adjusted, inverse * (root**2 * np.where(root > 0, given, 0.0)), 1)
     noise = _all_cameras(adjusted, noise, 2)
     return CameraCovariance(
         problem.free, noise, by_prior, noise + np.einsum("cpm,eqm->cpeq", by_prior, by_prior)

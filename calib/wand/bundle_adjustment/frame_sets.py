@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Moments of a wave: frames of different cameras that belong together, and which of many moments are worth while."""
+"""Groups frames of different cameras into frame sets, and chooses which frame sets the adjustment uses."""
 
 import numpy as np
 
@@ -7,52 +7,58 @@ from calib.wand.detections import WandDetections
 from camera_node.arrays import Array, Index, Mask
 
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
-DENSE_S = (
-    0.02  # within which frames are one moment however fast cameras are: the motion between is interpolated
+MIN_SPREAD_S = (
+    0.02  # frames this close form one set at any frame rate: the motion between them is interpolated
 )
-WINDOW = 8  # moments in a row that are chosen together, so that what happens between them is known
-CELLS = (4, 3)  # of an image, for coverage
+WINDOW = 8  # consecutive frame sets that are chosen together, so that the motion between them is estimated
+CELLS = (4, 3)  # columns and rows of an image, for coverage
 
 
-def group_instants(t_s: Array, camera: Index, period_s: float) -> Index:
-    """Which moment each of F frames, in order of time, belongs to (F,); -1 where only one camera has it.
+def group_frames(t_s: Array, camera: Index, period_s: float) -> Index:
+    """The frame set of each of F frames, (F,); -1 where only one camera has a frame.
 
-    A moment is a run of frames within half of a frame period, or within a few milliseconds if that is longer.
-    """
-    spread = min(max(period_s / 2, min(period_s, DENSE_S)), MAX_SPREAD_S) if period_s else MAX_SPREAD_S
-    found, first, instant = np.empty(len(t_s), np.intp), -np.inf, -1
-    for k, t in enumerate(t_s.tolist()):
-        if t - first > spread + 1e-6:
-            first, instant = t, instant + 1
-        found[k] = instant
-    pairs = np.unique(np.column_stack([found, camera]), axis=0)
-    several = np.bincount(pairs[:, 0], minlength=1) >= 2
-    return np.where(several, np.cumsum(several) - 1, -1)[found]
-
-
-def choose_instants(seen: WandDetections, instant: Index, sizes: Array, budget: int) -> Mask:
-    """Which moments (K,) to use, at most about `budget`: all, or runs of them that cover every image evenly.
-
-    Greedy: each next run is the one whose sightings fall where the fewest have fallen so far.
+    A frame set is a run of frames within half a frame period, or within 20 ms if that is longer.
 
     Args:
-        seen: sightings of all moments.
-        instant: (n,) their moment.
-        sizes: (C, 2) width and height of the cameras' images.
+        t_s: (F,) true capture times, ascending.
+        camera: (F,) camera of each frame.
+        period_s: frame period of the cameras; 0 if unknown.
     """
-    count = int(instant.max(initial=-1)) + 1
+    spread = min(max(period_s / 2, min(period_s, MIN_SPREAD_S)), MAX_SPREAD_S) if period_s else MAX_SPREAD_S
+    sets, first, current = np.empty(len(t_s), np.intp), -np.inf, -1
+    for k, t in enumerate(t_s.tolist()):
+        if t - first > spread + 1e-6:
+            first, current = t, current + 1
+        sets[k] = current
+    pairs = np.unique(np.column_stack([sets, camera]), axis=0)
+    several = np.bincount(pairs[:, 0], minlength=1) >= 2
+    return np.where(several, np.cumsum(several) - 1, -1)[sets]
+
+
+def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array, budget: int) -> Mask:
+    """Which of K frame sets to use, at most about `budget`: all, or windows of them that cover all images evenly.
+
+    Greedy: each next window is the one with most detections in cells that have few so far.
+
+    Args:
+        detections: n detections in frame sets.
+        frame_set: (n,) their frame set.
+        sizes: (C, 2) width and height of the cameras' images.
+        budget: number of frame sets.
+    """
+    count = int(frame_set.max(initial=-1)) + 1
     if count <= budget:
         return np.ones(count, bool)
-    share = np.clip(seen.uv / sizes[seen.camera], 0, 0.999)
-    column, row = (share * CELLS).astype(np.intp).T
-    cell = (seen.camera * CELLS[0] + column) * CELLS[1] + row
-    held = np.zeros((-(-count // WINDOW), len(sizes) * CELLS[0] * CELLS[1]))
-    np.add.at(held, (instant // WINDOW, cell), 1.0)
-    total, chosen, open_runs = np.zeros(held.shape[1]), np.zeros(count, bool), np.ones(len(held), bool)
+    position = np.clip(detections.uv / sizes[detections.camera], 0, 0.999)
+    column, row = (position * CELLS).astype(np.intp).T
+    cell = (detections.camera * CELLS[0] + column) * CELLS[1] + row
+    counts = np.zeros((-(-count // WINDOW), len(sizes) * CELLS[0] * CELLS[1]))
+    np.add.at(counts, (frame_set // WINDOW, cell), 1.0)
+    total, chosen, available = np.zeros(counts.shape[1]), np.zeros(count, bool), np.ones(len(counts), bool)
     for _ in range(budget // WINDOW):
-        gain = np.where(open_runs, held @ (1 / (1 + total)), -1.0)
+        gain = np.where(available, counts @ (1 / (1 + total)), -1.0)
         best = int(gain.argmax())
-        open_runs[best] = False
-        total += held[best]
+        available[best] = False
+        total += counts[best]
         chosen[best * WINDOW : (best + 1) * WINDOW] = True
     return chosen

@@ -23,7 +23,7 @@ from camera_node.geometry.lens import Lens
 # Usual standard deviations of log f, the principal point (share of the longer side) and k1 of a lens whose file has
 # none: between a data sheet, or a careless calibration, and the true lens.
 FOCAL, CENTRE, K1 = 0.03, 0.02, 0.1
-# Least standard deviations: focus, temperature, or remounting change every lens by more than its calibration claims.
+# Least standard deviations: focus, temperature or remounting change a lens by more than its calibration accounts for.
 MIN_SIGMA = np.array([5e-4, 0.3, 0.3, 5e-4])
 CONTRADICTED = 1e-4  # probability below which the recording contradicts a lens's standard deviations
 # Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
@@ -77,11 +77,11 @@ def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
     estimated = list(adjusted.problem.estimated_cameras())
     information, gradient = _lens_likelihood(adjusted)
     sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
-    prior, claimed = problem.lens_sigma.copy(), problem.lens_sigma.copy()
+    prior, wider = problem.lens_sigma.copy(), problem.lens_sigma.copy()
     prior[estimated] = sigma * _shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
     uniform = sigma * _shares(information, gradient, sigma, unknown, UNIFORM)
-    claimed[estimated] = np.maximum(uniform, prior[estimated])
-    return replace(problem, lens_sigma=prior, lens_sigma_claimed=claimed)
+    wider[estimated] = np.maximum(uniform, prior[estimated])
+    return replace(problem, lens_sigma=prior, covariance_lens_sigma=wider)
 
 
 def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:

@@ -108,7 +108,7 @@ class Problem:
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
         estimated: cameras that are estimated, the others are fixed; None for all.
-        lens_sigma_claimed: (C, 4) prior standard deviations for the covariance; `lens_sigma` if None.
+        covariance_lens_sigma: (C, 4) prior standard deviations for the covariance; `lens_sigma` if None.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
     """
 
@@ -122,17 +122,17 @@ class Problem:
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
     estimated: tuple[int, ...] | None = None
-    lens_sigma_claimed: Array | None = None
+    covariance_lens_sigma: Array | None = None
     drift_sigma: float = SLEWED_DRIFT
 
     def prior_sigma(self) -> Array:
         """(C, d) prior standard deviations of the free parameters in the estimate; infinite for poses."""
         return self._prior_sigma(self.lens_sigma)
 
-    def claimed_prior_sigma(self) -> Array:
+    def covariance_prior_sigma(self) -> Array:
         """(C, d) prior standard deviations of the free parameters for the covariance."""
         return self._prior_sigma(
-            self.lens_sigma if self.lens_sigma_claimed is None else self.lens_sigma_claimed
+            self.lens_sigma if self.covariance_lens_sigma is None else self.covariance_lens_sigma
         )
 
     def _prior_sigma(self, lens_sigma: Array) -> Array:

@@ -1,89 +1,71 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How far two cameras' clocks are apart, before anything is known of where they stand.
+"""Estimates the clock shift between two cameras whose relative pose is unknown.
 
-At the right shift, what both saw at once satisfies one epipolar constraint; at a wrong one the wand has moved on. For
-every trial shift the fundamental matrix is fitted by the eight-point algorithm (Hartley 1997), robustly.
+At the right shift, simultaneous detections of both cameras satisfy one epipolar constraint; at a wrong shift the wand
+has moved. The eight-point algorithm (Hartley 1997) fits a fundamental matrix robustly to each trial shift.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
-from calib.wand.tracks import MarkerTrack
+from calib.wand.detections import WandDetections
+from calib.wand.tracks import MarkerTrack, interpolate
 from camera_node.arrays import Array, Index, Mask
 
-RANGE_S = 0.32  # twice what clocks may be off
+RANGE_S = 0.32  # largest trial shift: twice the difference of clocks that the server synchronizes
 STEP_S = 0.01
-SAMPLE = 500  # sightings that are tried
+SAMPLE = 500  # detections that are used
 ROUNDS = 5  # of reweighting
-# Clocks are together unless the data say otherwise: by this much in the logarithm of their likelihood, as the best of
-# many trials is better by chance, and eight numbers were fitted to each.
+# A shift is accepted if it raises the logarithm of the likelihood by this much: the best of many trials is better than
+# no shift by chance, and the parameters of the fundamental matrix are fitted to each trial.
 EVIDENCE = 12.0
 FITTED = 8
-MIN_COMMON = 16
-MIN_MOMENTS = (
-    15  # at which both saw the wand; the markers of one moment tell little more than two of them would
-)
+MIN_COMMON = 16  # correspondences of a trial
+MIN_TIMES = 15  # timestamps with correspondences; the markers of one frame add little information
 
 
-@dataclass(frozen=True, slots=True)
-class Common:
-    """Sightings of camera a and where camera b saw the same markers at the same time: (n,) rows, (n, 2) each."""
-
-    rows: Index
-    xy_a: Array
-    xy_b: Array
-
-
-def common_sightings(
-    tracks: list[MarkerTrack], rows: Index, label: Index, t_s: Array, xy: Array, shift_s: float, gap_s: float
-) -> Common:
-    """Sightings `rows` with those of another camera, whose `tracks` are by marker and stamped `shift_s` later."""
-    other = interpolate(tracks, label, t_s + shift_s, gap_s)
-    good = np.isfinite(other[:, 0])
-    return Common(rows[good], xy[good], other[good])
-
-
-def interpolate(tracks: list[MarkerTrack], label: Index, t_s: Array, gap_s: float) -> Array:
-    """(..., n, 2) positions of the markers `label` (n,) at times (..., n)."""
-    found = np.full((*t_s.shape, 2), np.nan)
-    for marker, track in enumerate(tracks):
-        mine = label == marker
-        found[..., mine, :] = track.interpolate(t_s[..., mine], gap_s)
-    return found
-
-
-def find_shift(tracks: list[MarkerTrack], label: Index, t_s: Array, xy: Array, gap_s: float) -> float:
-    """The time by which camera b's stamps are later than camera a's, seconds; 0 where nothing tells.
+def find_shift(tracks: Sequence[MarkerTrack], detections: WandDetections, gap_s: float) -> float:
+    """Return how much later the timestamps of camera b are than those of a, seconds; 0 if the data show no shift.
 
     Args:
-        tracks: camera b's, by marker.
-        label, t_s, xy: (n,), (n,), (n, 2) camera a's sightings.
-        gap_s: the longest time over which b's tracks are interpolated.
+        tracks: of camera b, by marker.
+        detections: of camera a.
+        gap_s: the longest gap over which the tracks are interpolated.
     """
-    if not len(label):
+    if not len(detections):
         return 0.0
-    chosen = np.linspace(0, len(label) - 1, min(SAMPLE, len(label))).round().astype(np.intp)
-    label, t_s, xy = label[chosen], t_s[chosen], xy[chosen]
+    detections = detections.select(spread_evenly(len(detections), SAMPLE))
+    label, t_s, xy = detections.label, detections.t_s, detections.xy
     coarse = STEP_S * np.arange(-round(RANGE_S / STEP_S), round(RANGE_S / STEP_S) + 1)
-    misfits = misfit(xy, interpolate(tracks, label, t_s + coarse[:, None], gap_s))
-    together = misfits[len(coarse) // 2]
+    misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + coarse[:, None], gap_s))
+    unshifted = misfits[len(coarse) // 2]
     best = int(np.nanargmin(misfits)) if np.isfinite(misfits).any() else len(coarse) // 2
     common = np.isfinite(interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
-    moments = len(np.unique(t_s[common]))
-    told = min(int(common.sum()), 2 * moments) - FITTED
-    if moments < MIN_MOMENTS or not together > misfits[best] * np.exp(EVIDENCE / told):
+    times = len(np.unique(t_s[common]))
+    if times < MIN_TIMES or not supports_shift(unshifted, misfits[best], int(common.sum()), times):
         return 0.0
     fine = coarse[best] + STEP_S * np.linspace(-1, 1, 11)
-    misfits = misfit(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
+    misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
     return float(fine[np.nanargmin(misfits)]) if np.isfinite(misfits).any() else float(coarse[best])
 
 
-def misfit(xy_a: Array, xy_b: Array) -> Array:
-    """(S,) median distance from the epipolar constraint that fits best (Sampson), of S trials of n correspondences.
+def spread_evenly(count: int, most: int) -> Index:
+    """Return up to `most` indices below `count`, evenly spaced."""
+    return np.linspace(0, count - 1, min(most, count)).round().astype(np.intp)
+
+
+def supports_shift(unshifted: float, shifted: float, correspondences: int, times: int) -> bool:
+    """Return whether the misfits without and with a shift show that the clocks differ."""
+    return bool(unshifted > shifted * np.exp(EVIDENCE / (min(correspondences, 2 * times) - FITTED)))
+
+
+def epipolar_misfits(xy_a: Array, xy_b: Array) -> Array:
+    """Fit a fundamental matrix to each of S trials of n correspondences; return (S,) median Sampson distances.
 
     Args:
-        xy_a: (n, 2); xy_b: (S, n, 2), NaN where there is none. Trials with too few have inf.
+        xy_a: (n, 2) image plane coordinates in camera a.
+        xy_b: (S, n, 2) in camera b; NaN without a correspondence. A trial with too few has an infinite misfit.
     """
     known = np.isfinite(xy_b[..., 0])
     b = np.where(known[..., None], xy_b, 0.0)
@@ -92,17 +74,17 @@ def misfit(xy_a: Array, xy_b: Array) -> Array:
     ha = np.concatenate([np.broadcast_to(xy_a / scale_a, b.shape), one], axis=2)
     hb = np.concatenate([b / scale_b, one], axis=2)
     products = (hb[..., :, None] * ha[..., None, :]).reshape(*known.shape, 9)
-    weight, middle = known.astype(float), np.full(len(known), np.inf)
+    weight, median = known.astype(float), np.full(len(known), np.inf)
     for _ in range(ROUNDS):
         moments = np.swapaxes(products * weight[..., None], 1, 2) @ products
         F = np.linalg.eigh(moments)[1][:, :, 0].reshape(-1, 3, 3)
         off = np.abs(np.einsum("snk,sk->sn", products, F.reshape(-1, 9)))
         lines_b, lines_a = ha @ np.swapaxes(F, 1, 2), hb @ F
         slope = (lines_b[..., :2] / scale_b) ** 2, (lines_a[..., :2] / scale_a) ** 2
-        miss = off / np.sqrt(slope[0].sum(axis=2) + slope[1].sum(axis=2) + 1e-18)
-        middle = _masked_median(miss, known)
-        weight = known / (1 + (miss / (2 * middle[:, None] + 1e-9)) ** 2)
-    return np.where(known.sum(axis=1) >= MIN_COMMON, middle, np.inf)
+        distance = off / np.sqrt(slope[0].sum(axis=2) + slope[1].sum(axis=2) + 1e-18)
+        median = _masked_median(distance, known)
+        weight = known / (1 + (distance / (2 * median[:, None] + 1e-9)) ** 2)
+    return np.where(known.sum(axis=1) >= MIN_COMMON, median, np.inf)
 
 
 def _masked_median(values: Array, known: Mask) -> Array:

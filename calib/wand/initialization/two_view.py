@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Two-view geometry: how two cameras stand and how far their clocks are apart, from what both saw.
+"""Two-view geometry: the relative pose and clock shift of two cameras from their common detections.
 
-The essential matrix (Nister 2004) gives the motion up to scale; the wand's lengths or the roundels' sizes the scale.
+The essential matrix (Nister 2004) gives the pose up to scale; the wand's lengths, or the roundels' sizes, give the
+scale.
 """
 
 from collections.abc import Sequence
@@ -12,33 +13,34 @@ import numpy as np
 
 from calib.rig.camera import transform
 from calib.wand.detections import WandDetections, ranges
-from calib.wand.initialization.clock_shift import EVIDENCE, FITTED, Common, common_sightings, find_shift
-from calib.wand.tracks import MarkerTrack, tracks_of
+from calib.wand.initialization.clock_shift import find_shift, spread_evenly, supports_shift
+from calib.wand.tracks import MarkerTrack, build_tracks, interpolate
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 
-MIN_INSTANTS = 8  # that two cameras must share
-SAMPLE = 1500  # sightings that the essential matrix is fitted to
+MIN_FRAME_SETS = 8  # that two cameras must share
+SAMPLE = 1500  # detections that the essential matrix is fitted to
 GATE_PX = 5.0
-INTERPOLATED = 2.5  # frame periods over which a marker's place is interpolated
-SLOWEST_S = 0.5  # and never longer
-MAX_SPREAD = 0.15  # of the logarithm of lengths and sizes: a geometry that makes them differ by more is none
-AGREEING = 0.3  # of the sightings that both have, at the least, are right: one in two of either camera
-MIN_SHARE = 0.5  # of the sightings that both have: a geometry that fewer agree to is none
+MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
+MAX_SPREAD = 0.15  # of the logarithm of the scale, over the wand's lengths: a larger one rejects the pose
+QUANTILE = 0.3  # of Sampson distances, that are compared: 30 % of the correspondences are right at the least
+MIN_INLIER_RATIO = 0.5  # of the correspondences: fewer inliers reject a pose
 
 
 @dataclass(frozen=True, slots=True)
 class TwoView:
-    """Camera b seen from camera a.
+    """Relative pose and clock shift of two cameras.
 
     Attributes:
-        a, b: their numbers.
+        a, b: their indices.
         T_a_b: (4, 4) p_a = T_a_b p_b, metres if `metric`, else its translation has length 1.
-        shift_s: by which b's stamps are later than a's.
-        inliers: sightings that agree with it; `share` of those that both have.
-        depth: distance to the marker by sighting (row), in the unit of T_a_b: ties scales together.
+        shift_s: time by which b's timestamps are later than a's.
+        inliers: number of detections of a that agree.
+        inlier_ratio: the part of the correspondences that are inliers.
+        metric: whether the scale is known.
+        depth: distance from its camera to the marker by detection (row), in the unit of T_a_b.
     """
 
     a: int
@@ -46,116 +48,152 @@ class TwoView:
     T_a_b: Array
     shift_s: float
     inliers: int
-    share: float
+    inlier_ratio: float
     metric: bool
     depth: dict[int, float]
 
 
 @dataclass(frozen=True, slots=True)
-class _Motion:
-    """T_a_b with a translation of length 1, the sightings `good` (n,) that agree to it, and a quantile of how far all
-    are from the epipolar constraint."""
+class _Correspondences:
+    """Detections `rows` (n,) of camera a, and both cameras' image plane coordinates (n, 2) of the same markers."""
 
-    common: Common
-    T: Array
-    good: Mask
+    rows: Index
+    xy_a: Array
+    xy_b: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _RelativePose:
+    """T_a_b with a translation of length 1, its inliers (n,), and a low quantile of the Sampson distances."""
+
+    matches: _Correspondences
+    T_a_b: Array
+    inlier: Mask
     misfit: float
 
 
 class TwoViewGeometry:
-    """What each two cameras of a recording have in common."""
+    """Relative poses of the pairs of cameras of a labeled recording, computed on demand.
 
-    def __init__(self, seen: WandDetections, lenses: Sequence[Lens], wand: Body, period_s: float) -> None:
-        self.seen, self.lenses, self.wand = seen, lenses, wand
-        self.rows = [np.flatnonzero(seen.camera == k) for k in range(len(lenses))]
-        self.tracks: list[list[MarkerTrack]] = tracks_of(seen, len(lenses), len(wand.markers))
-        self.gap_s = min(INTERPOLATED * period_s, SLOWEST_S) if period_s else SLOWEST_S
+    Args:
+        detections: labeled, of all cameras.
+        lenses: of the C cameras.
+        wand: its markers.
+        period_s: the frame period.
+    """
+
+    def __init__(
+        self, detections: WandDetections, lenses: Sequence[Lens], wand: Body, period_s: float
+    ) -> None:
+        self.detections, self.lenses, self.wand = detections, lenses, wand
+        self.rows = [np.flatnonzero(detections.camera == k) for k in range(len(lenses))]
+        self.tracks: list[list[MarkerTrack]] = build_tracks(detections, len(lenses), len(wand.markers))
+        self.gap_s = longest_gap_s(period_s)
         self.period_s = period_s
-        self._related: dict[tuple[int, int], TwoView | None] = {}
-        self.range = ranges(lenses, seen, wand.diameter_m)
+        self._known: dict[tuple[int, int], TwoView | None] = {}
+        self._ranges = ranges(lenses, detections, wand.diameter_m)
 
-    def shared(self) -> Index:
-        """(C, C) about how many moments, a frame period long, each two cameras share."""
-        bins = (self.seen.t_s / max(self.period_s, 0.02)).astype(np.intp)
+    def with_detections(self, detections: WandDetections) -> "TwoViewGeometry":
+        """Return the geometry of the same cameras with other detections."""
+        return TwoViewGeometry(detections, self.lenses, self.wand, self.period_s)
+
+    def count_shared(self) -> Index:
+        """Return (C, C) the approximate number of frame sets, one frame period long, that two cameras share."""
+        bins = (self.detections.t_s / max(self.period_s, 0.02)).astype(np.intp)
         held = np.zeros((len(self.lenses), int(bins.max(initial=0)) + 1))
-        held[self.seen.camera, bins] = 1
+        held[self.detections.camera, bins] = 1
         near = np.maximum(held, np.roll(held, 1, axis=1))
         return (near @ near.T / 2).astype(np.intp)
 
     def relate(self, a: int, b: int) -> TwoView | None:
-        """Where two cameras stand to each other; None where it can't be told."""
-        if (a, b) not in self._related:
-            self._related[a, b] = self._relate(a, b)
-        return self._related[a, b]
+        """Return the relative pose of two cameras; None if the data do not determine it."""
+        if (a, b) not in self._known:
+            self._known[a, b] = self._estimate(a, b)
+        return self._known[a, b]
 
-    def _relate(self, a: int, b: int) -> TwoView | None:
-        seen, rows = self.seen, self.rows[a]
-        near = self._near(rows, b)
-        shift_s = find_shift(self.tracks[b], seen.label[near], seen.t_s[near], seen.xy[near], self.gap_s)
-        together = self._motion(a, b, near, 0.0)
-        apart = self._motion(a, b, near, shift_s) if shift_s else together
-        if shift_s and not _tells(together, apart, len(np.unique(seen.t_s[near]))):
-            shift_s, apart = 0.0, together
-        if apart is None:
+    def _estimate(self, a: int, b: int) -> TwoView | None:
+        pose, shift_s = self._estimate_with_shift(a, b)
+        if pose is None:
             return None
-        common, T, good = apart.common, apart.T, apart.good
-        inliers = common.rows[good]
-        if len(np.unique(seen.frame[inliers])) < MIN_INSTANTS:
+        matches, T_a_b = pose.matches, pose.T_a_b.copy()
+        inliers = matches.rows[pose.inlier]
+        if self._count_frames(inliers) < MIN_FRAME_SETS:
             return None
-        points = intersect_rays(T, common.xy_a[good], common.xy_b[good])
-        ratios = self._ratios(points, inliers)
+        points = intersect_rays(T_a_b, matches.xy_a[pose.inlier], matches.xy_b[pose.inlier])
+        ratios = self._scale_ratios(points, inliers)
         scale = float(np.median(ratios)) if len(ratios) else 1.0
         if len(ratios) and np.median(np.abs(np.log(ratios / scale))) > MAX_SPREAD:
             return None
-        T[:3, 3] *= scale
-        depth = self._depths(T, inliers, points * scale, b, shift_s)
-        share = len(inliers) / len(common.rows)
-        return TwoView(a, b, T, shift_s, len(inliers), share, len(ratios) > 0, depth)
+        T_a_b[:3, 3] *= scale
+        points_b = transform(invert(T_a_b), points * scale)
+        depth = _lengths(inliers, points * scale) | self._depths_of_b(inliers, points_b, b, shift_s)
+        ratio = len(inliers) / len(matches.rows)
+        return TwoView(a, b, T_a_b, shift_s, len(inliers), ratio, len(ratios) > 0, depth)
 
-    def _near(self, rows: Index, b: int) -> Index:
-        """Rows at whose time, clocks apart, camera b could have seen the wand; of whole frames, as the markers of a
-        frame tell the scale, and not more than are worth while."""
-        times = np.unique(self.seen.t_s[self.rows[b]])
+    def _estimate_with_shift(self, a: int, b: int) -> tuple[_RelativePose | None, float]:
+        """Return the relative pose up to scale and the clock shift, 0 unless the data show one."""
+        rows = self._overlapping_rows(a, b)
+        selected = self.detections.select(rows)
+        shift_s = find_shift(self.tracks[b], selected, self.gap_s)
+        unshifted = self._fit_pose(a, b, rows, 0.0)
+        shifted = self._fit_pose(a, b, rows, shift_s) if shift_s else None
+        if shifted is None:
+            return unshifted, 0.0
+        counts = len(shifted.matches.rows), len(np.unique(selected.t_s))
+        if unshifted is not None and not supports_shift(unshifted.misfit, shifted.misfit, *counts):
+            return unshifted, 0.0
+        return shifted, shift_s
+
+    def _overlapping_rows(self, a: int, b: int) -> Index:
+        """Return rows of camera a at times when b has detections, clock shift apart.
+
+        Whole frames, because the markers of a frame give the scale; at most about SAMPLE rows.
+        """
+        rows, t_s = self.rows[a], self.detections.t_s
+        times = np.unique(t_s[self.rows[b]])
         if not len(times) or not len(rows):
             return rows[:0]
-        after = np.clip(np.searchsorted(times, self.seen.t_s[rows]), 1, max(len(times) - 1, 1)) - 1
-        after = np.minimum(after, len(times) - 1)
-        other = np.minimum(after + 1, len(times) - 1)
-        gap = np.minimum(
-            np.abs(times[after] - self.seen.t_s[rows]), np.abs(times[other] - self.seen.t_s[rows])
-        )
+        before = np.clip(np.searchsorted(times, t_s[rows]), 1, max(len(times) - 1, 1)) - 1
+        before = np.minimum(before, len(times) - 1)
+        after = np.minimum(before + 1, len(times) - 1)
+        gap = np.minimum(np.abs(times[before] - t_s[rows]), np.abs(times[after] - t_s[rows]))
         near = rows[gap <= self.gap_s]
-        frames = np.unique(self.seen.frame[near])
-        count = min(len(frames), max(round(SAMPLE * len(frames) / max(len(near), 1)), 1))
-        chosen = frames[np.linspace(0, len(frames) - 1, count).round().astype(np.intp)]
-        return near[np.isin(self.seen.frame[near], chosen)]
+        frames = np.unique(self.detections.frame[near])
+        count = max(round(SAMPLE * len(frames) / max(len(near), 1)), 1)
+        chosen = frames[spread_evenly(len(frames), count)]
+        return near[np.isin(self.detections.frame[near], chosen)]
 
-    def _common(self, rows: Index, b: int, shift_s: float) -> Common:
-        seen = self.seen
-        return common_sightings(
-            self.tracks[b], rows, seen.label[rows], seen.t_s[rows], seen.xy[rows], shift_s, self.gap_s
-        )
+    def _correspond(self, rows: Index, b: int, shift_s: float) -> _Correspondences:
+        """Return correspondences of detections `rows` with camera b, whose timestamps are `shift_s` later."""
+        found = self.detections.select(rows)
+        other = interpolate(self.tracks[b], found.label, found.t_s + shift_s, self.gap_s)
+        good = np.isfinite(other[:, 0])
+        return _Correspondences(rows[good], found.xy[good], other[good])
 
-    def _motion(self, a: int, b: int, rows: Index, shift_s: float) -> "_Motion | None":
-        """The motion that most of what both saw agrees to, if b's stamps are later by `shift_s`."""
-        common = self._common(rows, b, shift_s)
-        if len(np.unique(self.seen.frame[common.rows])) < MIN_INSTANTS:
+    def _fit_pose(self, a: int, b: int, rows: Index, shift_s: float) -> _RelativePose | None:
+        """Fit the essential matrix to the detections `rows` of camera a at a clock shift."""
+        matches = self._correspond(rows, b, shift_s)
+        if self._count_frames(matches.rows) < MIN_FRAME_SETS:
             return None
+        xy_a, xy_b, K = matches.xy_a, matches.xy_b, np.eye(3)
         gate = GATE_PX / ((self.lenses[a].fx + self.lenses[a].fy) / 2)
-        E, mask = cv2.findEssentialMat(common.xy_a, common.xy_b, np.eye(3), cv2.USAC_ACCURATE, 0.9999, gate)[
-            :2
-        ]
+        E, mask = cv2.findEssentialMat(xy_a, xy_b, K, cv2.USAC_ACCURATE, 0.9999, gate)[:2]
         if E is None or E.shape != (3, 3):
             return None
-        _, R, t, mask = cv2.recoverPose(E, common.xy_a, common.xy_b, np.eye(3), mask=mask)[:4]
+        _, R, t, mask = cv2.recoverPose(E, xy_a, xy_b, K, mask=mask)[:4]
         T_b_a = np.eye(4)
         T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
-        miss = sampson(np.asarray(E, float), common.xy_a, common.xy_b)
-        return _Motion(common, invert(T_b_a), mask.ravel() > 0, float(np.quantile(miss, AGREEING)))
+        distances = sampson(np.asarray(E, float), xy_a, xy_b)
+        return _RelativePose(
+            matches, invert(T_b_a), mask.ravel() > 0, float(np.quantile(distances, QUANTILE))
+        )
 
-    def _ratios(self, points: Array, rows: Index) -> Array:
-        """By what to multiply the points so that the wand has its lengths, or else roundels their size; (r,) votes."""
-        frame, label = self.seen.frame[rows], self.seen.label[rows]
+    def _count_frames(self, rows: Index) -> int:
+        return len(np.unique(self.detections.frame[rows]))
+
+    def _scale_ratios(self, points: Array, rows: Index) -> Array:
+        """Return the factors (r,) that give the wand its lengths, or else the roundels their ranges."""
+        frame, label = self.detections.frame[rows], self.detections.label[rows]
         table = np.full((len(np.unique(frame)), len(self.wand.markers), 3), np.nan)
         table[np.unique(frame, return_inverse=True)[1], label] = points
         gaps = np.linalg.norm(table[:, :, None] - table[:, None], axis=3)
@@ -163,36 +201,37 @@ class TwoViewGeometry:
         upper = np.triu(np.ones(known.shape, bool), 1)
         ratios = (known / np.where(gaps > 0, gaps, np.nan))[:, upper].ravel()
         if not np.isfinite(ratios).any():
-            ratios = self.range[rows] / np.linalg.norm(points, axis=1)
+            ratios = self._ranges[rows] / np.linalg.norm(points, axis=1)
         return ratios[np.isfinite(ratios)]
 
-    def _depths(self, T: Array, rows: Index, points: Array, b: int, shift_s: float) -> dict[int, float]:
-        """Distances from camera a at its sightings, and from camera b at its nearest ones."""
-        seen = self.seen
-        depth = dict(zip(rows.tolist(), np.linalg.norm(points, axis=1).tolist(), strict=True))
-        far = np.linalg.norm(transform(invert(T), points), axis=1)
+    def _depths_of_b(self, rows: Index, points: Array, b: int, shift_s: float) -> dict[int, float]:
+        """Return distances from camera b to points (n, 3) in its frame, at its detections nearest in time."""
+        label, t_s = self.detections.label, self.detections.t_s
+        depth: dict[int, float] = {}
         for marker in range(len(self.wand.markers)):
-            mine = np.flatnonzero(seen.label[rows] == marker)
-            theirs = self.rows[b][seen.label[self.rows[b]] == marker]
+            mine = np.flatnonzero(label[rows] == marker)
+            theirs = self.rows[b][label[self.rows[b]] == marker]
             if len(mine) and len(theirs):
-                at = np.searchsorted(seen.t_s[theirs], seen.t_s[rows[mine]] + shift_s)
-                depth |= dict(
-                    zip(theirs[np.minimum(at, len(theirs) - 1)].tolist(), far[mine].tolist(), strict=True)
-                )
+                at = np.searchsorted(t_s[theirs], t_s[rows[mine]] + shift_s)
+                depth |= _lengths(theirs[np.minimum(at, len(theirs) - 1)], points[mine])
         return depth
 
 
-def _tells(together: _Motion | None, apart: _Motion | None, moments: int) -> bool:
-    """Whether the data say that clocks are apart, by as much as `find_shift` asks for."""
-    if together is None or apart is None:
-        return together is None
-    told = min(len(apart.common.rows), 2 * moments) - FITTED
-    return together.misfit > apart.misfit * np.exp(EVIDENCE / told)
+def _lengths(rows: Index, points: Array) -> dict[int, float]:
+    """Return the distances of points (n, 3) from the origin, by row (n,)."""
+    return dict(zip(rows.tolist(), np.linalg.norm(points, axis=1).tolist(), strict=True))
+
+
+def longest_gap_s(period_s: float) -> float:
+    """Return the longest gap over which tracks are interpolated, seconds."""
+    return min(MAX_GAP_PERIODS * period_s, MAX_GAP_S) if period_s else MAX_GAP_S
 
 
 def sampson(E: Array, xy_a: Array, xy_b: Array) -> Array:
-    """(n,) distances of correspondences (n, 2) from the epipolar constraint x_b' E x_a = 0 (Hartley and Zisserman,
-    section 11.4.3)."""
+    """Return (n,) Sampson distances of correspondences (n, 2) from the epipolar constraint x_b' E x_a = 0.
+
+    Hartley and Zisserman, section 11.4.3.
+    """
     a, b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b))
     line_b, line_a = a @ E.T, b @ E
     slope = np.concatenate([line_b[:, :2], line_a[:, :2]], axis=1)
@@ -200,7 +239,7 @@ def sampson(E: Array, xy_a: Array, xy_b: Array) -> Array:
 
 
 def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
-    """Points (n, 3), camera a's frame, seen at (n, 2) image plane coordinates in two cameras (linear triangulation)."""
+    """Triangulate points (n, 3), camera a's frame, from image plane coordinates (n, 2) in two cameras (linear)."""
     P_a, P_b = np.eye(4)[:3], invert(T_a_b)[:3]
     homogeneous = cv2.triangulatePoints(P_a, P_b, xy_a.T, xy_b.T).T
     return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], float)

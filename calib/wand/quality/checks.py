@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What an adjustment says against the files that it was given: lenses, names and the wand's measures."""
+"""Checks an adjustment against the files that it was given: lenses, camera names, and the wand's dimensions."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -12,48 +12,48 @@ from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import WandObservations
-from calib.wand.bundle_adjustment.residuals import predict_markers
+from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
 from calib.wand.detections import WandDetections, ranges
 from calib.wand.quality.clock_jump import find_jump
-from calib.wand.quality.lengths import distances, free_markers
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
-AGREE = 0.5  # of a camera's sightings must fit the rig, beside those that its pose and clock fit anyway
-SIZE = 0.04  # of the distance: what no roundel's size is off by, in the median of a wave
-SPACING = 0.03  # of the wand's length: what no distance of two of its markers is off by
-FEW = 8  # moments at which a distance is measured
-MOVES = 0.02  # of an image's longer side: a wand that stays within is not waved
-WRONG = 3.0  # usual standard deviations of a lens without figures: beyond, it is another lens
-SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
+MIN_AGREEING = 0.5  # share of a camera's detections that must fit the rig
+MAX_SIZE_ERROR = 0.04  # of the distance: the median error of roundel sizes is below it
+MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
+MIN_MEASURED = 8  # frame sets at which a distance is measured
+MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
+WRONG_LENS = 3.0  # usual standard deviations of a lens without figures
+SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another camera
 
 
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
-    """Raise CameraFault where lenses are other cameras', or far from those that were given."""
+    """Raise CameraFault where lenses are swapped between two cameras, or far from the given ones."""
     lenses, cov = adjusted.problem.lenses, camera_covariance(adjusted).of(LENS)
     found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
     for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
-        crossed = _apart(found[a], lenses[b], cov[a, :, a]), _apart(found[b], lenses[a], cov[b, :, b])
-        straight = _apart(found[a], lenses[a], cov[a, :, a]), _apart(found[b], lenses[b], cov[b, :, b])
-        if max(crossed) < SAME < min(straight):
-            told = "what it saw fits the intrinsics of '{}', and the other way round: swap the two in the rig file"
-            raise CameraFault({names[a]: told.format(names[b]), names[b]: told.format(names[a])})
+        crossed = _distance(found[a], lenses[b], cov[a, :, a]), _distance(found[b], lenses[a], cov[b, :, b])
+        straight = _distance(found[a], lenses[a], cov[a, :, a]), _distance(found[b], lenses[b], cov[b, :, b])
+        if max(crossed) < SAME_LENS < min(straight):
+            swapped = (
+                "its detections fit the intrinsics of '{}', and vice versa; swap the two in the rig file"
+            )
+            raise CameraFault({names[a]: swapped.format(names[b]), names[b]: swapped.format(names[a])})
     reasons = {}
     for name, given, lens in zip(names, lenses, found, strict=True):
         off = np.array([np.log(lens.fx / given.fx), lens.cx - given.cx, lens.cy - given.cy])
-        if (np.abs(off) > WRONG * usual_sigma(given)[:3]).any():
+        if (np.abs(off) > WRONG_LENS * usual_sigma(given)[:3]).any():
             reasons[name] = (
-                f"wrong intrinsics: what it saw fits f = {lens.fx:.0f} px and a centre at "
-                f"({lens.cx:.0f}, {lens.cy:.0f}), its file says {given.fx:.0f} px and "
-                f"({given.cx:.0f}, {given.cy:.0f}); is its name right? "
-                f"else run python -m calib intrinsics --camera {name}"
+                f"wrong intrinsics: its detections fit f = {lens.fx:.0f} px and a centre at "
+                f"({lens.cx:.0f}, {lens.cy:.0f}), its file has {given.fx:.0f} px and "
+                f"({given.cx:.0f}, {given.cy:.0f}); check its name, or run python -m calib intrinsics --camera {name}"
             )
     if reasons:
         raise CameraFault(reasons)
 
 
-def _apart(found: Lens, given: Lens, cov: Array) -> float:
+def _distance(found: Lens, given: Lens, cov: Array) -> float:
     """Distance of two lenses in sigmas, root mean square of the adjusted parameters."""
     k1 = [lens.distortion[0] if lens.distortion else 0.0 for lens in (found, given)]
     focal = np.log(found.fx * found.fy / (given.fx * given.fy)) / 2
@@ -61,78 +61,114 @@ def _apart(found: Lens, given: Lens, cov: Array) -> float:
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
 
 
-def check_agreement(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) -> None:
-    """Raise CameraFault where much of what a camera saw fits nothing that the others saw.
+def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:
+    """Raise CameraFault where most detections of a camera contradict those of the other cameras.
 
-    The worst one, as one that is wrong makes others look wrong. The d parameters of a camera's pose and clock
-    fit d coordinates wherever it stands: those tell nothing.
+    Only the worst camera is named, because a wrong camera makes others look wrong. The d parameters of a camera's pose
+    and clock fit d coordinates of any detections, so these do not count.
     """
-    sightings = np.bincount(seen.camera, minlength=len(names))
-    fitting = np.bincount(seen.camera[adjusted.used], minlength=len(names))
-    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / sightings
-    if share.min() < AGREE:
+    total = np.bincount(observations.camera, minlength=len(names))
+    fitting = np.bincount(observations.camera[adjusted.used], minlength=len(names))
+    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / total
+    if share.min() < MIN_AGREEING:
         k = int(share.argmin())
-        jump = find_jump(names, adjusted, seen)
+        jump = find_jump(names, adjusted, observations)
         if jump is not None and jump.camera == names[k]:
-            raise CameraFault({names[k]: jump.words()}, certain=False)
-        told = (
-            f"only {fitting[k]} of its {sightings[k]} sightings fit what the others saw: if these are few, wave before "
-            "it; else are its name and its intrinsics its own, and did it stand still? run python -m calib intrinsics "
-            f"--camera {names[k]}, or leave it out"
+            raise CameraFault({names[k]: jump.sentence()}, certain=False)
+        reason = (
+            f"only {fitting[k]} of its {total[k]} detections fit those of the other cameras: if it has few, wave the "
+            "wand in front of it; else check that its name and its intrinsics are its own and that it did not move; "
+            f"run python -m calib intrinsics --camera {names[k]}, or leave it out"
         )
-        raise CameraFault({names[k]: told}, certain=False)
+        raise CameraFault({names[k]: reason}, certain=False)
 
 
-def check_motion(wave: WandDetections, names: Sequence[str], lenses: Sequence[Lens]) -> None:
-    """Raise CalibrationError where no camera saw the wand move: a wand at rest fixes little, and nothing of clocks."""
+def check_motion(detections: WandDetections, names: Sequence[str], lenses: Sequence[Lens]) -> None:
+    """Raise CalibrationError where no camera saw the wand move: a wand at rest determines little, and no clock."""
     moved, share = {}, {}
     for k, (name, lens) in enumerate(zip(names, lenses, strict=True)):
-        for marker in np.unique(wave.label[wave.camera == k]):
-            uv = wave.uv[(wave.camera == k) & (wave.label == marker)]
+        for marker in np.unique(detections.label[detections.camera == k]):
+            uv = detections.uv[(detections.camera == k) & (detections.label == marker)]
             away = float(np.quantile(np.linalg.norm(uv - np.median(uv, axis=0), axis=1), 0.95))
             moved[name] = max(moved.get(name, 0.0), away)
             share[name] = moved[name] / max(lens.width, lens.height)
-    if share and max(share.values()) < MOVES:
+    if share and max(share.values()) < MIN_MOTION:
         name = max(moved, key=moved.__getitem__)
         raise CalibrationError(
-            f"the wand hardly moved: by {moved[name]:.1f} px before '{name}', and less before others; wave it through "
-            "the whole volume"
+            f"the wand hardly moved: by {moved[name]:.1f} px in the image of '{name}', and less in the others; wave it "
+            "through the whole volume"
         )
 
 
-def check_spacing(wand: Body, adjusted: Adjusted, seen: WandObservations) -> None:
-    """Raise CalibrationError where the cameras see the wand's markers at other distances than its file has."""
+def check_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
+    """Raise CalibrationError where the cameras measure other distances between the wand's markers than its file has."""
     pairs = np.array(list(combinations(range(len(wand.markers)), 2)), np.intp)
     if len(pairs) < 2:
         return
-    told = distances(wand.points[None], pairs)[0]
-    measured = distances(free_markers(adjusted, seen), pairs)
-    known = np.isfinite(measured).sum(axis=0) >= FEW
+    given = _distances(wand.points[None], pairs)[0]
+    measured = _distances(triangulate_markers(adjusted, observations), pairs)
+    known = np.isfinite(measured).sum(axis=0) >= MIN_MEASURED
     if not known.any():
         return
     found = np.nanmedian(measured[:, known], axis=0)
-    worst = int(np.abs(found - told[known]).argmax())
-    if abs(found[worst] - told[known][worst]) > SPACING * told.max():
+    worst = int(np.abs(found - given[known]).argmax())
+    if abs(found[worst] - given[known][worst]) > MAX_SPACING_ERROR * given.max():
         a, b = pairs[known][worst]
         raise CalibrationError(
-            f"the wand is not as its file says: markers {a} and {b} are {told[known][worst]:.3f} m apart there, and "
-            f"{found[worst]:.3f} m by what the cameras saw; measure the wand again"
+            f"the wand differs from its file: markers {a} and {b} are {given[known][worst]:.3f} m apart there, and "
+            f"{found[worst]:.3f} m as the cameras measure it; measure the wand again"
         )
 
 
-def check_sizes(wand: Body, adjusted: Adjusted, seen: WandObservations) -> None:
-    """Raise CalibrationError where the wand's lengths put roundels elsewhere than their sizes do."""
+def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
+    """Raise CalibrationError where the wand's lengths give other ranges of the roundels than their sizes do."""
     state, problem = adjusted.state, adjusted.problem
     if len(problem.wand.lengths) == 0:
         return
     lenses = [state.lens(k, lens) for k, lens in enumerate(problem.lenses)]
-    points = predict_markers(problem, seen, state).points
-    far = np.linalg.norm(points - state.cameras[seen.camera, :3, 3], axis=1)
-    ratio = ranges(lenses, seen, wand.diameter_m) / far
+    points = predict_markers(problem, observations, state).points
+    by_lengths = np.linalg.norm(points - state.cameras[observations.camera, :3, 3], axis=1)
+    ratio = ranges(lenses, observations, wand.diameter_m) / by_lengths
     known = np.isfinite(ratio) & adjusted.used
-    if not known.any() or abs(np.log(factor := float(np.median(ratio[known])))) < SIZE:
+    if not known.any() or abs(np.log(factor := float(np.median(ratio[known])))) < MAX_SIZE_ERROR:
         return
     raise CalibrationError(
         f"the wand's lengths and its roundels' sizes disagree by {abs(factor - 1):.0%}: by the lengths, the black disc "
-        f"is {wand.diameter_m / factor:.4f} m across, the wand file says {wand.diameter_m:.4f} m; measure both again"
+        f"is {wand.diameter_m / factor:.4f} m across, the wand file has {wand.diameter_m:.4f} m; measure both again"
     )
+
+
+def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> Array:
+    """(K, M, 3) positions of the wand's markers by the cameras alone, world; NaN where fewer than two cameras saw one.
+
+    One Gauss-Newton step of every marker of a frame set from its adjusted position, without the wand's lengths.
+    """
+    state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(adjusted.used)
+    markers = np.einsum("mb,kbx->kmx", problem.wand.weights, state.motion[:, 0])
+    camera, k, m = observations.camera[rows], observations.knot[rows], observations.label[rows]
+    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    J = np.nan_to_num(point_jacobians(lenses, state.cameras, camera, markers[k, m])[1])
+    weight, residuals = np.linalg.inv(observations.cov[rows]), np.nan_to_num(adjusted.residuals[rows])
+    A, b = np.zeros((*markers.shape, 3)), np.zeros(markers.shape)
+    np.add.at(A, (k, m), np.swapaxes(J, 1, 2) @ weight @ J)
+    np.add.at(b, (k, m), np.einsum("nji,njk,nk->ni", J, weight, residuals))
+    views = np.zeros((*markers.shape[:2], len(problem.lenses)))
+    views[k, m, camera] = 1
+    observed = views.sum(axis=2) >= 2
+    points = np.full(markers.shape, np.nan)
+    points[observed] = markers[observed] + np.linalg.solve(A[observed], b[observed][:, :, None])[:, :, 0]
+    return points
+
+
+def measure_lengths(adjusted: Adjusted, observations: WandObservations) -> Array:
+    """(n,) errors of the wand's lengths as the cameras alone measure them, metres."""
+    wand = adjusted.problem.wand
+    markers = triangulate_markers(adjusted, observations)
+    errors = _distances(markers[:, wand.basis], wand.pairs) - wand.lengths
+    return errors[np.isfinite(errors)]
+
+
+def _distances(points: Array, pairs: Index) -> Array:
+    """(K, P) distances of P pairs of points (K, N, 3)."""
+    ends = points[:, pairs]
+    return np.asarray(np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2), float)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How far a wand calibration can be trusted: by camera, by what each image was used for, and as a grade.
+"""Grades a wand calibration, camera by camera and as a whole, and advises what to improve.
 
-Every criterion is a figure with three limits; a camera's grade is that of its worst figure, the rig's that of its worst
-camera or of the wand's length. What a figure means for the person who waved stands with it.
+Each criterion is a figure with three limits. The grade of a camera is that of its worst figure; the grade of the rig is
+that of its worst camera or of the wand's length.
 """
 
 from dataclasses import dataclass
@@ -10,70 +10,72 @@ from typing import Any
 
 import numpy as np
 
-from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
-from calib.rig.camera import Camera, transform
+from calib.rig.camera import LENS, Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
-from calib.rig.triangulation import Joint
-from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.outcome import WandCalibration
-from calib.wand.quality.blame import lens_to_blame, pose_px
-from calib.wand.report import CameraReport
+from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
+from calib.rig.triangulation import JointCovariance, camera_jacobians
+from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.result import NOT_RECORDED, WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 
 GRADES = "ABCD"
-# A, B and C at most; beyond is D.
+# Largest value for A, B and C; a larger one is D.
 LIMITS = {
-    "residual_px": (0.3, 0.7, 1.5),  # a good lens at rest; webcams that blur; wrong lenses begin
-    "rejected": (0.05, 0.1, 0.25),  # part of the wand's markers
+    "residual_px": (
+        0.3,
+        0.7,
+        1.5,
+    ),  # sharp images and a good lens; webcams with motion blur; wrong intrinsics
+    "rejected": (0.05, 0.1, 0.25),  # part of the marker centres
     "pose_px": (
         0.1,
         0.3,
         1.0,
-    ),  # what the camera's own covariance moves a point by, beside 0.1 px of a roundel
-    "unused": (0.5, 0.7, 0.85),  # part of the image that other cameras see too
-    "length": (0.002, 0.005, 0.02),  # of the wand's length, off in the mean
+    ),  # image error by the camera's own covariance; 0.1 px is the noise of a roundel
+    "unused": (0.5, 0.7, 0.85),  # part of the image area shared with other cameras
+    "length": (0.002, 0.005, 0.02),  # relative mean error of the wand's length
 }
 ADVICE = {
-    "residual_px": "calibrate its lens again, and compare its time stamps",
-    "rejected": "look for reflections and other round things in its view",
-    "pose_px": "wave longer where it and two other cameras see the wand",
+    "residual_px": "calibrate its lens again, and check its timestamps",
+    "rejected": "look for reflections and other round objects in its view",
+    "pose_px": "wave the wand longer where it and two other cameras see it",
     "length": "measure the wand, and calibrate the lenses again",
 }
-NOT_RECORDED = "is not in the recording"  # the reason of a camera that was not there, which is nobody's fault
-CELLS = (4, 6)  # rows and columns in which an image is counted
-MANY = 4  # thirds of an image: more are not worth naming
-DEPTHS = (0.1, 0.5, 0.9)  # quantiles of the wand's distances, at which another camera may see too
+CELLS = (4, 6)  # rows and columns of the grid for the coverage of an image
+MAX_REGIONS = 4  # ninths of an image that advice names; more are the whole image
+DEPTHS = (0.1, 0.5, 0.9)  # quantiles of the wand's distance, at which the shared image area is computed
 
 
 @dataclass(frozen=True, slots=True)
 class CameraQuality:
-    """What there is to say of one placed camera.
+    """Figures of one placed camera.
 
     Attributes:
-        coverage: the wand's used markers in cells of the image.
-        useful: (rows, columns) cells in which another camera could see the wand too.
+        coverage: used marker centres by cell of the image.
+        shared: (rows, columns) cells in which another camera could see the wand too.
         figures: by criterion, of those in LIMITS that a camera has.
-        lens: the camera whose lens spoils `pose_px` most; empty where lenses make up less than half of its square.
-        noise_px: as `pose_px`, by the noise of what was seen alone: more of the same waving makes it smaller.
+        limiting_lens: the camera whose lens contributes most to `pose_px`; empty if all lenses together contribute less
+            than half of its variance.
+        noise_px: `pose_px` by the image noise alone, which a longer recording reduces.
     """
 
     name: str
     coverage: Coverage
-    useful: Mask
+    shared: Mask
     figures: dict[str, float]
-    lens: str = ""
+    limiting_lens: str = ""
     noise_px: float = 0.0
 
     @property
     def missing(self) -> Mask:
-        """(rows, columns) useful cells through which the wand was not waved."""
-        return self.useful & ~self.coverage.used
+        """(rows, columns) shared cells without a used marker."""
+        return self.shared & ~self.coverage.used
 
     @property
-    def strain(self) -> float:
-        """What the wave's noise moves a pixel by, over the pixel's own noise (0.1 px, or its residual)."""
+    def noise_ratio(self) -> float:
+        """`noise_px` over the noise of a pixel: 0.1 px, or the residual if that is larger."""
         return self.noise_px / max(SIGMA_PX, self.figures["residual_px"] / np.sqrt(2))
 
     @property
@@ -84,184 +86,219 @@ class CameraQuality:
     @property
     def worst(self) -> str:
         """The criterion that gives the grade: the one farthest beyond its limits."""
-        return max(self.figures, key=lambda name: _strain(name, self.figures[name]))
+        return max(self.figures, key=lambda name: _severity(name, self.figures[name]))
 
     @property
     def advice(self) -> str:
-        """What to do about the worst criterion."""
-        if self.worst == "pose_px" and self.lens:
-            return (
-                f"the lens of '{self.lens}' is known too roughly: wave longer, or run python -m calib intrinsics "
-                f"--camera {self.lens}"
-            )
+        """How to improve the worst criterion."""
+        if self.worst == "pose_px" and self.limiting_lens:
+            return _advise_lens(f"the lens of '{self.limiting_lens}' is", self.limiting_lens)
         return self.wave_next if self.worst == "unused" else ADVICE[self.worst]
 
     @property
     def wave_next(self) -> str:
-        """Where to wave next, such as `wave in its upper left`; empty where nothing useful is missing."""
-        missing = self.coverage.missing(self.useful)
-        if len(missing) > MANY:
+        """Where to wave the wand next, such as `wave in its upper left`; empty if no shared cell is missing."""
+        regions = self.coverage.missing(self.shared)
+        if len(regions) > MAX_REGIONS:
             return "wave through its whole image"
-        return f"wave in its {enumerate_words(missing)}" if missing else ""
+        return f"wave in its {enumerate_words(regions)}" if regions else ""
 
 
 @dataclass(frozen=True, slots=True)
 class RigQuality:
-    """What a person needs to know before relying on a rig.
+    """Quality of a calibrated rig.
 
     Attributes:
-        cameras: placed ones.
-        unplaced: why, and what to do, by name of those that could not be placed.
-        length: how far the wand's length is off in the mean, as a part of it; None without two markers.
-        expected: errors of points across the waved arena, at robots' height; None where the rig knows no metres.
+        cameras: the placed ones.
+        unplaced: reason and remedy, by name of each recorded camera that could not be placed.
+        length_error: relative mean error of the wand's length; None with one marker.
+        expected: predicted errors of points at the height of robots' roundels; None for a rig without scale.
     """
 
     cameras: list[CameraQuality]
     unplaced: dict[str, str]
-    length: float | None
+    length_error: float | None
     expected: PrecisionMap | None
 
     @property
     def grade(self) -> str:
         """A to D: that of the worst camera, or of the wand's length."""
         grades = [camera.grade for camera in self.cameras] + ["D"] * bool(self.unplaced)
-        return max(grades + ([grade("length", self.length)] if self.length is not None else []))
+        return max(grades + ([grade("length", self.length_error)] if self.length_error is not None else []))
 
     def sentence(self) -> str:
-        """The grade, whose fault it is, and what to do."""
-        worst = max(self.cameras, key=lambda camera: _strain(camera.worst, camera.figures[camera.worst]))
+        """State the grade, its cause and the remedy."""
+        worst = max(self.cameras, key=lambda camera: _severity(camera.worst, camera.figures[camera.worst]))
         if self.unplaced:
-            told = "; ".join(f"camera '{name}' has no place: {why}" for name, why in self.unplaced.items())
-            return f"grade D: {told}"
-        if self.length is not None and grade("length", self.length) == self.grade > worst.grade:
-            return f"grade {self.grade}: the wand's length is {self.length:.2%} off; {ADVICE['length']}"
+            reasons = "; ".join(
+                f"camera '{name}' is not placed: {why}" for name, why in self.unplaced.items()
+            )
+            return f"grade D: {reasons}"
+        if self.length_error is not None and grade("length", self.length_error) == self.grade > worst.grade:
+            return f"grade {self.grade}: the wand's length is {self.length_error:.2%} off; {ADVICE['length']}"
         if self.grade == "A":
-            return "grade A: every camera is placed well"
-        said = _describe(worst.worst, worst.figures[worst.worst])
-        return f"grade {self.grade}: camera '{worst.name}', {said}" + (
+            return "grade A: all cameras meet the limits"
+        cause = _describe(worst.worst, worst.figures[worst.worst])
+        return f"grade {self.grade}: camera '{worst.name}', {cause}" + (
             f"; {worst.advice}" if worst.advice else ""
         )
 
-    def spoilt(self) -> list[str]:
-        """Which lenses keep cameras from being placed better, line by line."""
-        blamed: dict[str, list[str]] = {}
+    def lens_warnings(self) -> list[str]:
+        """List the lenses whose uncertainty limits the poses of cameras, one line each."""
+        limited: dict[str, list[str]] = {}
         for camera in self.cameras:
-            if camera.lens and grade("pose_px", camera.figures["pose_px"]) > "A":
-                blamed.setdefault(camera.lens, []).append(camera.name)
+            if camera.limiting_lens and grade("pose_px", camera.figures["pose_px"]) > "A":
+                limited.setdefault(camera.limiting_lens, []).append(camera.name)
         return [
-            f"warning: the lens of {lens} is known too roughly, and so is the place of {enumerate_words(names)}: wave "
-            f"longer, or run python -m calib intrinsics --camera {lens}"
-            for lens, names in blamed.items()
+            "warning: "
+            + _advise_lens(f"the lens of {lens}, and with it the pose of {enumerate_words(names)}, is", lens)
+            for lens, names in limited.items()
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """For the `calibration` map of `rig.yaml`."""
-        expected = {}
-        if self.expected is not None and np.isfinite(self.expected.typical_mm):
-            figures = {
-                "median": self.expected.typical_mm,
-                "worst": self.expected.worst_mm,
-                "height": self.expected.z,
+        """Return the entries for the `calibration` map of `rig.yaml`."""
+        cameras = {
+            camera.name: {
+                "grade": camera.grade,
+                **{name: round(value, 4) for name, value in camera.figures.items()},
+                **({"next": camera.wave_next} if camera.wave_next else {}),
             }
-            expected = {"expected_mm": {name: round(value, 3) for name, value in figures.items()}}
+            for camera in self.cameras
+        }
+        return {"grade": self.grade, "because": self.sentence(), **self._expected(), "quality": cameras}
+
+    def _expected(self) -> dict[str, Any]:
+        if self.expected is None or not np.isfinite(self.expected.typical_mm):
+            return {}
+        values = self.expected.typical_mm, self.expected.worst_mm, self.expected.grid.z
         return {
-            "grade": self.grade,
-            "because": self.sentence(),
-            **expected,
-            "trust": {
-                camera.name: {
-                    "grade": camera.grade,
-                    **{name: round(value, 4) for name, value in camera.figures.items()},
-                    **({"next": camera.wave_next} if camera.wave_next else {}),
-                }
-                for camera in self.cameras
-            },
+            "expected_mm": dict(
+                zip(("median", "worst", "height"), (round(v, 3) for v in values), strict=True)
+            )
         }
 
 
 def grade(criterion: str, value: float) -> str:
-    """A to D by the limits; NaN is D."""
+    """Return A to D by the limits; NaN is D."""
     return next((g for g, limit in zip(GRADES, LIMITS[criterion], strict=False) if value <= limit), "D")
 
 
-def _strain(criterion: str, value: float) -> float:
-    """A figure over its limit for B: comparable between criteria of the same grade, and D after C after B."""
+def _severity(criterion: str, value: float) -> float:
+    """Return the grade as a number, plus the figure relative to its limit for C: comparable between criteria."""
     position = GRADES.index(grade(criterion, value))
     return position + min(value / LIMITS[criterion][-1], 1.0) / 2 if np.isfinite(value) else len(GRADES)
 
 
 def _describe(criterion: str, value: float) -> str:
-    said = {
+    texts = {
         "residual_px": f"residual {value:.2f} px",
         "rejected": f"{value:.0%} of its markers rejected",
-        "pose_px": f"its place is known to {value:.2f} px only",
-        "unused": f"{value:.0%} of what it could share with others was not waved through",
+        "pose_px": f"uncertainty of its pose {value:.2f} px",
+        "unused": f"{value:.0%} of the image area that it shares with others unused",
     }
-    return said[criterion]
+    return texts[criterion]
 
 
-def assess(
-    result: WandCalibration, wand: Body, height_m: float = 0.1, sigma_px: float = SIGMA_PX
-) -> RigQuality:
-    """Judge a calibration.
+def _advise_lens(subject: str, name: str) -> str:
+    return f"{subject} too uncertain: wave longer, or run python -m calib intrinsics --camera {name}"
+
+
+def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQuality:
+    """Grade a calibration.
 
     Args:
         result: of `calib.wand.calibrate.calibrate`.
-        wand: the wand of it.
-        height_m: at which robots carry their roundels.
-        sigma_px: standard deviation of a roundel's centre when robots are tracked.
+        wand: that of the recording.
+        height_m: height of the robots' roundels.
     """
-    wave = waved_points(result)
-    rows = {row.name: row for row in result.report.cameras}
+    positions = wand_positions(result)
     covariance = camera_covariance(result.adjusted)
-    noise, joint = covariance.noise, covariance.joint
-    cameras = [
-        _assess_camera(result, k, rows[name], wave, noise, joint) for k, name in enumerate(result.names)
-    ]
-    length, extent = result.report.length_mean_mm, np.linalg.norm(np.ptp(wand.points, axis=0))
-    expected = None
-    if result.report.metric:
-        low, high = np.quantile(wave[:, :2], [0.02, 0.98], axis=0)
-        placed = [result.rig.cameras[name] for name in result.names]
-        size = joint.shape[0] * joint.shape[1]
-        doubt = Joint(result.adjusted.problem.free, joint.reshape(size, size))
-        expected = map_precision(placed, low, high, height_m, sigma_px, doubt)
-    off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
+    cameras = [_assess_camera(result, k, positions, covariance) for k in range(len(result.names))]
+    length_mm, extent = result.report.length_mean_mm, np.linalg.norm(np.ptp(wand.points, axis=0))
+    error = None if length_mm is None or extent == 0 else abs(length_mm) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
-    return RigQuality(cameras, unplaced, off, expected)
+    expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
+    return RigQuality(cameras, unplaced, error, expected)
 
 
-def waved_points(result: WandCalibration) -> Array:
-    """(N, 3) where the wand has been, in the rig's world."""
+def wand_positions(result: WandCalibration) -> Array:
+    """Return (N, 3) positions of the wand's basis markers, in the rig's world."""
     T_world_adjusted = result.rig.cameras[result.names[0]].matrix() @ invert(result.adjusted.state.cameras[0])
     return transform(T_world_adjusted, result.adjusted.state.motion[:, 0].reshape(-1, 3))
 
 
+def _predict(
+    result: WandCalibration, positions: Array, covariance: CameraCovariance, height_m: float
+) -> PrecisionMap:
+    """Predict the errors of points across the area where the wand was."""
+    size = len(covariance.joint) * len(covariance.free)
+    low, high = np.quantile(positions[:, :2], [0.02, 0.98], axis=0)
+    cameras = [result.rig.cameras[name] for name in result.names]
+    joint = JointCovariance(covariance.free, covariance.joint.reshape(size, size))
+    return map_precision(cameras, FloorGrid.covering(low, high, height_m), SIGMA_PX, joint)
+
+
 def _assess_camera(
-    result: WandCalibration, k: int, row: CameraReport, wave: Array, noise: Array, joint: Array
+    result: WandCalibration, k: int, positions: Array, covariance: CameraCovariance
 ) -> CameraQuality:
-    """Camera k, by covariances (C, d, C, d) of all cameras: by the wave's noise alone, and by all that is unknown."""
+    row, joint, free = result.report.cameras[k], covariance.joint, covariance.free
     camera = result.rig.cameras[row.name]
-    seen = result.observations
-    uv = seen.uv[(seen.camera == k) & result.adjusted.used]
+    uv = result.observations.uv[(result.observations.camera == k) & result.adjusted.used]
     coverage = Coverage.of(uv, camera.width, camera.height, CELLS)
-    distances = np.linalg.norm(wave - camera.matrix()[:3, 3], axis=1)
+    distances = np.linalg.norm(positions - camera.matrix()[:3, 3], axis=1)
     others = [result.rig.cameras[name] for name in result.names if name != row.name]
-    useful = shared_cells(camera, others, np.quantile(distances, DEPTHS))
-    distance = float(np.median(distances))
+    shared = shared_cells(camera, others, np.quantile(distances, DEPTHS))
+    rays = camera.rays(uv)
+    points = rays[np.isfinite(rays).all(axis=1)] * float(np.median(distances))
+    J = camera_jacobians(camera, points, free)
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": pose_px(result, k, uv, distance, joint),
-        "unused": 1 - coverage.share(useful),
+        "pose_px": _rms_px(J, joint[k, :, k]),
+        "unused": 1 - coverage.share(shared),
     }
-    lens = lens_to_blame(result, k, uv, distance, joint)
-    noise_px = pose_px(result, k, uv, distance, noise)
-    return CameraQuality(row.name, coverage, useful, figures, lens, noise_px)
+    lens = find_limiting_lens(J, joint, k, [free.index(p) for p in LENS])
+    name = "" if lens is None else result.names[lens]
+    return CameraQuality(row.name, coverage, shared, figures, name, _rms_px(J, covariance.noise[k, :, k]))
+
+
+def _rms_px(J: Array, covariance: Array) -> float:
+    """Return the RMS image error per coordinate of points with Jacobians (n, 2, d), for a covariance (d, d)."""
+    if not len(J):
+        return float("nan")
+    return float(np.sqrt(np.einsum("nii->n", J @ covariance @ np.swapaxes(J, 1, 2)).mean() / 2))
+
+
+def find_limiting_lens(J: Array, joint: Array, k: int, lens: list[int]) -> int | None:
+    """Return the camera whose lens, if known, would reduce the image errors of camera k most.
+
+    Args:
+        J: (n, 2, d) Jacobians of points in the image of camera k.
+        joint: (C, d, C, d) covariance of all cameras.
+        lens: columns of the lens parameters.
+
+    Returns:
+        its index; None if all lenses together would not halve the variance.
+    """
+    cov_lenses = joint[:, lens][:, :, :, lens]
+    cross = np.einsum("nip,pcl->nicl", J, joint[k][:, :, lens])
+    single = [_explained(cross[:, :, c], cov_lenses[c, :, c]) for c in range(len(cov_lenses))]
+    size = len(lens) * len(single)
+    together = _explained(cross.reshape(*J.shape[:2], -1), cov_lenses.reshape(size, size))
+    total = float(np.einsum("nip,pq,niq->", J, joint[k, :, k], J))
+    return int(np.argmax(single)) if together > total / 2 else None
+
+
+def _explained(cross: Array, covariance: Array) -> float:
+    """Return the variance, summed over pixels, that knowing parameters would remove, from their covariance (l, l) and
+    the covariances `cross` (n, 2, l) of the pixels with them."""
+    unit = np.sqrt(np.diag(covariance))
+    scaled = cross / unit
+    return float(np.einsum("nip,pq,niq->", scaled, np.linalg.inv(covariance / np.outer(unit, unit)), scaled))
 
 
 def shared_cells(camera: Camera, others: list[Camera], distances: Array) -> Mask:
-    """(rows, columns) the cells of a camera's image in which, at one of these distances, another camera sees too."""
+    """Return (rows, columns) the image cells whose points at one of the distances another camera sees too."""
     rays = camera.rays(cell_centres(camera.width, camera.height, CELLS))
     shared = np.zeros(len(rays), bool)
     for distance in distances:

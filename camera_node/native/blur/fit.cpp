@@ -4,32 +4,35 @@
 #include <algorithm>
 #include <cmath>
 
-#include "numeric/cholesky.hpp"
 #include "blur/sums.hpp"
-#include "fit/pose_outputs.hpp"
-#include "fit/starting_point.hpp"
+#include "fit/fit_covariance.hpp"
+#include "fit/gauss_newton.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr int kCoarsePixels = 240, kFinePixels = 1200;
-constexpr double kCoarseSpacing = 1.5, kFineSpacing = 1;  // of the exposure's instants, pixels
-constexpr int kCoarseSteps = 14, kFineSteps = 5;
-constexpr double kArrived = 0.1, kDone = 0.01;  // greatest moves of a step, pixels
-constexpr double kStartBlur = 0.9;
-// Standard deviations before a pixel is seen: less than in `refine`, as a motion hides both.
-constexpr double kAnyRatio = 0.05, kAnyBlur = 0.5;
-constexpr double kLeastMotion = 0.1;  // of the minor axis: what moves less is still
-constexpr double kHopeless = 0.15;    // residuals over the contrast that no more steps will mend
-constexpr double kBeyond = 100;       // grey levels off the scale
-constexpr double kLeastSpread = 0.2;  // of the ground, grey levels
-constexpr double kMostSpread = 100;
-constexpr double kPatch = 64;  // pixels of the ground that are off together
+/// One stage of the iteration: the approximate number of pixels, the spacing of the exposure's time steps in
+/// pixels of motion, the maximum number of steps, and the step length in pixels at which it stops.
+struct Stage {
+    int pixels;
+    double spacing;
+    int max_steps;
+    double converged;
+};
+constexpr Stage kCoarse{240, 1.5, 14, 0.1}, kFine{1200, 1, 5, 0.01};
 
-double square(double x) { return x * x; }
+constexpr double kInitialBlur = 0.9;
+// Prior standard deviations. They are smaller than those of fit_photometric: a motion hides both.
+constexpr double kRatioPrior = 0.05, kBlurPrior = 0.5;
+constexpr double kMinMotion = 0.1;   // over the minor axis: below it the roundel counts as still
+constexpr double kMaxMotion = 4;     // mean radii
+constexpr double kMaxMisfit = 0.15;  // residuals over the contrast after the coarse stage
+constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
+constexpr double kPatch = 64;                         // pixels of the ground with correlated levels
+constexpr SanityLimits kLimits{.shift = 0.6, .min_size = 0.6, .max_size = 1.6, .blur = 0, .overflow = 100};
 
-/// A motion and a still picture's parameters.
+/// A motion followed by the parameters of a still picture.
 MovingParameters join(double x, double y, const Parameters& picture) {
     MovingParameters p{};
     p[kMotionX] = x, p[kMotionY] = y;
@@ -37,97 +40,69 @@ MovingParameters join(double x, double y, const Parameters& picture) {
     return p;
 }
 
-/// Gauss-Newton on the pixels that a moving roundel passes.
-class MovingFitter {
+class MovingFitter : GaussNewton<kMovingCount> {
   public:
-    MovingFitter(const ImageView& image, const MovingStart& start) : image_(image) {
-        pixels_.origin_x = int(std::lround(start.still.outer.x));
-        pixels_.origin_y = int(std::lround(start.still.outer.y));
-        p_ = start_ = join(start.motion_x, start.motion_y,
-                           starting_point(start.still, pixels_.origin_x, pixels_.origin_y, kStartBlur));
-        prior_ = join(0, 0, prior_information(start.still.outer.major, kAnyRatio, kAnyBlur));
+    MovingFitter(const ImageView& image, const MovingGuess& guess) : image_(image) {
+        pixels_.origin_x = int(std::lround(guess.still.outer.x));
+        pixels_.origin_y = int(std::lround(guess.still.outer.y));
+        p_ = start_ = join(guess.motion_x, guess.motion_y,
+                           initial_parameters(guess.still, pixels_.origin_x, pixels_.origin_y, kInitialBlur));
+        prior_ = join(0, 0, prior_information(guess.still.outer.major, kRatioPrior, kBlurPrior));
     }
 
-    bool solve() {
-        return iterate(kCoarsePixels, kCoarseSpacing, kCoarseSteps, kArrived) &&
-               noise_ < kHopeless * contrast() && iterate(kFinePixels, kFineSpacing, kFineSteps, kDone);
-    }
-    Fit fit() const;
+    bool solve() { return iterate(kCoarse) && noise_ < kMaxMisfit * contrast() && iterate(kFine); }
+    RoundelFit fit() const;
 
   private:
-    bool iterate(int limit, double spacing, int steps, double enough) {
-        select_moving(image_, p_, limit, pixels_);
+    bool iterate(const Stage& stage) {
+        select_moving(image_, p_, stage.pixels, pixels_);
         if (pixels_.used < 2 * kMovingCount) return false;
-        for (int k = 0; k < steps; ++k) {
-            sums_ = accumulate(pixels_, p_, spacing, kPatch * square(spread_ / noise_));
-            learn_noise();
-            add_prior();
-            factor_.emplace(sums_.H);
-            if (!factor_->positive()) return false;
+        for (int k = 0; k < stage.max_steps; ++k) {
+            sums_ = accumulate(pixels_, p_, stage.spacing, kPatch * square(spread_ / noise_));
+            update_noise();
+            if (!factorize(sums_.system, noise_)) return false;
             const double moved = advance();
-            if (!is_sane()) return false;
-            if (k > 0 && moved < enough) return true;
+            if (!is_sane(kLimits) || motion() >= kMaxMotion * start_radius()) return false;
+            if (k > 0 && moved < stage.converged) return true;
         }
         return true;
     }
 
-    /// The noise where no ground was seen, and how much the ground varies where it was.
-    void learn_noise() {
+    /// Estimates the noise from the pixels that do not see the ground, and the ground's standard deviation
+    /// from those that do.
+    void update_noise() {
         noise_ = std::max(1.0, std::sqrt(sums_.wrr / std::max(1.0, sums_.w - kMovingCount)));
         const double beyond = sums_.ground_rr - square(noise_) * sums_.ground;
         const double spread = std::sqrt(std::max(0.0, beyond) / std::max(1e-9, sums_.ground_ground));
-        spread_ = std::clamp(spread, kLeastSpread, kMostSpread);
+        spread_ = std::clamp(spread, kMinSpread, kMaxSpread);
     }
 
-    void add_prior() {
-        for (int i = 0; i < kMovingCount; ++i) {
-            const double information = square(noise_) * prior_[size_t(i)];
-            sums_.H[i][i] += information;
-            sums_.g[i] += information * (start_[i] - p_[i]);
-        }
-    }
-
-    /// Takes a step, at most a quarter of the minor axis long; gives its greatest move in pixels.
+    /// Takes a step; its geometric part is at most a quarter of the mean radius long. Returns the length of
+    /// the full step: the greatest change of its components, pixels.
     double advance() {
-        const MovingParameters delta = factor_->solve(sums_.g);
+        MovingParameters delta = factor_->solve(sums_.system.g);
         double moved = std::max(std::abs(delta[kMotionX]), std::abs(delta[kMotionY])) / 2;
         for (int i = kX; i <= kAyy; ++i) moved = std::max(moved, std::abs(delta[kStill + i]));
-        const double longest = std::sqrt(size(start_)) / 4, share = std::min(1.0, longest / moved);
+        const double share = std::min(1.0, start_radius() / 4 / moved);
         for (int i = 0; i < kMovingCount; ++i)
-            p_[i] += (i < kStill || i >= kStill + kBlur ? share : 1) * delta[i];
-        p_[kStill + kBlur] = std::max(p_[kStill + kBlur], kMinBlur);
+            if (i < kStill || i >= kStill + kBlur) delta[i] *= share;
+        apply(delta);
         return moved;
     }
 
-    double contrast() const { return p_[kStill + kBright] - p_[kStill + kDark]; }
-
-    static double size(const MovingParameters& p) {
-        return p[kStill + kAxx] * p[kStill + kAyy] - square(p[kStill + kAxy]);
-    }
-
-    bool is_sane() const {
-        const double area = size(p_) / size(start_), radius = std::sqrt(size(start_));
-        const Parameters p = still(p_), s = still(start_);
-        return std::hypot(p[kX] - s[kX], p[kY] - s[kY]) < 1 + 0.6 * radius && p[kAxx] > 0 &&
-               area > square(0.6) && area < square(1.6) && p[kRatio] > 0.1 && p[kRatio] < 0.95 &&
-               p[kBlur] < 3 && p[kCard] > 1 && p[kDark] > -kBeyond && p[kBright] < 255 + kBeyond &&
-               square(p[kGx]) + square(p[kGy]) < square(0.5 / p[kCard]) &&
-               std::hypot(p_[kMotionX], p_[kMotionY]) < 4 * radius;
-    }
+    double motion() const { return std::hypot(p_[kMotionX], p_[kMotionY]); }
 
     const ImageView& image_;
     MovingPixels pixels_;
-    MovingParameters p_, start_, prior_;
     MovingSums sums_;
-    std::optional<Cholesky<kMovingCount>> factor_;
     double noise_ = 20, spread_ = 40;
 };
 
-Fit MovingFitter::fit() const {
+RoundelFit MovingFitter::fit() const {
     auto pose = factor_->inverse_tail<kPoseCount>();
     for (auto& row : pose)
         for (double& value : row) value *= square(noise_);
-    Fit fit = fit_of(still(p_), pose, pixels_.origin_x, pixels_.origin_y);
+    RoundelFit fit = make_fit(still(p_), pose, pixels_.origin_x, pixels_.origin_y);
     fit.motion_x = p_[kMotionX], fit.motion_y = p_[kMotionY];
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = noise_;
@@ -137,12 +112,12 @@ Fit MovingFitter::fit() const {
 
 }  // namespace
 
-std::optional<Fit> refine_moving(const ImageView& image, const MovingStart& start) {
-    MovingFitter fitter(image, start);
+std::optional<RoundelFit> fit_moving(const ImageView& image, const MovingGuess& guess) {
+    MovingFitter fitter(image, guess);
     if (!fitter.solve()) return std::nullopt;
-    const Fit fit = fitter.fit();
-    return std::hypot(fit.motion_x, fit.motion_y) > kLeastMotion * fit.outer.minor ? std::optional(fit)
-                                                                                   : std::nullopt;
+    const RoundelFit fit = fitter.fit();
+    const bool moves = std::hypot(fit.motion_x, fit.motion_y) > kMinMotion * fit.outer.minor;
+    return moves ? std::optional(fit) : std::nullopt;
 }
 
 }  // namespace roundel

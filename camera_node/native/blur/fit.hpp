@@ -2,27 +2,28 @@
 #pragma once
 #include <optional>
 
-#include "numeric/image.hpp"
 #include "fit/photometric_fit.hpp"
+#include "numeric/image.hpp"
 
 namespace roundel {
 
-/// What the fit of a moving roundel starts from: its picture in mid-exposure, good to an eighth of its
-/// diameter, and the way that it moves during the exposure, pixels, good to a third of it.
-struct MovingStart {
-    Start still;
+/// The initial guess of the fit of a moving roundel: its picture at mid-exposure, within an eighth of its
+/// diameter, and its motion during the exposure in pixels, within a third of it.
+struct MovingGuess {
+    InitialGuess still;
     double motion_x, motion_y;
 };
 
-/// Fits a roundel that moves straight and evenly while it is exposed: `refine`'s model, averaged over the
-/// exposure, with two more unknowns. By Gauss-Newton, first on a part of the pixels. The ellipse that it
-/// gives is that of mid-exposure, and `dark` and `bright` are the levels of a still picture.
+/// Fits a roundel that moves in a straight line at constant speed during the exposure. The model is that of
+/// fit_photometric averaged over the exposure, with two more parameters. Gauss-Newton, first on a subset of
+/// the pixels. The resulting ellipse is that of mid-exposure; `dark` and `bright` are those of a still
+/// picture.
 ///
-/// What lies under the moving card is seen through for a part of the exposure. Of a cluttered ground no more
-/// is known than how much it varies, so pixels count less the more of it they saw.
+/// The ground under the moving card is visible for a part of the exposure. Only the variance of its levels is
+/// estimated, so pixels have less weight the longer they see it.
 ///
-/// The covariance is that of the weighted fit, its noise from the residuals, at least one grey level; nothing
-/// is widened. Nothing comes back where the fit leaves the start's neighbourhood, or nothing moves.
-std::optional<Fit> refine_moving(const ImageView& image, const MovingStart& start);
+/// The covariance is that of the weighted fit, with the noise of the residuals, at least one grey level.
+/// Returns nothing if the fit leaves the neighbourhood of the guess, or if the roundel does not move.
+std::optional<RoundelFit> fit_moving(const ImageView& image, const MovingGuess& guess);
 
 }  // namespace roundel

@@ -5,7 +5,7 @@
 #include <cmath>
 #include <numbers>
 
-#include "fit/gram.hpp"
+#include "numeric/gram.hpp"
 #include "numeric/simd.hpp"
 
 namespace roundel {
@@ -13,7 +13,7 @@ namespace roundel {
 namespace {
 
 constexpr int kColumns = kMovingCount + 1;  // the gradient and the residual
-constexpr double kMargin = 2.5;             // pixels around the disc's way
+constexpr double kMargin = 2.5;             // pixels around the disc's path
 
 struct LaneSums {
     Gram<kColumns> gram;
@@ -23,7 +23,7 @@ struct LaneSums {
 ROUNDEL_INLINE void weigh(const MovingGradient& model, const Lanes& level, float spread, int k,
                           Columns<kColumns>& columns, LaneSums& sums) {
     const Lanes r = level - model.level[k], share = model.by[kStill + kGround][k], gg = share * share;
-    const Bits counts = ~is_silent(level, model.level[k]);
+    const Bits counts = ~is_uninformative(level, model.level[k]);
     const Lanes w = counts ? 1.0f / (1.0f + spread * gg) : all(0);
     const Lanes root = w > 0.0f ? w * inverse_sqrt(w > 0.0f ? w : all(1)) : all(0);
     const Lanes &bx = model.by[kStill + kX][k], &by = model.by[kStill + kY][k];
@@ -48,10 +48,10 @@ ROUNDEL_CLONES void add_up(const MovingPixels& pixels, const MovingModel& model,
     }
 }
 
-/// Where a disc moves, in its own radii: a point's distance from the way of its centre.
-class Way {
+/// The path of a disc's centre, for distances of points from it in radii of the disc.
+class Path {
   public:
-    explicit Way(const MovingParameters& p) : p_(still(p)) {
+    explicit Path(const MovingParameters& p) : p_(still(p)) {
         det_ = p_[kAxx] * p_[kAyy] - p_[kAxy] * p_[kAxy];
         to_radii(p[kMotionX], p[kMotionY], u_, v_);
         length_ = u_ * u_ + v_ * v_ + 1e-12;
@@ -82,7 +82,7 @@ void append(const ImageView& image, int x, int y, MovingPixels& to) {
 }  // namespace
 
 void select_moving(const ImageView& image, const MovingParameters& p, int limit, MovingPixels& pixels) {
-    const Way way(p);
+    const Path path(p);
     const Eigen axes = eigen(circle_image(still(p), 1).shape);
     const double a = std::sqrt(axes.first), b = std::sqrt(axes.second);
     const double reach = 1 + kMargin / b, x0 = p[kStill + kX], y0 = p[kStill + kY];
@@ -93,17 +93,18 @@ void select_moving(const ImageView& image, const MovingParameters& p, int limit,
     pixels.used = pixels.expected = 0;
     for (int y = int(y0 - half_h); y <= int(y0 + half_h); y += step)
         for (int x = int(x0 - half_w); x <= int(x0 + half_w); x += step)
-            if (way.distance(x, y) < reach) append(image, x, y, pixels);
-    pixels.fill_up();
+            if (path.distance(x, y) < reach) append(image, x, y, pixels);
+    pixels.pad();
 }
 
 MovingSums accumulate(const MovingPixels& pixels, const MovingParameters& p, double spacing, double spread) {
     LaneSums sums{};
     add_up(pixels, MovingModel(p, spacing), float(spread), sums);
     MovingSums e;
+    auto& [H, g] = e.system;
     for (int i = 0; i < kMovingCount; ++i) {
-        for (int j = 0; j <= i; ++j) e.H[i][j] = sum(sums.gram[j][i]);
-        e.g[i] = sum(sums.gram[i][kMovingCount]);
+        for (int j = 0; j <= i; ++j) H[i][j] = sum(sums.gram[j][i]);
+        g[i] = sum(sums.gram[i][kMovingCount]);
     }
     e.wrr = sum(sums.gram[kMovingCount][kMovingCount]), e.w = sum(sums.w);
     e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr);

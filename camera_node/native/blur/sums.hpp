@@ -1,24 +1,24 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
-#include "numeric/image.hpp"
 #include "blur/model.hpp"
-#include "fit/pixel_columns.hpp"
+#include "fit/edge_pixels.hpp"
+#include "fit/gauss_newton.hpp"
+#include "numeric/image.hpp"
 
 namespace roundel {
 
-/// Pixels that a moving roundel passes.
+/// The pixels over which a roundel moves.
 using MovingPixels = PixelColumns<2048>;
 
-/// Fills `pixels` by about `limit` of those that the disc passes, and a margin around its way.
+/// Selects about `limit` of the pixels over which the disc moves, with a margin.
 void select_moving(const ImageView& image, const MovingParameters& p, int limit, MovingPixels& pixels);
 
-/// Sums over pixels at one point of the parameters. The weight of a pixel is 1 / (1 + spread g^2), g being
-/// the share of the exposure in which it saw the ground.
+/// Sums over pixels at one point of the parameters. The weight of a pixel is 1 / (1 + spread g^2); g is the
+/// share of the exposure in which it sees the ground.
 struct MovingSums {
-    std::array<MovingParameters, kMovingCount> H;  // J^T W J, the lower triangle
-    MovingParameters g;                            // J^T W r
+    GaussNewtonSystem<kMovingCount> system;
     double w, wrr;
-    double ring, ring_rr;                     // weighed squared slopes, and times squared residuals
+    double ring, ring_rr;                     // weighted squared slopes, and times squared residuals
     double ground, ground_rr, ground_ground;  // g^2, g^2 r^2 and g^4
 };
 

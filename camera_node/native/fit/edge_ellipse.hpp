@@ -7,13 +7,13 @@
 
 namespace roundel {
 
-/// The image of one circle as x = e + B u, |u| = 1, with B symmetric: a pose of its own, without perspective.
+/// The image of one circle as an ellipse x = e + B u, |u| = 1, with B symmetric: a pose without perspective.
 class EdgeEllipse {
   public:
     static constexpr int kShape = kAyy - kX + 1;
-    /// How a coordinate of e or B moves with each of the pose's parameters and, last, with the radius.
-    using Move = Vector<kPoseCount + 1>;
-    using Moves = std::array<Move, kShape>;
+    /// The derivatives of one coordinate of e or B by each of the pose's parameters and, last, by the radius.
+    using Row = Vector<kPoseCount + 1>;
+    using Jacobian = std::array<Row, kShape>;
 
     EdgeEllipse(const Parameters& p, Edge edge)
         : p_(p), r_(radius_of(edge, p)), image_(circle_image(p, r_)), is_outer_(edge == kOuterEdge) {
@@ -22,7 +22,7 @@ class EdgeEllipse {
         B_ = {(S.xx + root_) / trace_, S.xy / trace_, (S.yy + root_) / trace_};  // B B = S
     }
 
-    /// The parameters with this ellipse as the pose: the circle's radius is 1.
+    /// The parameters of a picture with this ellipse as the image of the unit circle.
     Parameters as_pose() const {
         Parameters p = p_;
         p[kX] = image_.x, p[kY] = image_.y, p[kAxx] = B_.xx, p[kAxy] = B_.xy, p[kAyy] = B_.yy;
@@ -30,26 +30,26 @@ class EdgeEllipse {
         return p;
     }
 
-    /// The outer circle's radius is always 1.
-    Moves moves() const {
-        Moves moves{};
-        moves[0][0] = moves[kY - kX][kY - kX] = 1;
-        const auto set = [&](int by, const Vector<kShape>& move) {
-            for (int i = 0; i < kShape; ++i) moves[i][by] = move[i];
+    /// The derivatives by the radius are 0 for the outer circle: its radius is 1 by definition.
+    Jacobian jacobian() const {
+        Jacobian J{};
+        J[0][0] = J[kY - kX][kY - kX] = 1;
+        const auto set = [&](int by, const Vector<kShape>& column) {
+            for (int i = 0; i < kShape; ++i) J[i][by] = column[i];
         };
-        set(kAxx - kX, move({1, 0, 0}, 0, 0, 0));
-        set(kAxy - kX, move({0, 1, 0}, 0, 0, 0));
-        set(kAyy - kX, move({0, 0, 1}, 0, 0, 0));
-        set(kGx - kX, move({0, 0, 0}, 1, 0, 0));
-        set(kGy - kX, move({0, 0, 0}, 0, 1, 0));
-        if (!is_outer_) set(kPoseCount, move({0, 0, 0}, 0, 0, 1));
-        return moves;
+        set(kAxx - kX, differential({1, 0, 0}, 0, 0, 0));
+        set(kAxy - kX, differential({0, 1, 0}, 0, 0, 0));
+        set(kAyy - kX, differential({0, 0, 1}, 0, 0, 0));
+        set(kGx - kX, differential({0, 0, 0}, 1, 0, 0));
+        set(kGy - kX, differential({0, 0, 0}, 0, 1, 0));
+        if (!is_outer_) set(kPoseCount, differential({0, 0, 0}, 0, 0, 1));
+        return J;
     }
 
   private:
     /// The differential of `circle_image` (e = c - k h, S = k A A + k^2 h h^T, h = A g) and of B, which is
     /// (S + sqrt(det S) I) over its own trace.
-    Vector<kShape> move(const Symmetric& dA, double dgx, double dgy, double dr) const {
+    Vector<kShape> differential(const Symmetric& dA, double dgx, double dgy, double dr) const {
         const double axx = p_[kAxx], axy = p_[kAxy], ayy = p_[kAyy], gx = p_[kGx], gy = p_[kGy];
         const double k = 1 / (1 / (r_ * r_) - gx * gx - gy * gy);
         const double dk = 2 * k * k * (gx * dgx + gy * dgy + dr / (r_ * r_ * r_));

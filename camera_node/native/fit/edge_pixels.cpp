@@ -7,28 +7,28 @@
 #include <numbers>
 #include <span>
 
+#include "fit/row_spans.hpp"
 #include "numeric/simd.hpp"
-#include "fit/strips.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr int kMinRows = 10;     // fewer do not tell an ellipse
-constexpr int kWideRows = 3;     // one in so many
-constexpr double kUnseen = 0.5;  // grey levels by which another edge may show
+constexpr int kMinRows = 10;         // fewer do not determine an ellipse
+constexpr int kWideRows = 3;         // every third row uses the wide band
+constexpr double kNegligible = 0.5;  // grey levels: the largest effect of another edge
 
 double square(double x) { return x * x; }
 
-/// The images of the edges, as far as they are the band's.
+/// The images of the edges that the band uses.
 struct EdgeImages {
     CircleImage of[kEdges];
     bool card;
-    EdgeImages(const Parameters& p, const Band& band) : card(band.card) {
+    EdgeImages(const Parameters& p, const EdgeBand& band) : card(band.card) {
         for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge})
             of[edge] = circle_image(p, radius_of(edge, p));
     }
-    /// The least distance of two edges.
+    /// The smallest distance between two edges.
     double gap(Edge outside, Edge inside) const {
         const CircleImage &a = of[outside], &b = of[inside];
         return minor_half_axis(a) - minor_half_axis(b) - std::hypot(a.x - b.x, a.y - b.y);
@@ -41,24 +41,24 @@ struct EdgeImages {
     }
 };
 
-/// How far from each edge no other one shows. An edge of contrast C does so by at most
-/// C exp(-(distance / blur)^2 / 2) / 2.
+/// The distance from each edge within which no other edge shows. An edge of contrast C changes the level at a
+/// distance by at most C exp(-(distance / blur)^2 / 2) / 2.
 struct Clearance {
     double of[kEdges];
     Clearance(const EdgeImages& images, const Parameters& p) {
-        const auto shown_within = [&](double contrast) {
-            return p[kBlur] * std::sqrt(2 * std::log(std::max(1.0, std::abs(contrast) / (2 * kUnseen))));
+        const auto visible_within = [&](double contrast) {
+            return p[kBlur] * std::sqrt(2 * std::log(std::max(1.0, std::abs(contrast) / (2 * kNegligible))));
         };
-        const double ring = shown_within(p[kBright] - p[kDark]);
-        const double card = images.card ? ring : shown_within(p[kGround] - p[kBright]);
+        const double ring = visible_within(p[kBright] - p[kDark]);
+        const double card = images.card ? ring : visible_within(p[kGround] - p[kBright]);
         const double within = images.gap(kOuterEdge, kInnerEdge), beyond = images.gap(kCardEdge, kOuterEdge);
         of[kInnerEdge] = within - ring, of[kCardEdge] = beyond - ring;
         of[kOuterEdge] = std::min(within - ring, beyond - card);
     }
 };
 
-/// What lies within a distance of the edges, as ellipses to be cut by rows: lanes 0 to 2 are those around the
-/// edges, from the card's inwards, lanes 4 to 6 the holes within them. Other lanes are empty.
+/// Strips of the pixels within a distance of the edges, as pairs of ellipses: lanes 0 to 2 are the outer
+/// boundaries, from the card's edge inwards, lanes 4 to 6 the inner ones. Other lanes are empty.
 class Strips {
   public:
     Strips(const EdgeImages& edges, double distance) {
@@ -66,26 +66,26 @@ class Strips {
             if (edge == kCardEdge && !edges.card) continue;
             const CircleImage& e = edges.of[edge];
             const int k = edge == kCardEdge ? 0 : 1 + edge;
-            const Oval around(e, distance);
-            ovals_.set(k, around), ovals_.set(4 + k, Oval(e, -distance));
+            const RowEllipse around(e, distance);
+            ellipses_.set(k, around), ellipses_.set(4 + k, RowEllipse(e, -distance));
             top_ = std::min(top_, around.top), bottom_ = std::max(bottom_, around.bottom);
             area_ += 2 * distance * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
             const double whole = std::numbers::pi * square(std::sqrt(e.shape.xx + e.shape.yy) + distance);
             most_ = std::max(most_, whole);
         }
     }
-    double area() const { return std::min(area_, most_); }  // about
+    double area() const { return std::min(area_, most_); }  // an estimate
     double top() const { return top_; }
     double bottom() const { return bottom_; }
-    ROUNDEL_INLINE Spans cut(float row) const { return ovals_.cut(all(row)); }
+    ROUNDEL_INLINE Spans cut(float row) const { return ellipses_.cut(all(row)); }
 
   private:
-    Ovals ovals_{};
+    RowEllipses ellipses_{};
     double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
 };
 
-/// Eight grey levels, of which `left` are in the image. (Wider by two steps: compilers take bytes to words of
-/// four times their size one by one.)
+/// Eight grey levels, of which `left` are in the image. (Widened in two steps: compilers convert bytes to
+/// words of four times their size one by one.)
 ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
     typedef uint8_t Bytes __attribute__((vector_size(2 * kLanes)));
     typedef int16_t Wide __attribute__((vector_size(4 * kLanes)));
@@ -100,8 +100,8 @@ ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
         __builtin_convertvector(__builtin_shufflevector(wide, wide, 0, 1, 2, 3, 4, 5, 6, 7), Bits), Lanes);
 }
 
-/// Appends columns [begin, end) of row y, as far as they are inside the image; eight at a time, where what is
-/// written beyond the end is overwritten by what comes next.
+/// Appends the columns [begin, end) of row y that are inside the image, eight at a time. The next call
+/// overwrites the values written beyond the end.
 ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
     to.expected += std::max(0, end - begin);
     if (y < 0 || y >= image.height) return;
@@ -117,10 +117,10 @@ ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, Ed
     to.used += std::max(0, end - begin);
 }
 
-/// Appends what row y has of the strips, left to right and each pixel once.
+/// Appends the pixels of row y in the strips, left to right and each pixel once.
 ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& strips, EdgePixels& to) {
     const Spans spans = strips.cut(float(y - to.origin_y));
-    int begin[2 * kEdges], end[2 * kEdges];  // left of the middle, then right
+    int begin[2 * kEdges], end[2 * kEdges];  // left of the centre, then right
     for (int k = 0; k < kEdges; ++k) {
         const bool hole = spans.has(4 + k);
         begin[k] = spans.begin[k], end[k] = hole ? spans.begin[4 + k] : spans.end[k];
@@ -134,7 +134,7 @@ ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& stri
     }
 }
 
-/// Every `step`-th row.
+/// Appends every `step`-th row of the strips.
 ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, const Strips& wide, int step,
                                 EdgePixels& to) {
     const int top = int(std::ceil(wide.top())), bottom = int(std::floor(wide.bottom()));
@@ -142,11 +142,11 @@ ROUNDEL_CLONES void append_rows(const ImageView& image, const Strips& narrow, co
         append_row(image, y + to.origin_y, k % kWideRows ? narrow : wide, to);
 }
 
-/// Appends what every `step`-th row from `first` on has of one edge's strip.
+/// Appends every `step`-th row, from `first` on, of one edge's strip.
 ROUNDEL_INLINE void append_strip(const ImageView& image, const CircleImage& edge, double distance, int first,
                                  int step, EdgePixels& to) {
-    const Oval around(edge, distance), hole(edge, -distance);
-    const Ovals outside = Ovals::all_of(around), inside = Ovals::all_of(hole);
+    const RowEllipse around(edge, distance), hole(edge, -distance);
+    const RowEllipses outside = RowEllipses::all_of(around), inside = RowEllipses::all_of(hole);
     constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     const int bottom = int(std::floor(around.bottom));
     for (int y = first; y <= bottom; y += kLanes * step) {
@@ -162,25 +162,26 @@ ROUNDEL_INLINE void append_strip(const ImageView& image, const CircleImage& edge
     }
 }
 
-/// Edge by edge: every `step`-th row of the narrow strip, the wide one in every third of these.
+/// Appends one part for each edge: every `step`-th row of the narrow strip, every third of these rows of the
+/// wide one.
 ROUNDEL_CLONES void append_edges(const ImageView& image, const EdgeImages& edges, const Clearance& clearance,
-                                 const Band& band, int step, EdgePixels& to) {
+                                 const EdgeBand& band, int step, EdgePixels& to) {
     for (const Edge edge : {kOuterEdge, kInnerEdge, kCardEdge}) {
         if (edge == kCardEdge && !edges.card) continue;
         const CircleImage& e = edges.of[edge];
-        const double wide = std::min(band.apart, clearance.of[edge]);
-        const int top = int(std::ceil(Oval(e, wide).top));
+        const double wide = std::min(band.separate, clearance.of[edge]);
+        const int top = int(std::ceil(RowEllipse(e, wide).top));
         for (int k = 0; k < kWideRows; ++k)
             append_strip(image, e, k ? band.narrow : wide, top + k * step, kWideRows * step, to);
         to.end_part(edge);
     }
 }
 
-struct Mean {
+struct MeanLevel {
     Lanes sum, n;
 };
 
-ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& card, Mean& mean) {
+ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& card, MeanLevel& mean) {
     const double det = card.shape.det();
     const float xx = float(card.shape.yy / det), xy = float(-2 * card.shape.xy / det);
     const float yy = float(card.shape.xx / det), x0 = float(card.x), y0 = float(card.y);
@@ -196,7 +197,7 @@ ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& car
 
 void EdgePixels::sample(int n, EdgePixels& to) const {
     to.clear();
-    for (const Part& part : std::span(parts.data(), size_t(part_count))) {
+    for (const EdgePart& part : std::span(parts.data(), size_t(part_count))) {
         for (int k = part.begin; k < part.begin + part.count; k += n * kLanes, to.used += kLanes) {
             std::copy_n(x + k, kLanes, to.x + to.used);
             std::copy_n(y + k, kLanes, to.y + to.used);
@@ -207,23 +208,23 @@ void EdgePixels::sample(int n, EdgePixels& to) const {
 }
 
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {
-    Mean mean{};
+    MeanLevel mean{};
     add_outside(pixels, circle_image(p, p[kCard]), mean);
     const double n = double(sum(mean.n));
     return n > 0 ? double(sum(mean.sum)) / n : p[kBright];
 }
 
-void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+void select_pixels(const ImageView& image, const Parameters& p, const EdgeBand& band, int limit,
                    EdgePixels& pixels) {
     const EdgeImages edges(p, band);
     const Clearance clearance(edges, p);
-    const bool apart = band.apart > 0 && clearance.of[kOuterEdge] >= band.narrow;
-    const Strips narrow(edges, band.narrow), wide(edges, apart ? band.apart : band.wide);
+    const bool separate = band.separate > 0 && clearance.of[kOuterEdge] >= band.narrow;
+    const Strips narrow(edges, band.narrow), wide(edges, separate ? band.separate : band.wide);
     const double area = narrow.area() + (wide.area() - narrow.area()) / kWideRows;
     const int rows = int(wide.bottom() - wide.top());
     const int step = std::max(1, std::min(int(std::ceil(area / limit)), rows / kMinRows));
     pixels.clear();
-    if (apart) return append_edges(image, edges, clearance, band, step, pixels);
+    if (separate) return append_edges(image, edges, clearance, band, step, pixels);
     append_rows(image, narrow, wide, step, pixels);
     pixels.end_part(kAnyEdge);
 }

@@ -2,31 +2,48 @@
 #pragma once
 #include <array>
 
-#include "numeric/image.hpp"
-#include "fit/pixel_columns.hpp"
 #include "fit/roundel_model.hpp"
+#include "numeric/image.hpp"
+#include "numeric/lanes.hpp"
 
 namespace roundel {
 
-/// Pixels near the edges of one roundel, part by part: those of one edge each, or of all of them.
+/// Up to `Max` pixels as columns, in a frame with its origin near the roundel. Padding to whole lanes has
+/// level -1 and does not count.
+template <int Max>
+struct PixelColumns {
+    static constexpr int kMax = Max;
+    int origin_x = 0, origin_y = 0;  // of the frame, pixels of the image
+    int count = 0;                   // padded to whole lanes
+    int used = 0;                    // pixels inside the image
+    int expected = 0;                // pixels inside and outside of the image
+    alignas(4 * kLanes) float x[kMax + kLanes], y[kMax + kLanes], level[kMax + kLanes];
+    /// Pads the columns to whole lanes.
+    void pad() {
+        count = (used + kLanes - 1) / kLanes * kLanes;
+        for (int k = used; k < count; ++k) x[k] = y[k] = 0, level[k] = -1;
+    }
+};
+
+/// Pixels near the edges of one roundel, divided into parts: of one edge each, or one part of all edges.
 struct EdgePixels : PixelColumns<6144> {
-    struct Part {
+    struct EdgePart {
         Edge edge;
         int begin, count;  // whole lanes
     };
-    std::array<Part, kEdges> parts;
+    std::array<EdgePart, kEdges> parts;
     int part_count = 0;
 
     void clear() { used = expected = count = part_count = padding_ = 0; }
-    /// Of pixels that are not told apart, the first `n`.
-    void keep(int n) {
+    /// Keeps the first `n` pixels, as one part of all edges.
+    void truncate(int n) {
         expected -= used - n, used = n, count = part_count = padding_ = 0;
         end_part(kAnyEdge);
     }
-    /// Every `n`-th lane of each part.
+    /// Copies every `n`-th lane of each part.
     void sample(int n, EdgePixels& to) const;
     int end() const { return used + padding_; }
-    /// Makes a part of what was added since the last one.
+    /// Makes a part of the pixels that were added since the last one.
     void end_part(Edge edge) {
         while (end() % kLanes) x[end()] = y[end()] = 0, level[end()] = -1, ++padding_;
         parts[size_t(part_count++)] = {edge, count, end() - count}, count = end();
@@ -36,23 +53,23 @@ struct EdgePixels : PixelColumns<6144> {
     int padding_ = 0;
 };
 
-/// Which pixels, by their distance from the nearest edge: those within `narrow` in every row, and in every
-/// third one those within `wide`, which tell of the levels.
-struct Band {
+/// Which pixels to use, by their distance from the nearest edge: those within `narrow` in every row, and
+/// those within `wide`, which determine the grey levels, in every third row.
+struct EdgeBand {
     double narrow, wide;
-    bool card;         // whether the card's edge is one of them
-    double apart = 0;  // `wide` where pixels that see one edge only are told apart; 0 if none may be
+    bool card;            // whether to use the card's edge
+    double separate = 0;  // `wide` where each part has pixels of a single edge; 0 to use one part
 };
 
-/// Fills `pixels` by the band along the edges that `p` says, in every n-th row: n is the least that leaves
-/// about `limit` pixels or less, or ten rows.
+/// Selects the pixels in a band along the edges of the model `p`, in every n-th row: n is the smallest number
+/// that gives about `limit` pixels or fewer, or ten rows.
 ///
-/// Where edges are so far from each other that no pixel within `narrow` sees two of them, each has a part of
-/// its own, and the wide one ends before the next one.
-void select_pixels(const ImageView& image, const Parameters& p, const Band& band, int limit,
+/// If the edges are so far apart that no pixel within `narrow` shows two of them, each edge gets its own
+/// part, and its wide band ends where the next edge shows.
+void select_pixels(const ImageView& image, const Parameters& p, const EdgeBand& band, int limit,
                    EdgePixels& pixels);
 
-/// The mean level of those that lie beyond the card's edge; the bright one where none do.
+/// The mean level of the pixels beyond the card's edge; the bright level if there are none.
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p);
 
 }  // namespace roundel

@@ -4,18 +4,18 @@
 #include <algorithm>
 #include <type_traits>
 
-#include "fit/gram.hpp"
+#include "numeric/gram.hpp"
 #include "numeric/simd.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr int kSample = 24;    // lanes, about
-constexpr int kHalvings = 10;  // of 256 grey levels
-constexpr int kLevels = 3;     // columns of a single edge that are not its ellipse's
+constexpr int kSample = 24;    // approximate number of lanes of a sample
+constexpr int kHalvings = 10;  // of the interval of 256 grey levels
+constexpr int kLevels = 3;     // columns of a single edge before those of its ellipse
 
-/// The parameters by which a part's gradient is set: all, or those of a single edge, its ellipse's last.
+/// The parameters of a part's gradient: all, or those of a single edge, with its ellipse last.
 template <Edge edge>
 constexpr auto kBy = [] {
     if constexpr (edge == kAnyEdge)
@@ -28,7 +28,8 @@ constexpr int kUnknowns = int(kBy<edge>.size());
 template <Edge edge>
 using GramOf = Gram<kUnknowns<edge> + 1>;  // and the residual
 
-/// Calls `work` with a part's edge as a constant. What it calls has to be inlined, as all of a clone has.
+/// Calls `work` with a part's edge as a compile-time constant. All calls within must be inlined, as in every
+/// function that is compiled for several targets (see simd.hpp).
 template <typename Work>
 ROUNDEL_INLINE void with_edge(Edge edge, const Work& work) {
     switch (edge) {
@@ -43,14 +44,14 @@ ROUNDEL_INLINE void with_edge(Edge edge, const Work& work) {
     }
 }
 
-/// The root of Tukey's weight of residuals that are `t` cuts.
+/// The square root of Tukey's weight for residuals of `t` cutoffs.
 ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
     const Lanes left = 1.0f - t * t;
     return left > 0.0f ? left : all(0);
 }
 
 template <Edge edge>
-ROUNDEL_INLINE void evaluate_part(const EdgePixels& pixels, const EdgePixels::Part& part,
+ROUNDEL_INLINE void evaluate_part(const EdgePixels& pixels, const EdgePixels::EdgePart& part,
                                   const ModelOf<edge>& model, Gradient* chunks) {
     for (int done = 0; done < part.count; done += kChunk * kLanes) {
         const int begin = part.begin + done;
@@ -59,8 +60,8 @@ ROUNDEL_INLINE void evaluate_part(const EdgePixels& pixels, const EdgePixels::Pa
     }
 }
 
-ROUNDEL_CLONES void evaluate(const EdgePixels& pixels, const EdgePixels::Part& part, const Parameters& pose,
-                             Gradient* chunks) {
+ROUNDEL_CLONES void evaluate(const EdgePixels& pixels, const EdgePixels::EdgePart& part,
+                             const Parameters& pose, Gradient* chunks) {
     with_edge(part.edge, [&](auto edge) __attribute__((always_inline)) {
         evaluate_part<edge>(pixels, part, ModelOf<edge>(pose), chunks);
     });
@@ -81,30 +82,30 @@ ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, float per_cu
     }
 }
 
-ROUNDEL_INLINE void add_sums(const GramOf<kAnyEdge>& gram, NormalEquations& to) {
+ROUNDEL_INLINE void add_sums(const GramOf<kAnyEdge>& gram, GaussNewtonSystem<kCount>& to) {
     for (int i = 0; i < kCount; ++i) {
         for (int j = 0; j <= i; ++j) to.H[i][j] += double(sum(gram[j][i]));
         to.g[i] += double(sum(gram[i][kCount]));
     }
 }
 
-/// Products with a single edge's columns as products with all that its levels, blur and ellipse depend on.
+/// Adds the products of a single edge's columns, transformed to the parameters on which its ellipse depends.
 template <Edge edge>
-ROUNDEL_INLINE void add_moved(const GramOf<edge>& gram, const EdgeEllipse::Moves& moves,
-                              NormalEquations& to) {
+ROUNDEL_INLINE void add_transformed(const GramOf<edge>& gram, const EdgeEllipse::Jacobian& J,
+                                    GaussNewtonSystem<kCount>& to) {
     constexpr int n = kUnknowns<edge>, shape = EdgeEllipse::kShape, kRadius = kPoseCount;
     constexpr Parameter radius = edge == kCardEdge ? kCard : kRatio;
     const auto product = [&](int i, int j) { return double(sum(gram[std::min(i, j)][std::max(i, j)])); };
-    std::array<EdgeEllipse::Move, n + 1> once{};  // the columns times those of pose and radius
+    std::array<EdgeEllipse::Row, n + 1> once{};  // products of the columns with those of pose and radius
     for (int i = 0; i <= n; ++i)
         for (int j = 0; j < shape; ++j) {
             const double each = product(i, kLevels + j);
-            for (int m = 0; m <= kRadius; ++m) once[i][m] += each * moves[j][m];
+            for (int m = 0; m <= kRadius; ++m) once[i][m] += each * J[j][m];
         }
-    std::array<EdgeEllipse::Move, kRadius + 1> twice{};
+    std::array<EdgeEllipse::Row, kRadius + 1> twice{};
     for (int m = 0; m <= kRadius; ++m)
         for (int j = 0; j < shape; ++j)
-            for (int k = 0; k <= kRadius; ++k) twice[m][k] += moves[j][m] * once[kLevels + j][k];
+            for (int k = 0; k <= kRadius; ++k) twice[m][k] += J[j][m] * once[kLevels + j][k];
     for (int i = 0; i < kLevels; ++i) {
         const Parameter level = kBy<edge>[size_t(i)];
         for (int j = i; j < kLevels; ++j) {
@@ -124,23 +125,24 @@ ROUNDEL_INLINE void add_moved(const GramOf<edge>& gram, const EdgeEllipse::Moves
     to.g[radius] += once[n][kRadius];
 }
 
-ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const EdgeEllipse::Moves& moves,
-                             float per_cut, NormalEquations& to) {
+ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const EdgeEllipse::Jacobian& J,
+                             float per_cut, GaussNewtonSystem<kCount>& to) {
     with_edge(edge, [&](auto e) __attribute__((always_inline)) {
         GramOf<e> gram{};
         add_products<e>(chunks, lanes, per_cut, gram);
         if constexpr (e == kAnyEdge)
             add_sums(gram, to);
         else
-            add_moved<e>(gram, moves, to);
+            add_transformed<e>(gram, J, to);
     });
 }
 
-struct Sums {
+struct LaneResidualSums {
     Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
 };
 
-ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut, Sums& sums) {
+ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut,
+                                  LaneResidualSums& sums) {
     const Lanes t = r * per_cut, root = root_weight(t), w = root * root, rr = r * r;
     const Lanes squared = at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k];
     const Lanes ring = at.residual[k] < kAbsent ? at.ring[k] * at.ring[k] : all(0), m = w * squared;
@@ -154,9 +156,9 @@ ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, flo
     sums.mpsi += squared * root * (1.0f - 5.0f * t * t);
 }
 
-/// `delta` is a step in what the part's gradient is by.
-ROUNDEL_CLONES void add_leftover(const Gradient* chunks, int lanes, Edge edge, const float* delta,
-                                 float per_cut, Sums& sums) {
+/// `delta` is a step of the parameters of the part's gradient.
+ROUNDEL_CLONES void add_residual_sums(const Gradient* chunks, int lanes, Edge edge, const float* delta,
+                                      float per_cut, LaneResidualSums& sums) {
     with_edge(edge, [&](auto e) __attribute__((always_inline)) {
         for (; lanes > 0; lanes -= kChunk, ++chunks)
             for (int k = 0; k < std::min(kChunk, lanes); ++k) {
@@ -175,7 +177,7 @@ ROUNDEL_INLINE int count_below(const Lanes* values, int n, float limit) {
     return count;
 }
 
-/// Residuals and slopes of the ring's edges, of some lanes.
+/// Residuals and slopes of the ring's edges in some lanes.
 struct Sample {
     Lanes residuals[kSample + kEdges], slopes[kSample + kEdges], most{};
     int n = 0;
@@ -191,7 +193,7 @@ ROUNDEL_INLINE void add_every(int step, const Gradient* chunks, int lanes, Sampl
     }
 }
 
-/// As Linearisation::median_residual, by halving an interval.
+/// Finds the median by halving an interval (see NormalEquations::median_residual).
 ROUNDEL_CLONES float median_of(Sample& sample) {
     auto& [residuals, slopes, most, n] = sample;
     float steep = 1e-3f;
@@ -207,14 +209,14 @@ ROUNDEL_CLONES float median_of(Sample& sample) {
     return high;
 }
 
-/// A step of the parameters as one of what a part's gradient is by.
-std::array<float, kCount> step_of(const Parameters& delta, Edge edge, const EdgeEllipse::Moves& moves) {
+/// Transforms a step of all parameters to one of the parameters of a part's gradient.
+std::array<float, kCount> step_of(const Parameters& delta, Edge edge, const EdgeEllipse::Jacobian& J) {
     std::array<float, kCount> step{};
     for (size_t i = 0; i < kCount; ++i) step[i] = float(delta[i]);
     if (edge == kAnyEdge) return step;
     for (int i = 0; i < EdgeEllipse::kShape; ++i) {
-        double shape = moves[i][kPoseCount] * delta[edge == kInnerEdge ? kRatio : kCard];  // or 0
-        for (int m = 0; m < kPoseCount; ++m) shape += moves[i][m] * delta[kX + m];
+        double shape = J[i][kPoseCount] * delta[edge == kInnerEdge ? kRatio : kCard];  // or 0
+        for (int m = 0; m < kPoseCount; ++m) shape += J[i][m] * delta[kX + m];
         step[size_t(kX + i)] = float(shape);
     }
     return step;
@@ -222,45 +224,45 @@ std::array<float, kCount> step_of(const Parameters& delta, Edge edge, const Edge
 
 }  // namespace
 
-void Linearisation::evaluate(const EdgePixels& pixels, const Parameters& p) {
+void NormalEquations::linearize(const EdgePixels& pixels, const Parameters& p) {
     part_count_ = pixels.part_count;
     Gradient* chunks = chunks_;
     for (int k = 0; k < part_count_; ++k) {
-        const EdgePixels::Part& from = pixels.parts[size_t(k)];
-        Part& part = parts_[size_t(k)];
+        const EdgePixels::EdgePart& from = pixels.parts[size_t(k)];
+        LinearPart& part = parts_[size_t(k)];
         part.edge = from.edge, part.lanes = from.count / kLanes, part.chunks = chunks;
         if (part.edge == kAnyEdge) {
-            roundel::evaluate(pixels, from, p, chunks);
+            evaluate(pixels, from, p, chunks);
         } else {
             const EdgeEllipse ellipse(p, part.edge);
-            roundel::evaluate(pixels, from, ellipse.as_pose(), chunks);
-            part.moves = ellipse.moves();
+            evaluate(pixels, from, ellipse.as_pose(), chunks);
+            part.jacobian = ellipse.jacobian();
         }
         chunks += (part.lanes + kChunk - 1) / kChunk;
     }
 }
 
-double Linearisation::median_residual() const {
+double NormalEquations::median_residual() const {
     int lanes = 0;
-    for (const Part& part : parts()) lanes += part.lanes;
+    for (const LinearPart& part : parts()) lanes += part.lanes;
     Sample sample;
-    for (const Part& part : parts())
+    for (const LinearPart& part : parts())
         add_every((lanes + kSample - 1) / kSample, part.chunks, part.lanes, sample);
     return double(median_of(sample));
 }
 
-NormalEquations Linearisation::accumulate(double scale) const {
-    NormalEquations e{};
-    for (const Part& part : parts())
-        add_part(part.chunks, part.lanes, part.edge, part.moves, float(1 / (kTukey * scale)), e);
-    return e;
+GaussNewtonSystem<kCount> NormalEquations::accumulate(double scale) const {
+    GaussNewtonSystem<kCount> system{};
+    for (const LinearPart& part : parts())
+        add_part(part.chunks, part.lanes, part.edge, part.jacobian, float(1 / (kTukey * scale)), system);
+    return system;
 }
 
-Leftover Linearisation::after(const Parameters& delta, double scale) const {
-    Sums s{};
-    for (const Part& part : parts())
-        add_leftover(part.chunks, part.lanes, part.edge, step_of(delta, part.edge, part.moves).data(),
-                     float(1 / (kTukey * scale)), s);
+ResidualSums NormalEquations::residuals_after(const Parameters& delta, double scale) const {
+    LaneResidualSums s{};
+    for (const LinearPart& part : parts())
+        add_residual_sums(part.chunks, part.lanes, part.edge, step_of(delta, part.edge, part.jacobian).data(),
+                          float(1 / (kTukey * scale)), s);
     return {.ring = double(sum(s.ring)),
             .agreeing = double(sum(s.agreeing)),
             .ring_rr = double(sum(s.ring_rr)),

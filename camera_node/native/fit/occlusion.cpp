@@ -13,14 +13,15 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2;    // pixels on either side of an edge
-constexpr int kPixels = 1500;  // that are looked at, about
-constexpr double kChance = 4;  // standard deviations
-constexpr double kReach = 2;   // pixels to which a cover's edge is blurred
-constexpr int kAround = 2;     // sectors on either side that a mean is over
-constexpr double kSeen = 0.2;  // of what they would tell if all of the edge were seen
+constexpr double kBand = 2;       // half width of the band around an edge, pixels
+constexpr int kPixels = 1500;     // approximate number of pixels used
+constexpr double kChance = 4;     // standard deviations
+constexpr double kReach = 2;      // blur of an occluding object's edge, pixels
+constexpr int kAround = 2;        // sectors on either side that a mean includes
+constexpr double kMinSeen = 0.2;  // of the information in a mean if the whole edge is visible
 
-/// The direction of (x, y), radians from -pi to pi, to 4e-4: a polynomial in the tangent, or in its inverse.
+/// The direction of (x, y) in radians from -pi to pi, within 4e-4: a polynomial in the tangent or its
+/// inverse.
 ROUNDEL_INLINE Lanes direction(const Lanes& x, const Lanes& y) {
     const Lanes across = magnitude(x), up = magnitude(y), least = across < up ? across : up;
     const Lanes most = (across < up ? up : across) + 1e-9f, t = least / most, tt = t * t;
@@ -30,15 +31,15 @@ ROUNDEL_INLINE Lanes direction(const Lanes& x, const Lanes& y) {
     return y < 0.0f ? -angle : angle;
 }
 
-/// Which edge a pixel belongs to, and which sector of it.
-class Compass {
+/// Assigns pixels to the nearest edge of the ring and to a sector of it.
+class SectorIndex {
   public:
-    explicit Compass(const Parameters& p)
-        : x_(float(p[kX])), y_(float(p[kY])), between_(float(square((1 + p[kRatio]) / 2))) {
+    explicit SectorIndex(const Parameters& p)
+        : x_(float(p[kX])), y_(float(p[kY])), between_(float((1 + p[kRatio]) * (1 + p[kRatio]) / 4)) {
         const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
         xx_ = float(p[kAyy] / det), xy_ = float(-p[kAxy] / det), yy_ = float(p[kAxx] / det);
     }
-    /// The sector of the outer edge, or kSectors more of the inner one.
+    /// The number of a sector of the outer edge, or kSectors plus that of a sector of the inner edge.
     ROUNDEL_INLINE Bits locate(const Lanes& x, const Lanes& y) const {
         const Lanes dx = x - x_, dy = y - y_, qx = xx_ * dx + xy_ * dy, qy = xy_ * dx + yy_ * dy;
         const Lanes turn = direction(qx, qy) * float(kSectors / (2 * std::numbers::pi)) + float(kSectors);
@@ -47,12 +48,11 @@ class Compass {
     }
 
   private:
-    static double square(double x) { return x * x; }
     float x_, y_, between_, xx_, xy_, yy_;
 };
 
-/// Of the outer edge and of the inner one.
-ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, const Compass& compass,
+/// Adds residuals to the sums of the outer and of the inner edge.
+ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, const SectorIndex& index,
                                std::array<SectorSums, 2>& edges) {
     Gradient at;
     for (int begin = 0; begin < pixels.count; begin += kChunk * kLanes) {
@@ -60,18 +60,18 @@ ROUNDEL_CLONES void add_misfit(const EdgePixels& pixels, const Model& model, con
         const float *x = pixels.x + begin, *y = pixels.y + begin;
         model.evaluate(x, y, pixels.level + begin, lanes, at);
         for (int n = 0; n < lanes; ++n) {
-            const Bits place = compass.locate(load(x + n * kLanes), load(y + n * kLanes));
+            const Bits place = index.locate(load(x + n * kLanes), load(y + n * kLanes));
             const Lanes slope = at.ring[n], residual = at.residual[n];
             for (int k = 0; k < kLanes; ++k)
-                if (std::abs(residual[k]) < 256)  // others are clipped, or none
+                if (std::abs(residual[k]) < 256)  // others are clipped or padding
                     edges[size_t(place[k] / kSectors)].add(place[k] % kSectors, double(slope[k]),
                                                            double(residual[k]));
         }
     }
 }
 
-/// The set with all sectors that lie within kReach of it on the image of a circle.
-Sectors widen(Sectors sectors, const CircleImage& circle) {
+/// Adds the sectors within kReach of the set on the image of a circle.
+Sectors dilate(Sectors sectors, const CircleImage& circle) {
     const double side = 2 * std::numbers::pi * std::sqrt(eigen(circle.shape).second) / kSectors;
     for (double reach = 0; reach < kReach; reach += side)
         sectors |= std::rotl(sectors, 1) | std::rotr(sectors, 1);
@@ -94,28 +94,30 @@ Pixel point_in_sector(const Parameters& p, int sector, double r) {
     return {float(p[kX] + p[kAxx] * x + p[kAxy] * y), float(p[kY] + p[kAxy] * x + p[kAyy] * y)};
 }
 
-ROUNDEL_CLONES void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels) {
-    const Compass compass(p);
-    int kept = 0;
+ROUNDEL_CLONES void remove_occluded(const OcclusionMask& occlusion, const Parameters& p, EdgePixels& pixels) {
+    const SectorIndex index(p);
+    int n = 0;
     for (int begin = 0; begin < pixels.used; begin += kLanes) {
         const Lanes x = load(pixels.x + begin), y = load(pixels.y + begin),
                     level = load(pixels.level + begin);
-        const Bits place = compass.locate(x, y);
+        const Bits place = index.locate(x, y);
         for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
-            if ((place[k] < kSectors ? hidden.outer : hidden.inner) >> (place[k] % kSectors) & 1) continue;
-            pixels.x[kept] = x[k], pixels.y[kept] = y[k], pixels.level[kept++] = level[k];
+            const Sectors occluded = place[k] < kSectors ? occlusion.outer : occlusion.inner;
+            if (occluded >> (place[k] % kSectors) & 1) continue;
+            pixels.x[n] = x[k], pixels.y[n] = y[k], pixels.level[n++] = level[k];
         }
     }
-    pixels.keep(kept);
+    pixels.truncate(n);
 }
 
 void SectorSums::add(int sector, double slope, double residual) {
     const auto s = size_t(sector);
     const double w = std::abs(slope);
-    rr_[s] += w * residual * residual, weight_[s] += w, squared_[s] += w * w, moved_[s] += slope * residual;
+    rr_[s] += w * residual * residual, weight_[s] += w, squared_[s] += w * w;
+    regression_[s] += slope * residual;
 }
 
-Sectors SectorSums::beyond(double noise, double slack) const {
+Sectors SectorSums::exceeding(double noise, double slack) const {
     Sectors off = 0;
     for (size_t s = 0; s < kSectors; ++s) {
         const double chance = kChance * std::sqrt(2 * squared_[s]);
@@ -127,14 +129,14 @@ Sectors SectorSums::beyond(double noise, double slack) const {
 
 Displacement SectorSums::displacement(double noise) const {
     constexpr int span = 2 * kAround + 1;
-    const double least = kSeen * span / kSectors * std::accumulate(squared_.begin(), squared_.end(), 0.0);
+    const double least = kMinSeen * span / kSectors * std::accumulate(squared_.begin(), squared_.end(), 0.0);
     double sum = 0, chance = 0;
     int seen = 0;
     for (int s = 0; s < kSectors; ++s) {
         double across = 0, along = 0;
         for (int k = s - kAround; k <= s + kAround; ++k) {
             const auto at = size_t(k + kSectors) % kSectors;
-            across += moved_[at], along += squared_[at];
+            across += regression_[at], along += squared_[at];
         }
         if (along <= least) continue;
         sum += across * across / (along * along), chance += noise * noise / along, ++seen;
@@ -150,12 +152,12 @@ EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
-    add_misfit(pixels, Model(local), Compass(local), edges_);
+    add_misfit(pixels, Model(local), SectorIndex(local), edges_);
 }
 
-Hidden EdgeMisfit::hidden(double noise, double slack) const {
-    return {widen(edges_[0].beyond(noise, slack), circles_[0]),
-            widen(edges_[1].beyond(noise, slack), circles_[1])};
+OcclusionMask EdgeMisfit::occlusion(double noise, double slack) const {
+    return {dilate(edges_[0].exceeding(noise, slack), circles_[0]),
+            dilate(edges_[1].exceeding(noise, slack), circles_[1])};
 }
 
 std::array<Displacement, 2> EdgeMisfit::displacements(double noise) const {

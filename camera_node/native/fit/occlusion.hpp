@@ -9,59 +9,60 @@
 
 namespace roundel {
 
-/// A set of the 32 sectors of a disc, one a bit, counted by the direction in the disc's own plane.
+/// A set of the 32 sectors of a disc, one bit each, numbered by the direction in the disc's own plane.
 using Sectors = uint32_t;
 constexpr int kSectors = 32;
 
 inline int count_sectors(Sectors sectors) { return std::popcount(sectors); }
-/// One of the runs of neighbouring sectors in a set that is not empty; the last sector is the first one's
-/// neighbour.
+/// One of the runs of adjacent sectors in a set that is not empty; the last sector and the first are
+/// adjacent.
 Sectors any_run(Sectors sectors);
 
-/// Pixel that lies in the middle of a sector at `r` outer radii, by the model `p` in the image's frame.
+/// The pixel in the middle of a sector at `r` outer radii of the model `p` in the image's frame.
 struct Pixel {
     float x, y;
 };
 Pixel point_in_sector(const Parameters& p, int sector, double r);
 
-/// Where a roundel's edges are covered: the outer one (with all that lies outside) and the inner one.
-struct Hidden {
+/// The sectors in which a roundel's outer edge (with all outside of it) and its inner edge are occluded.
+struct OcclusionMask {
     Sectors outer = 0, inner = 0;
-    bool operator==(const Hidden&) const = default;
+    bool operator==(const OcclusionMask&) const = default;
     bool any() const { return outer || inner; }
 };
 
-/// Takes what is hidden out of the pixels.
-void leave_out(const Hidden& hidden, const Parameters& p, EdgePixels& pixels);
+/// Removes the pixels of occluded sectors.
+void remove_occluded(const OcclusionMask& occlusion, const Parameters& p, EdgePixels& pixels);
 
-/// How far an edge lies off the model, RMS around it of means over a sixth of the turn, and how much of that
-/// the noise alone makes; pixels.
+/// The displacement of an edge from the model: the RMS around the edge of means over a sixth of the turn, and
+/// its expected value if there is noise only; pixels.
 struct Displacement {
     double rms, chance;
 };
 
-/// Residuals on an edge of the ring by sector: squared ones, each with its slope as the weight, and their
-/// regression on the slope, which is how far the edge is off.
+/// Residuals on an edge of the ring by sector: the sums of their squares weighted by the slope, and of their
+/// regression on the slope, which gives the displacement of the edge.
 class SectorSums {
   public:
     void add(int sector, double slope, double residual);
-    /// The sectors whose mean is more than `noise` and `slack` explain, but for a chance of four sigmas.
-    Sectors beyond(double noise, double slack) const;
+    /// The sectors whose mean square exceeds that of `noise` and `slack` by more than four standard
+    /// deviations.
+    Sectors exceeding(double noise, double slack) const;
     Displacement displacement(double noise) const;
 
   private:
-    std::array<double, kSectors> rr_{}, weight_{}, squared_{}, moved_{};
+    std::array<double, kSectors> rr_{}, weight_{}, squared_{}, regression_{};
 };
 
-/// What the picture differs from the model `p` by (in the image's frame), on either edge of the ring.
+/// The residuals of the model `p` (in the image's frame) on both edges of the ring.
 class EdgeMisfit {
   public:
     EdgeMisfit(const ImageView& image, const Parameters& p);
-    /// The sectors in which an edge is off by more than the noise explains and `slack`, both in grey levels
-    /// RMS; and those so near to them that what covers them may reach there too.
-    Hidden hidden(double noise, double slack) const;
-    /// Of the outer edge and of the inner one. What is drawn, printed or sharpened is ragged about the right
-    /// place, and its means hardly show it.
+    /// The sectors in which the residuals of an edge exceed `noise` and `slack`, both in grey levels RMS, and
+    /// adjacent ones that the blurred edge of the occluding object can reach.
+    OcclusionMask occlusion(double noise, double slack) const;
+    /// Displacements of the outer and of the inner edge. Ragged edges (drawn, printed, sharpened) scatter
+    /// about the right position, so their means hardly differ from it.
     std::array<Displacement, 2> displacements(double noise) const;
 
   private:

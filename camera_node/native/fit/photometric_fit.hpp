@@ -4,61 +4,61 @@
 #include <optional>
 #include <span>
 
+#include "fit/occlusion.hpp"
 #include "numeric/ellipse.hpp"
 #include "numeric/image.hpp"
-#include "fit/occlusion.hpp"
 
 namespace roundel {
 
-/// What the fit starts from: an ellipse good to a pixel, the ratio of the diameters, and the levels.
-struct Start {
+/// The initial guess of a fit: an ellipse within a pixel, the ratio of the diameters, and the grey levels.
+struct InitialGuess {
     Ellipse outer;
     double ratio, dark, bright;
-    std::span<const double> prints{};   // ratios that the prints in use were made with, where they are known
-    Hidden hidden{};                    // what is covered, and left out of the fit
-    std::optional<Parameters> model{};  // good to a third of a pixel, in the image's frame, where it is known
-    double noise = 0;                   // that the fit of this model left
+    std::span<const double> print_ratios{};  // ratios of the prints in use, if they are known
+    OcclusionMask occlusion{};               // sectors that the fit leaves out
+    std::optional<Parameters> model{};       // in the image's frame, within a third of a pixel, if known
+    double noise = 0;                        // noise that the fit of `model` estimated
 };
 
-/// Covariance of an outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (it is centre + A u, |u| = 1) and
-/// of the offset x, y to where the disc's own centre projects; pixels.
-using PoseCovariance = std::array<std::array<double, 7>, 7>;
+/// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is
+/// centre + A u, |u| = 1) and of the offset x, y from its centre to the image of the disc's centre; pixels.
+using PoseCovariance = std::array<Vector<kPoseCount>, kPoseCount>;
 
 /// A roundel fitted to the grey levels around its edges.
-struct Fit {
+struct RoundelFit {
     Ellipse outer;
-    double offset_x, offset_y;  // from the ellipse's centre to where the disc's own centre projects, pixels
-    PoseCovariance C;
-    double ratio;          // inner over outer diameter, as measured without the print
-    double ratio_sigma;    // its standard deviation
-    double dark, bright;   // grey levels
-    double blur;           // standard deviation of the edges' spread, the pixel's own width included, pixels
-    double edge_residual;  // over the ring's edges, each pixel counting as much as it tells of them
-    double support;        // share of the ring's edges that is in the image and agrees
-    Parameters p;          // as the model has them, in the image's frame; the ratio is a known print's
-    bool plain = false;    // fitted to the picture as it is, all around
-    double motion_x = 0, motion_y = 0;  // during the exposure, where it was fitted, pixels
-    double noise = 0;                   // that the fit leaves, grey levels
-    /// Of the ellipse's centre and of the offset, square pixels.
-    Symmetric centre_covariance() const { return {C[0][0], C[0][1], C[1][1]}; }
-    Symmetric offset_covariance() const { return {C[5][5], C[5][6], C[6][6]}; }
+    double offset_x, offset_y;  // from the ellipse's centre to the image of the disc's centre, pixels
+    PoseCovariance pose_cov;
+    double ratio;             // inner over outer diameter, measured without the prior of the print
+    double ratio_sigma;       // its standard deviation
+    double dark, bright;      // grey levels
+    double blur;              // standard deviation of the edges' spread including the pixel's width, pixels
+    double edge_residual;     // RMS over the ring's edges, each pixel weighted by its squared slope
+    double support;           // share of the ring's edges that is in the image and agrees with the model
+    Parameters p;             // of the model, in the image's frame; the ratio is that of a known print
+    bool unoccluded = false;  // the fit uses the unmodified image, all around
+    double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
+    double noise = 0;                   // standard deviation of the residuals, grey levels
+    /// Covariances of the ellipse's centre and of the offset, square pixels.
+    Symmetric centre_covariance() const { return {pose_cov[0][0], pose_cov[0][1], pose_cov[1][1]}; }
+    Symmetric offset_covariance() const { return {pose_cov[5][5], pose_cov[5][6], pose_cov[6][6]}; }
 };
 
-/// Fits a photometric model of a roundel to the pixels near its edges, by Gauss-Newton: a bright level, a
-/// dark one between the outer circle and the inner, and a third beyond the card's edge. Thirteen unknowns:
-/// three levels, blur, the inner circle's and the card's ratio, and seven of a plane's view. Pixels that
-/// disagree count less (Tukey's biweight).
+/// Fits a photometric model of a roundel to the pixels near its edges by Gauss-Newton (derivation:
+/// docs/detector_model.md). The model has 13 parameters: three grey levels (bright, dark between the outer
+/// and the inner circle, ground beyond the card's edge), the blur, the ratios of the inner circle and of the
+/// card, and seven of a plane's view. Tukey's biweight reduces the weight of pixels that disagree.
 ///
-/// A few steps on a part of the pixels, or the model of the frame before, come near enough for the last one,
-/// on all of them, to be efficient (Le Cam's one-step estimator). Large roundels are sampled: no more than
-/// 6144 pixels are used.
+/// A few steps on a subset of the pixels, or the model of the last frame, come close enough to the solution
+/// for a final step on all pixels to be efficient (Le Cam's one-step estimator). At most 6144 pixels are
+/// used.
 ///
-/// Known prints tell the ratio to 0.002: that of the one nearest to what the fit says without them, unless it
-/// is three standard deviations away and so another print. Small roundels owe it most of what they know of
-/// their size.
+/// The ratios of known prints are exact to 0.002. The fit uses the one nearest to the measured ratio unless
+/// it is more than three standard deviations away. This prior contributes most of the information on the size
+/// of small roundels.
 ///
-/// The covariance is that of the M-estimate, its noise from the residuals, at least one grey level. Nothing
-/// comes back where the fit leaves the start's neighbourhood or its equations are singular.
-std::optional<Fit> refine(const ImageView& image, const Start& start);
+/// The covariance is that of the M-estimate. Its noise is estimated from the residuals and is at least one
+/// grey level. Returns nothing if the fit leaves the neighbourhood of the guess or the system is singular.
+std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess);
 
 }  // namespace roundel

@@ -4,21 +4,22 @@
 
 #include "numeric/cholesky.hpp"
 #include "numeric/ellipse.hpp"
+#include "numeric/gram.hpp"
 #include "numeric/lanes.hpp"
 
 namespace roundel {
 
-/// The unknowns of a roundel's picture. Its plane is seen by x = c + A X / (1 + g . X), X in outer radii: c
-/// is where the disc's own centre projects, g its perspective, and every circle |X| = r an ellipse.
+/// The parameters of a roundel's picture (see docs/detector_model.md). A point X of its plane, in outer
+/// radii, projects to x = c + A X / (1 + g . X): c is the image of the disc's centre, g the perspective, and
+/// the image of every circle |X| = r is an ellipse.
 ///
-/// The pose stands last, so that its covariance is the last block of a Cholesky factor.
+/// The pose is last, so that its covariance follows from the last block of a Cholesky factor.
 enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
-constexpr double kCardRatio = 9.0 / 7;  // of the card's diameter to the outer one, where it was not fitted
+constexpr double kCardRatio = 9.0 / 7;  // card over outer diameter, if it is not fitted
 constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
 using Parameters = Vector<kCount>;
-using Matrix = std::array<Parameters, kCount>;
 
-/// The circles at which the level changes; or any of them, and more than one where they are close.
+/// The circles at which the grey level changes; kAnyEdge stands for any of them, or several that are close.
 enum Edge { kOuterEdge, kInnerEdge, kCardEdge, kAnyEdge };
 constexpr int kEdges = kAnyEdge;
 
@@ -26,14 +27,14 @@ constexpr double radius_of(Edge edge, const Parameters& p) {
     return edge == kInnerEdge ? p[kRatio] : edge == kCardEdge ? p[kCard] : 1;
 }
 
-/// The parameters that are the levels on either side of an edge.
+/// The parameters that hold the grey levels on either side of an edge.
 struct Sides {
     Parameter inside, outside;
 };
 constexpr Sides kSidesOf[kEdges] = {{kDark, kBright}, {kBright, kDark}, {kBright, kGround}};
 
-/// The image of the circle |X| = r: from its dual conic M diag(r^2, r^2, -1) M^T, M = [A + c g^T, c; g^T, 1]
-/// (Hartley and Zisserman, result 2.14). `shape` S gives the points centre + S^(1/2) u, |u| = 1.
+/// The image of the circle |X| = r, from its dual conic M diag(r^2, r^2, -1) M^T, M = [A + c g^T, c; g^T, 1]
+/// (Hartley and Zisserman, result 2.14). Its points are centre + S^(1/2) u, |u| = 1, with S = `shape`.
 struct CircleImage {
     double x, y;
     Symmetric shape;
@@ -49,33 +50,29 @@ inline CircleImage circle_image(const Parameters& p, double r) {
             {k * AA.xx + k * k * hx * hx, k * AA.xy + k * k * hx * hy, k * AA.yy + k * k * hy * hy}};
 }
 
-constexpr int kChunk =
-    31;  // lanes at a time: columns fit the first cache, and odd, so that they share no bank
-
 constexpr float kAbsent = 1e9f;  // a residual that does not count
 
-/// Pixels that do not count: absent ones (level -1), and clipped ones, which tell no more than that the
-/// modelled `level` is beyond the scale.
-ROUNDEL_INLINE Bits is_silent(const Lanes& seen, const Lanes& level) {
+/// Pixels that do not count: padding (level -1), and clipped pixels whose modelled `level` is out of range.
+ROUNDEL_INLINE Bits is_uninformative(const Lanes& seen, const Lanes& level) {
     const Bits clipped = ((seen > 254.5f) & (level > 255.0f)) | ((seen < 0.5f) & (level < 0.0f));
     return (seen < 0.0f) | clipped;
 }
 
-/// Of a chunk of pixels: the gradient of the grey levels by the parameters, what the ring's two edges have in
-/// their change with the distance, and the residuals.
+/// For a chunk of pixels: the gradient of the grey levels by the parameters, the part of their derivative by
+/// the distance that the ring's two edges contribute, and the residuals.
 struct Gradient {
     Lanes by[kCount][kChunk], ring[kChunk], residual[kChunk];
 };
 
-/// What the parameters say of pixels' grey levels.
+/// The grey levels of pixels as a function of the parameters.
 ///
-/// Each edge is a normal distribution of the distance to its ellipse, to first order (f - r) / |grad f|,
-/// where f = |X|. Blur moves the half level of an edge towards its centre of curvature, by curvature
-/// blur^2 / 2. The work is cut into loops that are short enough for a processor to overlap their turns.
+/// The profile of each edge is a normal distribution of the distance to its ellipse, to first order
+/// (f - r) / |grad f| with f = |X|. Blur moves the half level of an edge towards its centre of curvature by
+/// curvature blur^2 / 2. The loops are short, so that a processor can overlap their iterations.
 ///
-/// Where pixels see a single edge, the model is of that one alone: its ellipse stands for the pose, without
-/// perspective (see edge_ellipse.hpp), and of the gradient only the levels on its sides, the blur, kX to kAyy
-/// and the ring are set.
+/// For pixels that show a single edge, the model contains only that edge. Its ellipse replaces the pose,
+/// without perspective (see edge_ellipse.hpp), and only the gradient by the levels on its sides, the blur and
+/// kX to kAyy is set.
 template <Edge edge>
 class ModelOf {
   public:
@@ -102,7 +99,7 @@ class ModelOf {
                                  Gradient& to) const {
         Geometry at;
         for (int k = 0; k < count; ++k) locate(load(x + k * kLanes), load(y + k * kLanes), k, at);
-        for (int k = 0; k < count; ++k) face(k, at);
+        for (int k = 0; k < count; ++k) complete(k, at);
         if constexpr (kAlone) {
             Profile profile;
             blur_edge(at, 1, count, profile);
@@ -123,15 +120,15 @@ class ModelOf {
     static constexpr bool kAlone = edge != kAnyEdge;
     static constexpr double kRootHalf = 0.70710678, kPeak = 0.39894228;  // sqrt(1/2), 1 / sqrt(2 pi)
 
-    /// Where pixels are: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the shift of
-    /// an edge of radius 1 by blur, and by how much the distance changes with g . q.
+    /// The geometry of pixels: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the
+    /// shift of an edge of radius 1 by blur, and the derivative of the distance by g . q.
     struct Geometry {
         Lanes qx[kChunk], qy[kChunk], f[kChunk], nx[kChunk], ny[kChunk], stretch[kChunk], bow[kChunk],
             bend[kChunk], flat[kChunk], tip[kChunk];
     };
 
-    /// Leaves the gradient times the depth in n, the depth over the blur in `stretch`, 1 / |q| in `bow` and
-    /// the curvature of the lines of equal f, but for powers of the gradient, in `tip`.
+    /// Stores grad f times the depth in n, the depth in `stretch`, 1 / |q| in `bow`, and in `tip` the
+    /// curvature of the contours of f up to powers of the gradient.
     ROUNDEL_INLINE void locate(const Lanes& x, const Lanes& y, int k, Geometry& at) const {
         const Lanes dx = x - x_, dy = y - y_;
         const Lanes qx = inverse_xx_ * dx + inverse_xy_ * dy, qy = inverse_xy_ * dx + inverse_yy_ * dy;
@@ -140,15 +137,15 @@ class ModelOf {
         const Lanes f = kAlone ? qq * per_q : qq * per_q / depth;
         Lanes mx = qx * per_q, my = qy * per_q;  // grad f = A^-1 m / depth
         if constexpr (!kAlone) mx += f * gx_, my += f * gy_;
-        // A shape moves an edge by where the nearest point of the edge is, |q| = 1.
+        // The derivative by a shape is taken at the nearest point of the edge, |q| = 1.
         at.qx[k] = kAlone ? mx : qx, at.qy[k] = kAlone ? my : qy;
         at.f[k] = f, at.stretch[k] = depth, at.bow[k] = per_q;
         at.nx[k] = inverse_xx_ * mx + inverse_xy_ * my, at.ny[k] = inverse_xy_ * mx + inverse_yy_ * my;
         at.tip[k] = (turn_ * qx * qy + shear_ * (xx - yy)) * (per_q * per_q);
     }
 
-    /// Ends what `locate` began.
-    ROUNDEL_INLINE void face(int k, Geometry& at) const {
+    /// Completes the geometry that `locate` began.
+    ROUNDEL_INLINE void complete(int k, Geometry& at) const {
         const Lanes vx = at.nx[k], vy = at.ny[k], vv = vx * vx + vy * vy + 1e-12f, per_v = inverse_sqrt(vv);
         const Lanes f = at.f[k], depth = at.stretch[k], per_q = at.bow[k], per_vv = per_v * per_v;
         const Lanes near = kAlone ? per_v : per_v * f * per_q, across = at.tip[k] * per_v;
@@ -160,12 +157,12 @@ class ModelOf {
         at.bow[k] = per_vv * bow;
     }
 
-    /// The share of the inside that a pixel sees, and its derivatives by the distance and by the blur.
+    /// The share of the inside in a pixel's level, and its derivatives by the distance and by the blur.
     struct Profile {
         Lanes inside[kChunk], slope[kChunk], by_blur[kChunk];
     };
 
-    /// Distances and shifts in blurs.
+    /// Distances and shifts are in units of the blur.
     ROUNDEL_INLINE void blur_edge(const Geometry& at, float r, int count, Profile& to) const {
         const float per_r = 1 / r;
         for (int k = 0; k < count; ++k) {
@@ -181,7 +178,7 @@ class ModelOf {
         }
     }
 
-    /// Gives the grey level.
+    /// Sets the gradient and returns the grey level.
     ROUNDEL_INLINE Lanes differentiate(const Geometry& at, const Profile& outer, const Profile& inner,
                                        const Profile& card, int k, Gradient& to) const {
         const Lanes by_inner = -fall_ * inner.slope[k], by_card = -drop_ * card.slope[k];
@@ -198,7 +195,7 @@ class ModelOf {
         return bright_ + fall_ * dark + drop_ * ground;
     }
 
-    /// Likewise, of a single edge.
+    /// The same for a single edge.
     ROUNDEL_INLINE Lanes differentiate(const Geometry& at, const Profile& profile, int k,
                                        Gradient& to) const {
         const Lanes by = jump_ * profile.slope[k], inside = profile.inside[k];
@@ -216,12 +213,12 @@ class ModelOf {
     }
 
     ROUNDEL_INLINE static Lanes compare(const Lanes& seen, const Lanes& level) {
-        return is_silent(seen, level) ? all(kAbsent) : seen - level;
+        return is_uninformative(seen, level) ? all(kAbsent) : seen - level;
     }
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;
     float bright_, fall_, drop_, per_blur_, peak_, half_bend_, half_flat_, zgx_, zgy_, turn_, shear_;
-    float outside_ = 0, jump_ = 0;  // of a single edge
+    float outside_ = 0, jump_ = 0;  // for a single edge
 };
 
 using Model = ModelOf<kAnyEdge>;

@@ -9,8 +9,8 @@ namespace roundel {
 template <int N>
 using Vector = std::array<double, N>;
 
-/// The lower triangle L of a symmetric positive definite matrix A = L L^T, of which only the lower triangle
-/// is read.
+/// The Cholesky factor L of a symmetric positive definite matrix A = L L^T. Only the lower triangle of A is
+/// read.
 template <int N>
 class Cholesky {
   public:
@@ -28,7 +28,7 @@ class Cholesky {
         }
     }
     bool positive() const { return positive_; }
-    /// x of A x = b.
+    /// Solves A x = b.
     Vector<N> solve(Vector<N> b) const {
         for (int i = 0; i < N; ++i) {
             for (int k = 0; k < i; ++k) b[i] -= L_[i][k] * b[k];
@@ -40,7 +40,8 @@ class Cholesky {
         }
         return b;
     }
-    /// The last M rows and columns of the inverse of A: those of L alone, (L_22 L_22^T)^-1.
+    /// The last M rows and columns of the inverse of A. They depend on the last block of L only:
+    /// (L_22 L_22^T)^-1.
     template <int M>
     std::array<Vector<M>, M> inverse_tail() const {
         constexpr int first = N - M;

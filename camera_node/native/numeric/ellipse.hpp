@@ -3,7 +3,7 @@
 
 namespace roundel {
 
-/// An ellipse in pixels: its centre, its full axes, and the direction of the major one from +x towards +y in
+/// An ellipse in pixels: its centre, its full axes, and the direction of the major axis from +x towards +y in
 /// (-pi/2, pi/2].
 struct Ellipse {
     double x, y, major, minor, angle;
@@ -15,7 +15,7 @@ struct Symmetric {
     double det() const { return xx * yy - xy * xy; }
 };
 
-/// Eigenvalues, the larger first, and the direction of its eigenvector in (-pi/2, pi/2].
+/// Eigenvalues, the larger one first, and the direction of its eigenvector in (-pi/2, pi/2].
 struct Eigen {
     double first, second, angle;
 };

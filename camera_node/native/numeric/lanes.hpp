@@ -2,10 +2,10 @@
 #pragma once
 #include <cstdint>
 
-/// Eight floats at a time by the vector extensions of GCC and Clang. Only operations that IEEE 754 rounds
-/// exactly, or integer ones, so every machine gives the same bits (see simd.hpp).
+/// Vectors of eight floats by the vector extensions of GCC and Clang. All operations are exactly rounded by
+/// IEEE 754, or integer operations, so every machine computes the same bits (see simd.hpp).
 ///
-/// What takes or returns Lanes is inlined always: there is no call whose ABI could differ.
+/// Functions that take or return Lanes are always inlined, so that there is no call whose ABI could differ.
 #pragma GCC diagnostic ignored "-Wpsabi"
 #define ROUNDEL_INLINE inline __attribute__((always_inline))
 
@@ -14,7 +14,7 @@ namespace roundel {
 constexpr int kLanes = 8;
 typedef float Lanes __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Bits __attribute__((vector_size(4 * kLanes)));
-typedef uint32_t Words __attribute__((vector_size(4 * kLanes)));  // of which sums may wrap around
+typedef uint32_t Words __attribute__((vector_size(4 * kLanes)));  // sums may wrap around
 
 ROUNDEL_INLINE Lanes all(float value) { return Lanes{} + value; }
 ROUNDEL_INLINE Lanes load(const float* from) {
@@ -25,7 +25,8 @@ ROUNDEL_INLINE Lanes load(const float* from) {
 ROUNDEL_INLINE void store(float* to, const Lanes& v) { __builtin_memcpy(to, &v, sizeof v); }
 ROUNDEL_INLINE Lanes magnitude(const Lanes& x) { return Lanes(Bits(x) & 0x7fffffff); }
 
-/// 1 / sqrt(x) of x > 0 to 5e-6 of itself: a first guess by halving the exponent, and two of Newton's steps.
+/// 1 / sqrt(x) for x > 0 with a relative error of 5e-6: an initial guess by halving the exponent, and two
+/// steps of Newton's method.
 ROUNDEL_INLINE Lanes inverse_sqrt(const Lanes& x) {
     Lanes y = Lanes(0x5f375a86 - (Words(x) >> 1));
     const Lanes half = 0.5f * x;
@@ -33,13 +34,13 @@ ROUNDEL_INLINE Lanes inverse_sqrt(const Lanes& x) {
     return y * (1.5f - half * y * y);
 }
 
-/// Of the normal distribution: 1 - Phi(t), and exp(-t^2 / 2).
+/// The normal distribution: 1 - Phi(t) and exp(-t^2 / 2).
 struct Normal {
     Lanes tail, density;
 };
 
-/// By the polynomials of t^2 that are nearest on [-3.5, 3.5]: the tail is within 3e-5 there, and 2e-4 beyond,
-/// the density within 3e-3, and 0 beyond. Terms that do not wait for each other are faster than a chain.
+/// Minimax polynomials in t^2 on [-3.5, 3.5]. The error of the tail is 3e-5 there and 2e-4 beyond, that of
+/// the density 3e-3; the density is 0 beyond. Independent terms are faster than Horner's scheme.
 ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
     const Lanes above = t > -3.5f ? t : all(-3.5f), z = above < 3.5f ? above : all(3.5f);
     const Lanes u = z * z, uu = u * u;
@@ -50,7 +51,7 @@ ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
     return {0.5f - z * odd, z == t ? even : all(0)};
 }
 
-/// Sum in an order that all machines keep.
+/// The sum of the lanes, in the same order on every machine.
 ROUNDEL_INLINE float sum(const Lanes& v) {
     typedef float Half __attribute__((vector_size(2 * kLanes)));
     const Half h = __builtin_shufflevector(v, v, 0, 1, 2, 3) + __builtin_shufflevector(v, v, 4, 5, 6, 7);

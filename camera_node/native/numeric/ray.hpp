@@ -25,7 +25,7 @@ inline const std::array<Direction, kRays> kDirections = [] {
     return directions;
 }();
 
-/// Grey level between pixels; below 0 outside the image.
+/// The bilinearly interpolated grey level; negative outside of the image.
 inline float sample(const ImageView& image, float x, float y) {
     const int u = int(x), v = int(y);
     if (!(x >= 0 && y >= 0 && u < image.width - 1 && v < image.height - 1)) return -1;
@@ -36,7 +36,7 @@ inline float sample(const ImageView& image, float x, float y) {
     return above + b * (below - above);
 }
 
-/// A ray that walks outwards from (x, y) pixel by pixel, as far as the image goes.
+/// A ray that walks outwards from (x, y) pixel by pixel, up to the edge of the image.
 class Ray {
   public:
     Ray(const ImageView& image, float x, float y, Direction d)
@@ -45,8 +45,8 @@ class Ray {
           y_(y),
           d_(d),
           end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
-    /// The first pixel, before `limit`, where the ray is (or is not) darker than `theta` after it was not (or
-    /// was) once; negative where it does not turn so. The next walk goes on from there.
+    /// The first pixel before `limit` at which the ray becomes darker than `theta` (`dark`), or no longer is
+    /// (not `dark`); negative if there is none. The next walk continues from there.
     template <bool dark>
     int walk(int theta, float limit) {
         const int last = int(std::min(limit, end_));
@@ -56,13 +56,13 @@ class Ray {
         while (t < last && !is_there()) ++t, u += du_, v += dv_;
         return t_ = t, t < last ? t : -1;
     }
-    /// Where it does so between pixels; negative where it does not.
+    /// The same with subpixel interpolation.
     float turn(bool dark, float theta, float limit) {
         const int below = int(std::ceil(theta)),
                   pixel = dark ? walk<true>(below, limit) : walk<false>(below, limit);
         return pixel < 0 ? -1 : between(pixel, theta);
     }
-    /// Where the level is theta, near the pixel to which a walk went.
+    /// The position at which the level is theta, near the pixel that a walk found.
     float between(int pixel, float theta) const {
         float t = float(std::max(pixel - 2, 0)), before = level(t);
         for (int k = 0; k < 3; ++k) {
@@ -74,7 +74,7 @@ class Ray {
     }
 
   private:
-    /// How far a ray goes until half a pixel before the image's last one; nothing is seen from outside.
+    /// The length of a ray up to half a pixel before the image's last pixel; 0 from outside of the image.
     static float room(float at, float step, int length) {
         if (!(at >= 0 && at <= float(length - 1))) return 0;
         const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
@@ -91,7 +91,7 @@ class Ray {
     int t_ = 0;
 };
 
-/// Grey levels on the ellipse that is `scale` times the outer one; below 0 outside the image.
+/// Grey levels at kRays points on the ellipse scaled by `scale`; negative outside of the image.
 inline std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
     std::array<float, kRays> levels;
     const double c = std::cos(e.angle), s = std::sin(e.angle);

@@ -20,10 +20,11 @@ bool is_whole(const Segment& s, int width, int height) {
     return s.left > 0 && s.top > 0 && s.right < width - 1 && s.bottom < height - 1;
 }
 
-bool has_size(const Segment& s, const Settings& settings) {
-    // The upright box of an ellipse is between 1/sqrt(2) and 1 of its major axis; blur takes up to a pixel.
+bool has_size(const Segment& s, const RoundelLimits& limits) {
+    // The sides of an ellipse's upright box: the longer one is between 1/sqrt(2) and 1 of the major axis.
+    // Blur removes up to a pixel.
     const int side = std::max(s.width(), s.height());
-    return side >= settings.min_diameter / std::numbers::sqrt2 - 1 && side <= settings.max_diameter + 1;
+    return side >= limits.min_diameter / std::numbers::sqrt2 - 1 && side <= limits.max_diameter + 1;
 }
 
 bool is_inside(const Segment& inner, const Segment& outer) {
@@ -45,10 +46,10 @@ bool are_concentric(const Moments& disc, const Moments& inner) {
     return apart < 0.1 * covariance_ellipse(disc).minor + 0.5;
 }
 
-bool has_area_ratio(const Moments& disc, const Moments& inner, const Settings& settings) {
+bool has_area_ratio(const Moments& disc, const Moments& inner, const RoundelLimits& limits) {
     const double ratio = std::sqrt(inner.n / disc.n);
-    const double tolerance = settings.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
-    return settings.ratio_error(ratio) < tolerance;
+    const double tolerance = limits.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
+    return limits.ratio_error(ratio) < tolerance;
 }
 
 Ellipse covariance_ellipse(const Moments& disc) {
@@ -62,11 +63,12 @@ double distance_by_principal_axis(double diameter, double major) {
     return diameter / major;
 }
 
-std::vector<Pair> find_pairs(const Segments& segments, int width, int height, const Settings& settings) {
-    std::vector<Pair> pairs;
+std::vector<SegmentPair> find_pairs(const Segments& segments, int width, int height,
+                                    const RoundelLimits& limits) {
+    std::vector<SegmentPair> pairs;
     for (int k = 0; k < int(segments.list.size()); ++k) {
         const Segment& outer = segments.list[size_t(k)];
-        if (!outer.dark || !is_whole(outer, width, height) || !has_size(outer, settings)) continue;
+        if (!outer.dark || !is_whole(outer, width, height) || !has_size(outer, limits)) continue;
         const Moments& m = outer.moments;
         const int centre = segments.at(int(std::lround(m.x / m.n)), int(std::lround(m.y / m.n)));
         const Segment& inner = segments.list[size_t(centre)];
@@ -74,46 +76,59 @@ std::vector<Pair> find_pairs(const Segments& segments, int width, int height, co
         Moments disc = m;
         disc += inner.moments;
         if (!fills_its_box(outer, disc) || !are_concentric(disc, inner.moments)) continue;
-        if (has_area_ratio(disc, inner.moments, settings)) pairs.push_back({k, centre, disc});
+        if (has_area_ratio(disc, inner.moments, limits)) pairs.push_back({k, centre, disc});
     }
     return pairs;
 }
 
 namespace {
 
-/// A pair under its own threshold theta = (m_d + m_b) / 2, grown anew in the window around it.
-std::optional<Start> rethreshold(const ImageView& image, const Segment& outer, double theta,
-                                 const Settings& settings) {
+/// Repeats the search for a pair in the window around it, under its own threshold theta = (m_d + m_b) / 2.
+std::optional<InitialGuess> rethreshold(const ImageView& image, const Segment& outer, double theta,
+                                        const RoundelLimits& limits) {
     const int margin = 2 + std::max(outer.width(), outer.height()) / 8;
     const int left = std::max(0, outer.left - margin), top = std::max(0, outer.top - margin);
     const int width = std::min(image.width, outer.right + 1 + margin) - left;
     const int height = std::min(image.height, outer.bottom + 1 + margin) - top;
     const ImageView window = image.window(left, top, width, height);
     const Segments segments = grow_segments(window, constant_threshold(uint8_t(std::lround(theta))));
-    for (const Pair& pair : find_pairs(segments, width, height, settings)) {
+    for (const SegmentPair& pair : find_pairs(segments, width, height, limits)) {
         Ellipse e = covariance_ellipse(pair.disc);
         e.x += left, e.y += top;
         if (e.x < outer.left || e.x > outer.right || e.y < outer.top || e.y > outer.bottom) continue;
         const double ratio = std::sqrt(segments.list[size_t(pair.bright)].moments.n / pair.disc.n);
-        return Start{e, ratio, mean_level(window, segments, pair.dark),
-                     mean_level(window, segments, pair.bright)};
+        return InitialGuess{e, ratio, mean_level(window, segments, pair.dark),
+                            mean_level(window, segments, pair.bright)};
     }
     return std::nullopt;
 }
 
 }  // namespace
 
-std::vector<Start> find_by_segments(const ImageView& image, const ThresholdMap& threshold,
-                                    const Settings& settings) {
-    std::vector<Start> starts;
-    const Segments segments = grow_segments(image, threshold);
-    for (const Pair& pair : find_pairs(segments, image.width, image.height, settings)) {
+std::vector<InitialGuess> PaperSearch::find(const ImageView& image, double min_contrast,
+                                            const RoundelLimits& limits) const {
+    std::vector<InitialGuess> guesses;
+    const auto theta = uint8_t(std::lround(std::clamp(theta_, 1.0, 255.0)));
+    const Segments segments = grow_segments(image, local_threshold(image, min_contrast, theta));
+    for (const SegmentPair& pair : find_pairs(segments, image.width, image.height, limits)) {
         const double m_d = mean_level(image, segments, pair.dark);
         const double m_b = mean_level(image, segments, pair.bright);
         const Segment& outer = segments.list[size_t(pair.dark)];
-        if (const auto start = rethreshold(image, outer, (m_d + m_b) / 2, settings)) starts.push_back(*start);
+        if (const auto guess = rethreshold(image, outer, (m_d + m_b) / 2, limits)) guesses.push_back(*guess);
     }
-    return starts;
+    return guesses;
+}
+
+void PaperSearch::set_levels(double dark, double bright) {
+    theta_ = (dark + bright) / 2;
+    steps_ = 1;
+}
+
+void PaperSearch::step() {
+    steps_ = steps_ % 31 + 1;
+    double share = 0, bit = 0.5;  // the binary digits of the step's number, mirrored at the point
+    for (unsigned digits = steps_; digits; digits >>= 1, bit /= 2) share += (digits & 1) * bit;
+    theta_ = 256 * share;
 }
 
 }  // namespace roundel

@@ -21,7 +21,7 @@ Moments run_moments(const Run& run, double y) {
     return {n, x, n * y, n * (middle * middle + (n * n - 1) / 12), x * y, n * y * y};
 }
 
-/// Appends the runs of a row whose mask is 1 where it is dark.
+/// Appends the runs of a row; its mask is 1 at dark pixels.
 void append_runs(const uint8_t* mask, int width, std::vector<Run>& runs) {
     for (int x = 0; x < width;) {
         const uint8_t side = mask[x];
@@ -37,7 +37,7 @@ void append_runs(const uint8_t* mask, int width, std::vector<Run>& runs) {
     }
 }
 
-/// The run that stands for a run's set; halves the path on its way.
+/// The root of a run's set (union-find with path halving).
 int find_root(std::vector<Run>& runs, int k) {
     while (runs[size_t(k)].segment != k) {
         int& parent = runs[size_t(k)].segment;
@@ -56,7 +56,7 @@ void join(std::vector<Run>& runs, int a, int b) {
 void join_rows(std::vector<Run>& runs, int begin, int middle, int end) {
     for (int above = begin, below = middle; above < middle && below < end;) {
         const Run a = runs[size_t(above)],
-                  b = runs[size_t(below)];  // runs tile their rows, so these two touch
+                  b = runs[size_t(below)];  // runs cover their rows, so these two touch
         if (a.dark == b.dark) join(runs, above, below);
         if (a.end == b.end && above + 1 < middle && a.dark != b.dark)  // two bright runs meet at a corner
             a.dark ? join(runs, above + 1, below) : join(runs, above, below + 1);
@@ -73,7 +73,7 @@ void include(Segment& segment, const Run& run, int y) {
     segment.moments += run_moments(run, y);
 }
 
-/// Turns roots into numbers of segments and sums up each segment. A root comes before the runs of its set.
+/// Replaces roots by numbers of segments and sums up each segment. A root precedes the runs of its set.
 void number_segments(Segments& segments) {
     auto& runs = segments.runs;
     for (size_t y = 0; y + 1 < segments.row_begin.size(); ++y)
@@ -107,7 +107,7 @@ Segments grow_segments(const ImageView& image, const ThresholdMap& threshold) {
         segments.row_begin.push_back(int(segments.runs.size()));
         if (y) join_rows(segments.runs, segments.row_begin[size_t(y) - 1], middle, segments.row_begin.back());
     }
-    // Parents come before their children, so one pass leads every run to its root.
+    // Parents precede their children, so one pass finds every root.
     for (auto& run : segments.runs) run.segment = segments.runs[size_t(run.segment)].segment;
     number_segments(segments);
     return segments;

@@ -8,13 +8,13 @@
 
 namespace roundel {
 
-/// Sums over pixels from which area, centre and covariance follow.
+/// Sums over pixels that give area, centre and covariance.
 struct Moments {
     double n = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0;
     Moments& operator+=(const Moments& other);
 };
 
-/// A connected set of pixels on one side of the threshold. The box holds its last row and column.
+/// A connected set of pixels on one side of the threshold. The box includes its last row and column.
 struct Segment {
     bool dark = false;
     int left = INT32_MAX, top = INT32_MAX, right = -1, bottom = -1;
@@ -23,23 +23,23 @@ struct Segment {
     int height() const { return bottom - top + 1; }
 };
 
-/// Pixels [begin, end) of a row, all on one side of the threshold.
+/// Pixels [begin, end) of a row on one side of the threshold.
 struct Run {
     int begin, end, segment;
     bool dark;
 };
 
-/// All dark and all bright segments of an image, as runs in the order of rows. Dark pixels are connected by
-/// their four sides and bright ones also by their corners, so a thin bright line parts what is dark.
+/// All dark and all bright segments of an image, as runs in the order of the rows. Dark pixels are
+/// 4-connected and bright pixels 8-connected, so that a thin bright line separates dark segments.
 struct Segments {
     std::vector<Run> runs;
     std::vector<int> row_begin;  // (height + 1) first run of each row
     std::vector<Segment> list;
-    /// Which segment covers a pixel of the image.
+    /// The number of the segment that contains a pixel of the image.
     int at(int x, int y) const;
 };
 
-/// Region growing of the whole frame at once: the runs of neighbouring rows that touch are joined.
+/// Region growing of the whole frame: joins the runs of adjacent rows that touch.
 Segments grow_segments(const ImageView& image, const ThresholdMap& threshold);
 
 /// Mean grey level of one segment.

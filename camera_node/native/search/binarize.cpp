@@ -18,8 +18,8 @@ namespace {
 
 constexpr int kBlock = 2 * kWord;
 
-// Sixteen pixels at a time: the means of two rows and those of 32 pixels of a row two by two, both rounded
-// up, and which are below their thresholds (bit k is pixel k).
+// Operations on sixteen pixels: the means of two rows, and of 32 pixels of a row in pairs, both rounded up;
+// and the bits of the pixels below their thresholds (bit k is pixel k).
 #if defined(ROUNDEL_BASELINE)
 using Pixels = __m128i;
 inline Pixels load(const uint8_t* from) { return _mm_loadu_si128(reinterpret_cast<const __m128i*>(from)); }
@@ -71,12 +71,12 @@ inline uint32_t below(const Pixels& x, const Pixels& theta) {
 }
 #endif
 
-/// Every second one of n values.
+/// Copies every second one of n values.
 ROUNDEL_CLONES void halve(const uint8_t* from, int n, uint8_t* to) {
     for (int x = 0; x < n / 2; ++x) to[x] = from[2 * x];
 }
 
-/// The thresholds of a row, of its pixels and of its pairs of pixels; tiles are even.
+/// The thresholds of a row's pixels and of its pairs of pixels. The side of a tile is even.
 struct RowThreshold {
     std::vector<uint8_t> of_pixels, of_pairs;
     explicit RowThreshold(int length) : of_pixels(size_t(length)), of_pairs(of_pixels.size() / 2) {}
@@ -86,12 +86,12 @@ struct RowThreshold {
     }
 };
 
-/// What 128 pixels of two rows become: their means, and each row's pairs of pixels.
+/// The bits of 128 pixels of two rows: of their means, and of each row's pairs of pixels.
 struct BlockBits {
     uint64_t mean[2], upper, lower;
 };
 
-/// Where that goes: the words of a line of means, and every 64th word from that of the upper row's pairs on.
+/// The destination: the words of a line of means, and every 64th word from that of the upper row's pairs on.
 struct RowBits {
     uint64_t *mean, *pairs;
     ROUNDEL_INLINE void put(int n, const BlockBits& bits) {
@@ -100,7 +100,7 @@ struct RowBits {
     }
 };
 
-inline BlockBits binarise_block(const uint8_t* a, const uint8_t* b, const uint8_t* theta,
+inline BlockBits binarize_block(const uint8_t* a, const uint8_t* b, const uint8_t* theta,
                                 const uint8_t* theta_of_pairs) {
     BlockBits bits{};
     for (int x = 0; x < 2 * kWord; x += 16)
@@ -118,7 +118,7 @@ ROUNDEL_AVX2 inline __m256i load_32(const uint8_t* from) {
     return _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from));
 }
 
-/// Bit k tells that x[k] < theta[k].
+/// Bit k is set if x[k] < theta[k].
 ROUNDEL_AVX2 inline uint64_t below_32(__m256i x, __m256i theta) {
     return ~uint32_t(_mm256_movemask_epi8(_mm256_cmpeq_epi8(_mm256_max_epu8(x, theta), x)));
 }
@@ -131,7 +131,7 @@ ROUNDEL_AVX2 inline __m256i mean_of_32_pairs(const uint8_t* from) {
     return _mm256_permute4x64_epi64(mixed, 0xd8);
 }
 
-ROUNDEL_AVX2 inline BlockBits binarise_block_by_32(const uint8_t* a, const uint8_t* b, const uint8_t* theta,
+ROUNDEL_AVX2 inline BlockBits binarize_block_by_32(const uint8_t* a, const uint8_t* b, const uint8_t* theta,
                                                    const uint8_t* theta_of_pairs) {
     BlockBits bits{};
     for (int x = 0; x < 2 * kWord; x += 32)
@@ -145,11 +145,11 @@ ROUNDEL_AVX2 inline BlockBits binarise_block_by_32(const uint8_t* a, const uint8
     return bits;
 }
 
-ROUNDEL_AVX2 void binarise_rows(const uint8_t* a, const uint8_t* b, const RowThreshold& theta, int first,
+ROUNDEL_AVX2 void binarize_rows(const uint8_t* a, const uint8_t* b, const RowThreshold& theta, int first,
                                 int blocks, RowBits to) {
     for (int n = 0; n < blocks; ++n, a += kBlock, b += kBlock) {
         const size_t at = size_t(first + n) * kBlock;
-        to.put(n, binarise_block_by_32(a, b, &theta.of_pixels[at], &theta.of_pairs[at / 2]));
+        to.put(n, binarize_block_by_32(a, b, &theta.of_pixels[at], &theta.of_pairs[at / 2]));
     }
 }
 #endif
@@ -157,16 +157,16 @@ ROUNDEL_AVX2 void binarise_rows(const uint8_t* a, const uint8_t* b, const RowThr
 #if defined(ROUNDEL_BASELINE)
 ROUNDEL_BASELINE
 #endif
-/// `blocks` of two rows, under the thresholds from block `first` on.
-void binarise_rows(const uint8_t* a, const uint8_t* b, const RowThreshold& theta, int first, int blocks,
+/// Binarizes blocks of two rows with the thresholds from block `first` on.
+void binarize_rows(const uint8_t* a, const uint8_t* b, const RowThreshold& theta, int first, int blocks,
                    RowBits to) {
     for (int n = 0; n < blocks; ++n, a += kBlock, b += kBlock) {
         const size_t at = size_t(first + n) * kBlock;
-        to.put(n, binarise_block(a, b, &theta.of_pixels[at], &theta.of_pairs[at / 2]));
+        to.put(n, binarize_block(a, b, &theta.of_pixels[at], &theta.of_pairs[at / 2]));
     }
 }
 
-/// What is left of a row after whole blocks; beyond the image's edge all is bright.
+/// The rest of a row after whole blocks. Pixels beyond the image's edge are bright.
 struct Tail {
     std::array<uint8_t, kBlock> levels;
     Tail(const uint8_t* row, int begin, int end) {
@@ -178,7 +178,7 @@ struct Tail {
 
 }  // namespace
 
-void binarise(const ImageView& image, const ThresholdMap& threshold, BitImage& rows, BitImage& columns) {
+void binarize(const ImageView& image, const ThresholdMap& threshold, BitImage& rows, BitImage& columns) {
     const int w = image.width, h = image.height, whole = w / kBlock, blocks = (w + kBlock - 1) / kBlock;
     rows.reset((h + 1) / 2, w), columns.reset((w + 1) / 2, h);
     RowThreshold theta(blocks * kBlock);
@@ -187,10 +187,10 @@ void binarise(const ImageView& image, const ThresholdMap& threshold, BitImage& r
         if (threshold.changes(y)) theta.read(threshold, y, w);
         const uint8_t *row = image.row(y), *next = image.row(std::min(y + 1, h - 1));
         const int k = y % kWord;
-        binarise_rows(row, next, theta, 0, whole, {mean.data(), &pairs[size_t(k)]});
+        binarize_rows(row, next, theta, 0, whole, {mean.data(), &pairs[size_t(k)]});
         if (whole < blocks) {
             const Tail a(row, whole * kBlock, w), b(next, whole * kBlock, w);
-            binarise_rows(a.levels.data(), b.levels.data(), theta, whole, 1,
+            binarize_rows(a.levels.data(), b.levels.data(), theta, whole, 1,
                           {&mean[size_t(whole) * 2], &pairs[size_t(whole * kWord + k)]});
         }
         std::copy_n(mean.data(), rows.words, rows.line(y / 2));

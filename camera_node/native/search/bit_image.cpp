@@ -15,7 +15,7 @@ namespace {
 typedef uint64_t Four __attribute__((vector_size(32)));
 constexpr int kFours = kWord / 4;
 
-/// Exchanges the high bits of `upper` that `mask` << side holds with the low ones of `lower`.
+/// Exchanges the bits `mask` << side of `upper` with the bits `mask` of `lower`.
 template <int side>
 ROUNDEL_INLINE void exchange(Four& upper, Four& lower, uint64_t mask) {
     const Four swap = (upper >> side ^ lower) & mask;
@@ -23,14 +23,14 @@ ROUNDEL_INLINE void exchange(Four& upper, Four& lower, uint64_t mask) {
     lower ^= swap;
 }
 
-/// The same in whole vectors, `side` lines apart.
+/// The same for lines `side` apart, in whole vectors.
 template <int side>
 ROUNDEL_INLINE void exchange_quarters(Four* lines, uint64_t mask) {
     for (int top = 0; top < kFours; top += side / 2)
         for (int k = top; k < top + side / 4; ++k) exchange<side>(lines[k], lines[k + side / 4], mask);
 }
 
-/// And for the lines within two vectors.
+/// The same for lines within two vectors.
 ROUNDEL_INLINE void exchange_within(Four& a, Four& b) {
     Four upper = __builtin_shufflevector(a, b, 0, 1, 4, 5), lower = __builtin_shufflevector(a, b, 2, 3, 6, 7);
     exchange<2>(upper, lower, 0x3333333333333333u);
@@ -46,7 +46,7 @@ ROUNDEL_CLONES void transpose(uint64_t* block) {
     __builtin_memcpy(lines, block, sizeof lines);
     Four any{};
     for (const Four& four : lines) any |= four;
-    if (!(any[0] | any[1] | any[2] | any[3])) return;  // much of a picture has nothing dark
+    if (!(any[0] | any[1] | any[2] | any[3])) return;  // many blocks have no dark pixels
     exchange_quarters<32>(lines, 0x00000000ffffffffu);
     exchange_quarters<16>(lines, 0x0000ffff0000ffffu);
     exchange_quarters<8>(lines, 0x00ff00ff00ff00ffu);
@@ -55,7 +55,7 @@ ROUNDEL_CLONES void transpose(uint64_t* block) {
     __builtin_memcpy(block, lines, sizeof lines);
 }
 
-/// Every fourth bit of each of `words`, from bit `phase` on.
+/// Extracts every fourth bit of each word, from bit `phase` on.
 ROUNDEL_CLONES void take_fourths(const uint64_t* line, int words, int phase, uint16_t* to) {
     for (int n = 0; n < words; ++n) {
         uint64_t x = line[n] >> phase & 0x1111111111111111u;
@@ -66,7 +66,7 @@ ROUNDEL_CLONES void take_fourths(const uint64_t* line, int words, int phase, uin
     }
 }
 
-/// The 64 bits from `from` on of a line that has a word more before and behind.
+/// The 64 bits from `from` on of a line that is padded with one word on either side.
 inline uint64_t bits_from(const uint64_t* line, int from) {
     const uint64_t* word = line + 1 + (from >> 6);
     const int shift = from & (kWord - 1);
@@ -105,13 +105,13 @@ void BitImage::put_columns(int first, int at, uint64_t* block) {
     for (int j = 0; j < std::min(kWord, lines - first); ++j, to += words) *to = block[j];
 }
 
-void thin_out(const BitImage& rows, BitImage& thin) {
+void subsample(const BitImage& rows, BitImage& sparse) {
     const int words = (rows.words + 3) / 4;
-    thin.reset(rows.lines, (words + 2) * kWord);
+    sparse.reset(rows.lines, (words + 2) * kWord);
     std::vector<uint16_t> quarters(size_t(words) * 4, 0);
     for (int y = 0; y < rows.lines; ++y) {
         take_fourths(rows.line(y), rows.words, y % 2 * 2, quarters.data());
-        uint64_t* to = thin.line(y);
+        uint64_t* to = sparse.line(y);
         to[0] = to[words + 1] = 0;
         for (size_t n = 0; n < size_t(words); ++n)
             to[n + 1] = uint64_t(quarters[4 * n]) | uint64_t(quarters[4 * n + 1]) << 16 |
@@ -119,16 +119,16 @@ void thin_out(const BitImage& rows, BitImage& thin) {
     }
 }
 
-void shear(const BitImage& thin, bool growing, BitImage& diagonals) {
-    const int half = thin.lines / 2, length = thin.length - 2 * kWord;
-    diagonals.reset(length + half, thin.lines);
+void shear(const BitImage& sparse, bool growing, BitImage& diagonals) {
+    const int half = sparse.lines / 2, length = sparse.length - 2 * kWord;
+    diagonals.reset(length + half, sparse.lines);
     uint64_t block[kWord];
     for (int d = 0; d < diagonals.lines; d += kWord)
-        for (int top = 0; top < thin.lines; top += kWord) {
+        for (int top = 0; top < sparse.lines; top += kWord) {
             for (int k = 0; k < kWord; ++k) {
                 const int y = top + k, from = d + (growing ? y / 2 - half : -(y + 1) / 2);
                 block[k] =
-                    y < thin.lines && from > -kWord && from < length ? bits_from(thin.line(y), from) : 0;
+                    y < sparse.lines && from > -kWord && from < length ? bits_from(sparse.line(y), from) : 0;
             }
             diagonals.put_columns(d, top, block);
         }

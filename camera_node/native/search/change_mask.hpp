@@ -17,24 +17,24 @@ struct Box {
     double area() const { return double(right - left) * double(bottom - top); }
 };
 
-/// What a fixed camera's frames show that was not there when it was searched: by the mean of each tile of
-/// 8 x 8 pixels, which noise moves little and a roundel much. A tile is compared with the frame in which it
-/// was last searched, not with the last one, so slow changes add up.
-class Watch {
+/// Marks the parts of a fixed camera's frames that changed since they were searched. It compares the mean of
+/// each tile of 8 x 8 pixels, which a roundel changes much more than noise does. The reference is the frame
+/// in which the tile was last searched, not the last frame, so that slow changes accumulate.
+class ChangeMask {
   public:
-    /// Takes a frame; the first one and one of another size are all new.
-    void look(const ImageView& image);
-    /// A roundel is there, and explains what changes under it and its card in this frame.
-    void explain(const Ellipse& outer);
-    /// Boxes that hold all tiles whose mean moved by more than `limit` grey levels and that nothing explains,
-    /// with room for a roundel's rest around them; the whole frame where they would hold more than `share`.
+    /// Takes a frame. All of the first frame, and of a frame of another size, counts as changed.
+    void update(const ImageView& image);
+    /// Excludes the tiles under a roundel and its card from the changes of this frame.
+    void mask(const Ellipse& outer);
+    /// Boxes that contain all unmasked tiles whose mean changed by more than `limit` grey levels, with a
+    /// margin for the rest of a roundel; the whole frame if the boxes would cover more than `share` of it.
     std::vector<Box> changed(double limit, double share) const;
-    /// A part was searched. What a roundel hides of it was not, and counts as it was before.
-    void settle(const Box& box);
-    /// A roundel was there of late, and is looked for although nothing may change.
-    void doubt(const Ellipse& outer);
-    /// Nothing counts as searched any more.
-    void forget();
+    /// Makes this frame the reference for a box that was searched, except for its masked tiles.
+    void mark_searched(const Box& box);
+    /// Marks the tiles under a lost roundel as changed.
+    void invalidate(const Ellipse& outer);
+    /// Marks all tiles as changed.
+    void invalidate();
 
   private:
     template <typename Work>
@@ -42,8 +42,8 @@ class Watch {
     std::vector<uint8_t> changed_cells(int limit) const;
 
     int width_ = 0, height_ = 0, columns_ = 0, rows_ = 0;  // pixels; tiles
-    std::vector<uint16_t> now_, searched_;                 // sums of tiles' columns' means
-    std::vector<uint8_t> explained_;
+    std::vector<uint16_t> now_, searched_;                 // sums of the tiles' column means
+    std::vector<uint8_t> masked_;
 };
 
 }  // namespace roundel

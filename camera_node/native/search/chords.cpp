@@ -12,23 +12,22 @@ namespace roundel {
 
 namespace {
 
-// In sixteenths of a pixel, or of one.
-constexpr int kSlack = 24;        // by which a run may be off its proportion: a pixel's edge and blur
-constexpr int kCoarseLeast = 6;   // pixels, which are sqrt(8) as wide on a diagonal;
-constexpr int kCoarseSlack = 16;  // sixteenths of them
-constexpr int kUneven = 26;       // of one dark run to the other, in a chord that nothing covers
+constexpr int kSlack = 24;        // tolerance of a run, sixteenths of a pixel: edge and blur
+constexpr int kCoarseLeast = 6;   // least length on a diagonal, whose pixels are sqrt(8) wide, and
+constexpr int kCoarseSlack = 16;  // tolerance, sixteenths of them
+constexpr int kUneven = 26;       // longer dark run over the shorter one without occlusion, sixteenths
 constexpr int kDrift = 3;         // pixels that the middle may move from one line to the next
-constexpr int kStreakLines = 3, kStreakWidth = 14;  // the least; pixels
-constexpr float kStreakLong = 0.5f;  // of its width, and less where bars pass each other aslant:
-constexpr float kAside = 0.45f;      // sine of a slant off a diagonal that rows or columns see better
-constexpr float kPassing = 0.83f;    // so much of the width by the slant's sine
+constexpr int kStreakLines = 3, kStreakWidth = 14;  // least number of lines and least width, pixels
+constexpr float kStreakLength = 0.5f;               // least length over the width; less for oblique bars:
+constexpr float kOblique = 0.83f;  // width times the sine of the slant by which the length is shorter
+constexpr float kMaxSine = 0.45f;  // of the slant off a diagonal; rows or columns are better beyond
 
-constexpr int kBatch = 16;                       // lines that are scanned at once
-constexpr int kBeyond = 2 * kWord + 4 * kLanes;  // numbers that are read behind the last one
-constexpr int kGroup = 8;                        // numbers that are written without asking how many there are
+constexpr int kBatch = 16;                        // lines scanned together
+constexpr int kPadding = 2 * kWord + 4 * kLanes;  // numbers that are read beyond the last one
+constexpr int kGroup = 8;  // numbers that are written without testing how many there are
 
-/// The places of the bits of a word. Volatile, or they would be gathered in vectors first, which takes
-/// longer.
+/// Appends the positions of the bits of a word. The writes are volatile because the compiler would gather
+/// them in vectors otherwise, which takes longer.
 ROUNDEL_INLINE int* append_bits(uint64_t bits, int base, int* to) {
     const int count = std::popcount(bits);
     for (int k = 0; k < count; k += kGroup)
@@ -37,27 +36,33 @@ ROUNDEL_INLINE int* append_bits(uint64_t bits, int base, int* to) {
     return to + count;
 }
 
-/// Where some lines turn dark and bright again, in turns; returns how many dark runs there are. A place is
-/// the line's number times 2^shift and the pixel's; beyond a line all is bright.
-ROUNDEL_INLINE int find_runs(const BitImage& picture, int first, int last, int shift, int* edges) {
-    const int words = picture.words;
+/// Lines [first, last) of an image. A position in them is a single number: the line's number, counted from
+/// `first`, times 2^shift, plus the pixel's.
+struct LineRange {
+    int first, last, shift;
+};
+
+/// Writes the begins and ends of the dark runs of some lines; returns the number of runs. Pixels beyond the
+/// end of a line are bright.
+ROUNDEL_INLINE int find_runs(const BitImage& picture, const LineRange& range, int* edges) {
+    const int words = picture.words, shift = range.shift;
     int* to = edges;
-    for (int line = first; line < last; ++line) {
+    for (int line = range.first; line < range.last; ++line) {
         const uint64_t* word = picture.line(line);
         uint64_t carry = 0;
         for (int n = 0; n < words; ++n) {
             const uint64_t turns = word[n] ^ (word[n] << 1 | carry);
             carry = word[n] >> (kWord - 1);
-            if (turns) to = append_bits(turns, ((line - first) << shift) + n * kWord, to);
+            if (turns) to = append_bits(turns, ((line - range.first) << shift) + n * kWord, to);
         }
-        if (carry) *to++ = ((line - first) << shift) + picture.length;
+        if (carry) *to++ = ((line - range.first) << shift) + picture.length;
     }
     const int last_edge = to > edges ? to[-1] : 0;
-    for (int k = 0; k < kBeyond; ++k) to[k] = last_edge;  // runs of no length
+    for (int k = 0; k < kPadding; ++k) to[k] = last_edge;  // empty runs
     return int(to - edges) / 2;
 }
 
-/// Begins and ends of eight dark runs that lie one after another.
+/// Begins and ends of eight consecutive dark runs.
 struct DarkRuns {
     Bits begin, end;
     ROUNDEL_INLINE explicit DarkRuns(const int* edges) {
@@ -68,7 +73,7 @@ struct DarkRuns {
     }
 };
 
-/// Bit k tells whether lane k is set.
+/// Bit k is set if lane k is.
 ROUNDEL_INLINE uint32_t lanes_set(const Bits& lanes) {
     typedef int32_t Half __attribute__((vector_size(2 * kLanes)));
     const Bits v = lanes & Bits{1, 2, 4, 8, 16, 32, 64, 128};
@@ -77,9 +82,8 @@ ROUNDEL_INLINE uint32_t lanes_set(const Bits& lanes) {
     return uint32_t(q[0] | q[1]);
 }
 
-/// Which of the eight bright runs behind some dark ones lie in the middle of a roundel, by their lengths and
-/// those of the dark runs on either side: bit k tells of the k-th. All in sixteenths of a pixel, so that
-/// whole numbers do.
+/// Tests whether each of eight bright runs may be the middle of a roundel, by its length and those of the
+/// dark runs on either side: bit k is for the k-th. Integers in sixteenths are sufficient.
 ROUNDEL_INLINE uint32_t test_chords(const int* edges, const Proportions& p) {
     const DarkRuns before(edges), behind(edges + 2);
     const Bits left = before.end - before.begin, right = behind.end - behind.begin;
@@ -91,12 +95,12 @@ ROUNDEL_INLINE uint32_t test_chords(const int* edges, const Proportions& p) {
     return lanes_set(pass);
 }
 
-/// Finds the bright runs of some lines that may lie in the middle of a roundel: `numbers` counts the dark
-/// runs before each. Returns how many. What lies between two lines is too long.
-ROUNDEL_CLONES int find_chords(const BitImage& picture, int first, int last, int shift,
-                               const Proportions& limits, int* edges, int* numbers) {
-    const Proportions p = limits;  // a copy that nothing overlaps
-    const int count = find_runs(picture, first, last, shift, edges) - 1;
+/// Finds the bright runs of some lines that may be the middle of a roundel, and returns how many there are:
+/// `numbers` are the numbers of the dark runs before them. (A run from one line to the next is too long.)
+ROUNDEL_CLONES int find_chords(const BitImage& picture, const LineRange& range, const Proportions& limits,
+                               int* edges, int* numbers) {
+    const Proportions p = limits;  // a copy, which cannot alias the output
+    const int count = find_runs(picture, range, edges) - 1;
     int* number = numbers;
     for (int begin = 0; begin < count; begin += kWord) {
         uint64_t passes = 0;
@@ -108,7 +112,7 @@ ROUNDEL_CLONES int find_chords(const BitImage& picture, int first, int last, int
     return int(number - numbers);
 }
 
-/// The darkest of three pixels in the middle of a run: a thin ring is that dark on one of them only.
+/// The darkest of three pixels in the middle of a run. Only one of them may be fully dark in a thin ring.
 template <typename Level>
 int darkest(const Level& level, int begin, int end) {
     const int middle = (begin + end) / 2;
@@ -120,16 +124,16 @@ int darkest(const Level& level, int begin, int end) {
 
 }  // namespace
 
-ChordSearch::ChordSearch(const Settings& settings) {
-    const auto [low, high] = settings.ratio_range();
-    const double r = std::max(0.05, low - settings.ratio_tolerance);
-    const double R = std::min(0.95, high + settings.ratio_tolerance);
+ChordSearch::ChordSearch(const RoundelLimits& limits) {
+    const auto [low, high] = limits.ratio_range();
+    const double r = std::max(0.05, low - limits.ratio_tolerance);
+    const double R = std::min(0.95, high + limits.ratio_tolerance);
     // The shortest chord through the centre is the minor axis.
     const int thick = int(std::lround(16 * (1 - r) / (2 * r))),
               thin = int(std::lround(16 * (1 - R) / (2 * R)));
-    fine_ = {int(0.65 * settings.min_diameter), int(settings.max_diameter + 2), thick, thin, kSlack};
-    coarse_ = {kCoarseLeast, int(settings.max_diameter / 2.8) + 2, thick, thin, kCoarseSlack};
-    min_contrast_ = int(settings.min_contrast / 2);
+    fine_ = {int(0.65 * limits.min_diameter), int(limits.max_diameter + 2), thick, thin, kSlack};
+    coarse_ = {kCoarseLeast, int(limits.max_diameter / 2.8) + 2, thick, thin, kCoarseSlack};
+    min_contrast_ = int(limits.min_contrast / 2);
 }
 
 bool ChordSearch::is_diametral(int dark, int inner) const {
@@ -141,7 +145,7 @@ void ChordSearch::scan_lines(const BitImage& along, int first, int last) {
     Proportions limits = limits_;
     limits.most = std::min(limits.most, along.length);
     const int shift = std::bit_width(unsigned(along.length + limits.most));
-    const int found = find_chords(along, first, last, shift, limits, edges_.get(), numbers_.get());
+    const int found = find_chords(along, {first, last, shift}, limits, edges_.get(), numbers_.get());
     for (int n = 0; n < found; ++n) {
         const int* edge = &edges_[2 * size_t(numbers_[size_t(n)])];
         const int line = edge[1] >> shift, b = edge[1] - (line << shift), inner = edge[2] - edge[1];
@@ -149,15 +153,15 @@ void ChordSearch::scan_lines(const BitImage& along, int first, int last) {
     }
 }
 
-/// On the stack that it continues, one line may be between them; or on none. Without a branch, since nobody
-/// can tell.
+/// Adds a chord to the stack that it continues, with at most one line between them, or begins a stack.
+/// Without a branch, since it would be unpredictable.
 void ChordSearch::add_chord(int middle, int inner, int outer, int line) {
-    int* near = &nearest_[size_t(middle)];  // from `kDrift` pixels before it on
+    int* near = &nearest_[size_t(middle)];  // begins `kDrift` pixels before the middle
     Stack& before = stacks_[size_t(near[kDrift])];
     const bool same = (before.last + 2 >= line) & (before.last < line) &
                       (std::abs(inner - before.inner) <= 2 + before.inner / 4);
     const int mask = -int(same);
-    before.goes_on |= same;
+    before.continued |= same;
     const int first = (before.first & mask) | (line & ~mask),
               begin = (before.begin & mask) | (middle & ~mask);
     const int longest = std::max(outer, before.outer & mask);
@@ -165,8 +169,8 @@ void ChordSearch::add_chord(int middle, int inner, int outer, int line) {
     stacks_.push_back({middle, inner, first, line, begin, longest, false});
 }
 
-/// A stack of two chords or more is tried across its middle.
-void ChordSearch::try_across(const Stack& stack) {
+/// Tests the line across the middle of a stack of two chords or more.
+void ChordSearch::test_across(const Stack& stack) {
     const BitImage& across = *across_;
     const int at = stack.middle, line = at / 2, middle = stack.first + stack.last;  // two pixels a line
     if (across.is_dark(line, middle)) return;
@@ -174,14 +178,14 @@ void ChordSearch::try_across(const Stack& stack) {
     const int a = b > 0 ? across.run_begin(line, b - 1) : b;
     const int d = c < across.length ? across.run_end(line, c) : c;
     if (!is_diametral(b - a, c - b) && !is_diametral(d - c, c - b)) return;
-    if (6 * (stack.last - stack.first + 1) < c - b) return;  // much of the hole's lines are diametral
+    if (6 * (stack.last - stack.first + 1) < c - b)
+        return;  // many lines of the hole have diametral proportions
     const auto level = [&](int k) -> int { return along_rows_ ? image_->row(k)[at] : image_->row(at)[k]; };
     const bool upper = b > a && (d == c || b - a <= d - c);
     const int m_d = upper ? darkest(level, a, b) : darkest(level, c, d), m_b = level((b + c - 1) / 2);
     if (m_b - m_d < min_contrast_) return;
     const float x = float(at), y = float(b + c - 1) / 2;
-    const auto reach =
-        float(std::max(c - b, stack.inner) + 2);  // of a slanted hole, twice what its chords do
+    const auto reach = float(std::max(c - b, stack.inner) + 2);  // twice the chord's for a slanted hole
     seeds_.push_back({along_rows_ ? x : y, along_rows_ ? y : x, reach, m_d, m_b});
 }
 
@@ -189,7 +193,7 @@ bool ChordSearch::is_inside(int x, int y) const {
     return x >= 0 && x < image_->width && y >= 0 && y < image_->height;
 }
 
-/// How many pixels from (x, y) on, in steps of (dx, dy), are as dark or as bright as the first one.
+/// The number of pixels from (x, y) on, in steps of (dx, dy), that are dark, or bright, like the first one.
 int ChordSearch::run_length(int x, int y, int dx, int dy) const {
     if (!is_inside(x, y)) return 0;
     const int across = dx > 0 ? image_->width - x : x + 1, down = dy > 0 ? image_->height - y : y + 1;
@@ -200,8 +204,8 @@ int ChordSearch::run_length(int x, int y, int dx, int dy) const {
     return n;
 }
 
-/// Whether pixel by pixel, too, the chord through a place is one that nothing covers.
-bool ChordSearch::is_free_along(int x, int y, int dx, int dy) const {
+/// Whether the chord through a point is unoccluded at full resolution, too.
+bool ChordSearch::is_unoccluded(int x, int y, int dx, int dy) const {
     const int to = run_length(x, y, dx, dy), back = run_length(x, y, -dx, -dy), inner = to + back - 1;
     const int after = run_length(x + to * dx, y + to * dy, dx, dy);
     if (!is_diametral(after, inner)) return false;
@@ -212,18 +216,18 @@ bool ChordSearch::is_free_along(int x, int y, int dx, int dy) const {
     const auto level = [&](int k) -> int { return image_->row(y + k * dy)[x + k * dx]; };
     const int one = darkest(level, to, to + after);
     const int other = darkest([&](int k) { return level(-k); }, back, back + before);
-    return 4 * std::abs(one - other) < level(0) - std::min(one, other);  // of one ink
+    return 4 * std::abs(one - other) < level(0) - std::min(one, other);  // both runs have the same ink
 }
 
-/// A stack of diagonal chords is tried across, too: where rows and columns are covered, a diagonal may be
-/// free.
-void ChordSearch::try_across_diagonal(const Stack& stack) {
+/// Tests the line across a stack of diagonal chords. Rows and columns may be occluded although a diagonal is
+/// not.
+void ChordSearch::test_across_diagonal(const Stack& stack) {
     const Raster& r = raster_;
     const int dx = r.step_x > 0 ? 1 : -1, dy = -1;  // across the diagonal, upwards
     const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) / 2;
     const int x = int(r.x + at * r.step_x + line * r.line_x), y = int(r.y + at * r.step_y + line * r.line_y);
     if (!is_inside(x, y) || rows_.is_dark(y / 2, x)) return;
-    if (!is_free_along(x, y, -dx * dy, 1)) return;
+    if (!is_unoccluded(x, y, -dx * dy, 1)) return;
     const int up = run_length(x, y, dx, dy), down = run_length(x, y, -dx, -dy), inner = up + down - 1;
     if (6 * (stack.last - stack.first + 1) < inner) return;
     const int above = run_length(x + up * dx, y + up * dy, dx, dy);
@@ -238,7 +242,7 @@ void ChordSearch::try_across_diagonal(const Stack& stack) {
     seeds_.push_back({float(x + middle * dx), float(y + middle * dy), reach, m_d, m_b});
 }
 
-/// A stack as long as the bars of a roundel that is smeared along it.
+/// Adds a stack as a streak if it is as long as the bars of a roundel that moves along it.
 void ChordSearch::add_streak(const Stack& stack) {
     const int lines = stack.last - stack.first + 1;
     const Raster& r = raster_;
@@ -250,8 +254,8 @@ void ChordSearch::add_streak(const Stack& stack) {
     const float sine = std::abs(r.step_x * x + r.step_y * y) * per_line / step;  // of the slant
     const float cosine = std::abs(r.step_x * y - r.step_y * x) * per_line / step;
     const float width = float(stack.outer) * step * cosine, length = float(lines) * cosine / per_line;
-    if (!across_ && sine > kAside) return;
-    if (width < kStreakWidth || length < kStreakLong * width * (cosine - kPassing * sine)) return;
+    if (!across_ && sine > kMaxSine) return;
+    if (width < kStreakWidth || length < kStreakLength * width * (cosine - kOblique * sine)) return;
     const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) / 2;
     streaks_.push_back({r.x + at * r.step_x + line * r.line_x, r.y + at * r.step_y + line * r.line_y,
                         x * per_line, y * per_line, width});
@@ -260,7 +264,7 @@ void ChordSearch::add_streak(const Stack& stack) {
 void ChordSearch::scan(const BitImage& along, const BitImage* across, const Raster& raster,
                        const Proportions& limits) {
     across_ = across, along_rows_ = raster.step_y == 0, raster_ = raster, limits_ = limits;
-    const size_t most = size_t(kBatch) * size_t(along.length + 1) + kBeyond;
+    const size_t most = size_t(kBatch) * size_t(along.length + 1) + kPadding;
     if (most > room_) {
         edges_ = std::make_unique_for_overwrite<int[]>(most);
         numbers_ = std::make_unique_for_overwrite<int[]>(room_ = most);
@@ -270,25 +274,25 @@ void ChordSearch::scan(const BitImage& along, const BitImage* across, const Rast
     for (int line = 0; line < along.lines; line += kBatch)
         scan_lines(along, line, std::min(line + kBatch, along.lines));
     for (const Stack& stack : stacks_) {
-        if (stack.goes_on || stack.first == stack.last) continue;
+        if (stack.continued || stack.first == stack.last) continue;
         add_streak(stack);
-        across_ ? try_across(stack) : try_across_diagonal(stack);
+        across_ ? test_across(stack) : test_across_diagonal(stack);
     }
 }
 
-/// For smeared ones, and for those whose rows and columns are covered.
+/// Finds motion-blurred roundels, and those whose rows and columns are occluded.
 void ChordSearch::scan_diagonals() {
-    thin_out(rows_, thin_);
-    shear(thin_, true, diagonals_);
+    subsample(rows_, sparse_);
+    shear(sparse_, true, diagonals_);
     scan(diagonals_, nullptr, {float(-4 * (rows_.lines / 2)), 0.5f, 2, 2, 4, 0}, coarse_);
-    shear(thin_, false, diagonals_);
+    shear(sparse_, false, diagonals_);
     scan(diagonals_, nullptr, {0, 0.5f, -2, 2, 4, 0}, coarse_);
 }
 
 void ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
     seeds_.clear(), streaks_.clear();
     image_ = &image;
-    binarise(image, threshold, rows_, columns_);
+    binarize(image, threshold, rows_, columns_);
     scan(rows_, &columns_, {0, 0.5f, 1, 0, 0, 2}, fine_);
     scan(columns_, &rows_, {0.5f, 0, 0, 1, 2, 0}, fine_);
     scan_diagonals();

@@ -16,24 +16,24 @@ namespace roundel {
 
 namespace {
 
-constexpr int kLeast = 9;  // rays of each kind that must agree: what 30 % of a disc covered leaves
-constexpr int kLeastOfHalf = 14, kLeastCovered = 6;
-// Ratios of rays that nothing covers are less apart, from half a radius off the middle.
-constexpr float kUnlike = 0.35f;
-constexpr int kCasts = 2;           // at most; again where the middle or theta was far off
-constexpr int kReweights = 4;       // at most, where crossings disagree
-constexpr double kRelative = 0.05;  // of the radius that a crossing may be off its ellipse, and
-constexpr double kAbsolute = 0.5;   // so many pixels
+constexpr int kMinAgree = 9;              // crossings of each circle: 30 % of the disc may be occluded
+constexpr int kMinAgreeOccluded = 6;      // on the rays of an unoccluded part,
+constexpr int kMinOfPart = 14;            // of which so many cross
+constexpr float kMaxRatioSpread = 0.35f;  // of unoccluded rays from within half a radius of the centre
+constexpr int kMaxCasts = 2;              // the second if the centre or theta changed much
+constexpr int kMaxReweights = 4;
+constexpr double kRelative = 0.05;  // distance of an agreeing crossing from its ellipse, radii, and
+constexpr double kAbsolute = 0.5;   // pixels
 
-/// Where rays cross the edge of the disc or of the hole in it, from the rays' origin, in units of `unit`
-/// pixels, as columns; those beyond `count` are 0.
+/// The points, as columns, at which rays cross the edges of the disc and of its hole, relative to the rays'
+/// origin and in units of `unit` pixels. Values beyond `count` are 0.
 struct Crossings {
     static constexpr int kMost = 2 * kRays;
     explicit Crossings(double length) : unit(length) {}
     alignas(4 * kLanes) float x[kMost]{}, y[kMost]{}, inner[kMost]{};  // inner is 1 or 0
-    float ratio[kMost]{};  // of the ray's inner distance to its outer one; 0 where it has one only
+    float ratio[kMost]{};  // inner over outer distance on the ray; 0 if it has only one
     int ray[kMost]{}, count = 0;
-    uint16_t seen[2]{};  // a bit a ray: which cross the disc's edge, and the hole's
+    uint16_t seen[2]{};  // one bit per ray: whether it crosses the disc's edge, and the hole's
     double unit;
     void add(int number, float at, bool is_inner, float its_ratio) {
         const Direction direction = kDirections[size_t(number)];
@@ -46,32 +46,32 @@ struct Crossings {
     }
 };
 
-/// Least and most of inner over outer distance on a ray from near the middle.
-struct Ratios {
+/// The range of inner over outer distance on a ray from near the centre.
+struct RatioRange {
     double least, most;
 };
 
-Ratios ratios_near_middle(const Settings& settings) {
-    const auto [low, high] = settings.ratio_range();
-    const double slack = settings.ratio_tolerance + 0.1;  // a quarter of a radius off the middle
+RatioRange ratios_near_centre(const RoundelLimits& limits) {
+    const auto [low, high] = limits.ratio_range();
+    const double slack = limits.ratio_tolerance + 0.1;  // for a quarter of a radius off the centre
     return {std::max(0.1, low - slack), std::min(0.95, high + slack)};
 }
 
-/// Diagonals first, then what lies between: with the chords along row and column, few rays tell early that
-/// nothing is there.
+/// The order of the rays: diagonals first, then those between. The search has tested row and column already,
+/// so few rays reject most false seeds.
 constexpr std::array<int, kRays> kOrder{2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15, 0, 8, 4, 12};
 
 struct Weights {
     alignas(4 * kLanes) float at[Crossings::kMost]{};
 };
 
-/// A ray's number, and the pixels at which it leaves the disc and the ring; below 0 where it does not.
+/// A ray's number, and the pixels at which it leaves the disc and the ring; negative if it does not.
 struct Walk {
     int number, inner, outer;
 };
 
-/// Where rays cross, between pixels; nothing where too few do, which whole pixels tell.
-Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
+/// Finds the crossings with subpixel interpolation; none if walks along whole pixels find too few.
+Crossings cast(const ImageView& image, const Seed& seed, const RatioRange& ratios) {
     const float theta = float(seed.dark + seed.bright) / 2;
     const int below = int(std::ceil(theta));
     Crossings crossings(std::max(1.0, double(seed.reach)));
@@ -85,7 +85,7 @@ Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
         missed += outer < 0, crossed += (inner >= 0) + (outer >= 0);
         walks[size_t(n)] = {kOrder[size_t(n)], inner, outer};
     }
-    if (crossed < 2 * kLeastCovered + 2) return crossings;
+    if (crossed < 2 * kMinAgreeOccluded + 2) return crossings;
     for (const auto [number, inner, outer] : std::span(walks.data(), size_t(n))) {
         if (inner < 0) continue;
         const Ray ray(image, seed.x, seed.y, kDirections[size_t(number)]);
@@ -97,14 +97,14 @@ Crossings cast(const ImageView& image, const Seed& seed, const Ratios& ratios) {
     return crossings;
 }
 
-/// The weight of what is off by so many scales (Geman and McClure).
+/// The weight of a residual of `off` scales (Geman and McClure).
 template <typename T>
 ROUNDEL_INLINE T redescend(const T& off) {
     const T inverse = 1.0f / (1.0f + off * off);
     return inverse * inverse;
 }
 
-/// Two ellipses of one centre and shape: p^T M p + v p = 1 is the outer one and = level the inner one.
+/// Two ellipses with the same centre and shape: p^T M p + v p = 1 is the outer one, = level the inner one.
 struct Conics {
     double a, b, c, d, e, level;
     double at(double x, double y) const { return a * x * x + b * x * y + c * y * y + d * x + e * y; }
@@ -113,13 +113,14 @@ struct Conics {
     bool are_ellipses() const { return a > 0 && 4 * a * c > b * b; }
 };
 
-/// Normal equations of linear least squares, each crossing with its weight.
-struct Equations {
+/// Normal equations of weighted linear least squares.
+struct ConicEquations {
     std::array<Vector<6>, 6> H;  // its lower triangle
     Vector<6> g;
 };
 
-ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weights, Equations& equations) {
+ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weights,
+                               ConicEquations& equations) {
     Lanes H[6][6] = {}, g[5] = {};
     for (int k = 0; k < crossings.count; k += kLanes) {
         const Lanes x = load(crossings.x + k), y = load(crossings.y + k), inner = load(crossings.inner + k);
@@ -137,7 +138,7 @@ ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weight
 }
 
 std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) {
-    Equations equations;
+    ConicEquations equations;
     accumulate(crossings, weights, equations);
     const Cholesky<6> factor(equations.H);
     if (!factor.positive()) return std::nullopt;
@@ -146,22 +147,23 @@ std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) 
     return conics.are_ellipses() ? std::optional(conics) : std::nullopt;
 }
 
-/// The conics' own frame: their middle, and the form's values there and on both ellipses.
-struct Frame {
+/// The centre of the conics, and the values of the centred form on both ellipses.
+struct ConicFrame {
     double x, y, outer, inner;
-    explicit Frame(const Conics& c) : x(c.middle_x()), y(c.middle_y()) {
+    explicit ConicFrame(const Conics& c) : x(c.middle_x()), y(c.middle_y()) {
         const double least = c.at(x, y);  // negative
         outer = 1 - least, inner = c.level - least;
     }
     bool is_valid() const { return inner > 0 && inner < outer; }
 };
 
-/// How far each crossing is from its ellipse, in what it may be; beyond the last one 0.
+/// The distance of each crossing from its ellipse over the tolerance; 0 beyond the last one.
 struct Distances {
     alignas(4 * kLanes) float off[Crossings::kMost];
 };
 
-ROUNDEL_CLONES void measure(const Crossings& crossings, const Conics& c, const Frame& frame, Distances& to) {
+ROUNDEL_CLONES void measure(const Crossings& crossings, const Conics& c, const ConicFrame& frame,
+                            Distances& to) {
     const float a = float(c.a), b = float(c.b), cc = float(c.c);
     const float per_outer = float(1 / frame.outer), per_inner = float(1 / frame.inner);
     const float absolute = float(kAbsolute / crossings.unit);
@@ -169,16 +171,17 @@ ROUNDEL_CLONES void measure(const Crossings& crossings, const Conics& c, const F
         const Lanes dx = load(crossings.x + k) - float(frame.x), dy = load(crossings.y + k) - float(frame.y);
         const Lanes inner = load(crossings.inner + k), square = dx * dx + dy * dy + 1e-12f;
         const Lanes radius = square * inverse_sqrt(square);
-        const Lanes form = dx * (a * dx + b * dy) + cc * dy * dy;  // 1 on either ellipse, times its size
+        const Lanes form = dx * (a * dx + b * dy) + cc * dy * dy;  // the value of the centred form
         const Lanes share = form * (inner > 0.5f ? all(per_inner) : all(per_outer)) + 1e-12f;
         const Lanes off = radius * (share * inverse_sqrt(share) - 1.0f);
         store(to.off + k, off / (float(kRelative) * radius + absolute));
     }
 }
 
-/// Weights by distance from the ellipses; returns how many crossings agree, of the kind of which fewer do.
+/// Sets the weights by the distance from the ellipses. Returns the number of crossings that agree, of the
+/// circle with fewer of them.
 int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) {
-    const Frame frame(conics);
+    const ConicFrame frame(conics);
     Distances distances;
     measure(crossings, conics, frame, distances);
     int agree[2] = {0, 0};
@@ -190,8 +193,8 @@ int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) 
     return std::min(agree[0], agree[1]);
 }
 
-/// Weights to begin with: from near the middle, rays that nothing covers have about the same ratio.
-Weights weigh(const Crossings& crossings) {
+/// Initial weights: from near the centre, the ratios of unoccluded rays are similar.
+Weights initial_weights(const Crossings& crossings) {
     std::array<float, kRays> ratios;
     int n = 0;
     for (int k = 0; k < crossings.count; ++k)
@@ -203,22 +206,23 @@ Weights weigh(const Crossings& crossings) {
     return weights;
 }
 
-/// Solves and weighs anew from some weights on, until ever more crossings agree and at last `least`.
-std::optional<Conics> settle(const Crossings& crossings, const Weights& first, int least) {
+/// Iteratively reweighted least squares. The number of crossings that agree must grow in each iteration, to
+/// at least `least`.
+std::optional<Conics> iterate(const Crossings& crossings, const Weights& first, int least) {
     Weights weights = first;
     std::optional<Conics> conics;
-    for (int k = 0, agree = 0; k < kReweights && 2 * agree < crossings.count; ++k) {
+    for (int k = 0, agree = 0; k < kMaxReweights && 2 * agree < crossings.count; ++k) {
         conics = solve(crossings, weights);
-        if (!conics || !Frame(*conics).is_valid()) return std::nullopt;
+        if (!conics || !ConicFrame(*conics).is_valid()) return std::nullopt;
         agree = reweigh(crossings, *conics, weights);
-        if (agree < least - kReweights + 1 + k) return std::nullopt;
+        if (agree < least - kMaxReweights + 1 + k) return std::nullopt;
     }
     return conics;
 }
 
-/// The rays, a bit each, of which something may have left whole: half of them side by side, or a quarter on
-/// either side of a strip through the middle.
-constexpr std::array<uint16_t, 12> kWhole = [] {
+/// Sets of rays, one bit each, that an occluding object may leave visible: half of them, adjacent, or a
+/// quarter on each side of a strip through the centre.
+constexpr std::array<uint16_t, 12> kVisibleParts = [] {
     std::array<uint16_t, 12> whole{};
     for (int first = 0; first < kRays; first += 2)
         for (int k = 0; k < kRays / 2; ++k) whole[size_t(first / 2)] |= uint16_t(1 << (first + k) % kRays);
@@ -229,8 +233,8 @@ constexpr std::array<uint16_t, 12> kWhole = [] {
     return whole;
 }();
 
-/// How far apart the ratios of such rays are.
-float most_apart(const Crossings& crossings, uint16_t rays) {
+/// The spread of the ratios of a set of rays.
+float ratio_spread(const Crossings& crossings, uint16_t rays) {
     float least = 1, most = 0;
     for (int k = 0; k < crossings.count; ++k)
         if (crossings.ratio[k] > 0 && rays >> crossings.ray[k] & 1)
@@ -238,23 +242,24 @@ float most_apart(const Crossings& crossings, uint16_t rays) {
     return most - least;
 }
 
-/// From those rays' crossings with which most of all agree.
-std::optional<Conics> settle_covered(const Crossings& crossings) {
-    int most = kLeastCovered - kReweights;  // what no less would do
+/// Starts from the visible part whose ellipses agree with the most crossings.
+std::optional<Conics> fit_visible_part(const Crossings& crossings) {
+    int most = kMinAgreeOccluded - kMaxReweights;  // fewer would not pass `iterate`
     std::optional<Weights> best;
-    for (const uint16_t whole : kWhole) {
-        if (crossings.count_of(whole) < kLeastOfHalf || most_apart(crossings, whole) > kUnlike) continue;
+    for (const uint16_t part : kVisibleParts) {
+        if (crossings.count_of(part) < kMinOfPart || ratio_spread(crossings, part) > kMaxRatioSpread)
+            continue;
         Weights weights;
-        for (int k = 0; k < crossings.count; ++k) weights.at[k] = float(whole >> crossings.ray[k] & 1);
+        for (int k = 0; k < crossings.count; ++k) weights.at[k] = float(part >> crossings.ray[k] & 1);
         const auto conics = solve(crossings, weights);
-        if (!conics || !Frame(*conics).is_valid()) continue;
+        if (!conics || !ConicFrame(*conics).is_valid()) continue;
         if (const int agree = reweigh(crossings, *conics, weights); agree > most)
             most = agree, best = weights;
     }
-    return best ? settle(crossings, *best, kLeastCovered) : std::nullopt;
+    return best ? iterate(crossings, *best, kMinAgreeOccluded) : std::nullopt;
 }
 
-Ellipse outer_ellipse(const Conics& c, const Frame& frame, double unit) {
+Ellipse outer_ellipse(const Conics& c, const ConicFrame& frame, double unit) {
     const double det = c.a * c.c - c.b * c.b / 4;
     const Eigen e = eigen({c.c / det, -c.b / 2 / det, c.a / det});  // of M^-1
     const double diameter = 2 * unit;
@@ -268,36 +273,51 @@ double median_level(const ImageView& image, const Ellipse& e, double scale) {
     return double(levels[kRays / 2]);
 }
 
+std::optional<Conics> fit_conics(const Crossings& crossings) {
+    if (crossings.count < 2 * kMinAgreeOccluded + 2) return std::nullopt;
+    auto conics = crossings.count < 2 * kMinAgree ? std::nullopt
+                                                  : iterate(crossings, initial_weights(crossings), kMinAgree);
+    return conics ? conics : fit_visible_part(crossings);
+}
+
+/// The ellipse of a cast from `seed`, with the levels that it finds; nothing if it is not around the seed.
+std::optional<InitialGuess> cast_and_fit(const ImageView& image, const Seed& seed, const RatioRange& ratios) {
+    const Crossings crossings = cast(image, seed, ratios);
+    const auto conics = fit_conics(crossings);
+    if (!conics) return std::nullopt;
+    const ConicFrame frame(*conics);
+    Ellipse outer = outer_ellipse(*conics, frame, crossings.unit);
+    const double ratio = std::sqrt(frame.inner / frame.outer);
+    if (!(std::hypot(outer.x, outer.y) < outer.major)) return std::nullopt;
+    outer.x += double(seed.x), outer.y += double(seed.y);
+    return InitialGuess{outer, ratio, median_level(image, outer, (1 + ratio) / 2),
+                        median_level(image, outer, ratio / 3)};
+}
+
+bool is_plausible(const InitialGuess& guess, const RoundelLimits& limits) {
+    const double slack = limits.ratio_tolerance + 1 / guess.outer.minor;
+    return limits.ratio_error(guess.ratio) < slack && guess.outer.major > 0.8 * limits.min_diameter &&
+           guess.outer.major < 1.2 * limits.max_diameter && guess.outer.minor > 3 &&
+           guess.bright - guess.dark > limits.min_contrast / 2;
+}
+
 }  // namespace
 
-std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const Settings& settings) {
-    const Ratios ratios = ratios_near_middle(settings);
+std::optional<InitialGuess> fit_rays(const ImageView& image, const Seed& seed, const RoundelLimits& limits) {
+    const RatioRange ratios = ratios_near_centre(limits);
     Seed from = seed;
-    std::optional<Start> start;
-    for (int k = 0; k < kCasts; ++k) {
-        const Crossings crossings = cast(image, from, ratios);
-        if (crossings.count < 2 * kLeastCovered + 2) return std::nullopt;
-        auto conics =
-            crossings.count < 2 * kLeast ? std::nullopt : settle(crossings, weigh(crossings), kLeast);
-        if (!conics) conics = settle_covered(crossings);
-        if (!conics) return std::nullopt;
-        const Frame frame(*conics);
-        Ellipse outer = outer_ellipse(*conics, frame, crossings.unit);
-        const double ratio = std::sqrt(frame.inner / frame.outer), moved = std::hypot(outer.x, outer.y);
-        if (!(moved < outer.major)) return std::nullopt;
-        outer.x += double(from.x), outer.y += double(from.y);
-        const double m_d = median_level(image, outer, (1 + ratio) / 2);
-        const double m_b = median_level(image, outer, ratio / 3);
-        start = Start{outer, ratio, m_d, m_b};
-        const double theta = double(from.dark + from.bright) / 2;
-        if (moved < 0.1 * outer.minor && std::abs((m_d + m_b) / 2 - theta) < 0.1 * (m_b - m_d)) break;
-        from = {float(outer.x), float(outer.y), float(outer.major), int(m_d), int(m_b)};
+    std::optional<InitialGuess> guess;
+    for (int k = 0; k < kMaxCasts; ++k) {
+        guess = cast_and_fit(image, from, ratios);
+        if (!guess) return std::nullopt;
+        const Ellipse& outer = guess->outer;
+        const double dark = guess->dark, bright = guess->bright, theta = double(from.dark + from.bright) / 2;
+        const double moved = std::hypot(outer.x - double(from.x), outer.y - double(from.y));
+        const double change = std::abs((dark + bright) / 2 - theta);
+        if (moved < 0.1 * outer.minor && change < 0.1 * (bright - dark)) break;
+        from = {float(outer.x), float(outer.y), float(outer.major), int(dark), int(bright)};
     }
-    const double slack = settings.ratio_tolerance + 1 / start->outer.minor;
-    const bool ratio = settings.ratio_error(start->ratio) < slack;
-    const bool size = start->outer.major > 0.8 * settings.min_diameter &&
-                      start->outer.major < 1.2 * settings.max_diameter && start->outer.minor > 3;
-    return ratio && size && start->bright - start->dark > settings.min_contrast / 2 ? start : std::nullopt;
+    return is_plausible(*guess, limits) ? guess : std::nullopt;
 }
 
 }  // namespace roundel

@@ -2,18 +2,19 @@
 #pragma once
 #include <optional>
 
-#include "search/chords.hpp"
-#include "numeric/image.hpp"
 #include "fit/photometric_fit.hpp"
-#include "settings.hpp"
+#include "fit/roundel_limits.hpp"
+#include "numeric/image.hpp"
+#include "search/chords.hpp"
 
 namespace roundel {
 
-/// Casts 16 rays from a seed, finds on each where it leaves the bright disc and where it leaves the dark ring
-/// (between pixels, at the paper's threshold theta = (m_d + m_b) / 2), and fits both circles' images at once.
-/// Crossings that disagree with the rest, where something covers an edge, are left out. Nothing comes back
-/// where fewer than nine of either kind agree (six on rays of one half or on either side of a strip) or the
-/// ratio or the size is no roundel's.
-std::optional<Start> fit_circles(const ImageView& image, const Seed& seed, const Settings& settings);
+/// Casts 16 rays from a seed, finds where each leaves the bright disc and the dark ring (with subpixel
+/// interpolation at the paper's threshold theta = (m_d + m_b) / 2), and fits the images of both circles
+/// together. Crossings that disagree with the others, as on an occluding edge, are rejected.
+///
+/// Returns nothing if fewer than nine crossings of either circle agree (six on the rays of one half of the
+/// disc, or on both sides of a strip), or if the ratio or the size is out of its limits.
+std::optional<InitialGuess> fit_rays(const ImageView& image, const Seed& seed, const RoundelLimits& limits);
 
 }  // namespace roundel

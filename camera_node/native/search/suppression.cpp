@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kTile = 8;
 
-bool holds(const Ellipse& e, double x, double y) {
+bool is_inside(const Ellipse& e, double x, double y) {
     const double dx = x - e.x, dy = y - e.y;
     if (std::abs(dx) > e.major / 2 || std::abs(dy) > e.major / 2) return false;
     const double c = std::cos(e.angle), s = std::sin(e.angle);
@@ -19,16 +19,16 @@ bool holds(const Ellipse& e, double x, double y) {
 
 }  // namespace
 
-Claims::Claims(int width, int height)
+Suppression::Suppression(int width, int height)
     : columns_(width / kTile + 1), rows_(height / kTile + 1), tiles_(size_t(columns_) * size_t(rows_), 0) {}
 
-size_t Claims::tile(double x, double y) const {
+size_t Suppression::tile(double x, double y) const {
     const int column = std::clamp(int(x) / kTile, 0, columns_ - 1),
               row = std::clamp(int(y) / kTile, 0, rows_ - 1);
     return size_t(row) * size_t(columns_) + size_t(column);
 }
 
-void Claims::add(const Ellipse& e) {
+void Suppression::add(const Ellipse& e) {
     ellipses_.push_back(e);
     const double reach = e.major / 2;
     for (double y = e.y - reach; y < e.y + reach + kTile; y += kTile) {
@@ -38,13 +38,14 @@ void Claims::add(const Ellipse& e) {
     }
 }
 
-bool Claims::cover(double x, double y) const {
-    return std::any_of(ellipses_.begin(), ellipses_.end(), [&](const Ellipse& e) { return holds(e, x, y); });
+bool Suppression::contains(double x, double y) const {
+    return std::any_of(ellipses_.begin(), ellipses_.end(),
+                       [&](const Ellipse& e) { return is_inside(e, x, y); });
 }
 
-bool Claims::cover_quickly(double x, double y) const {
+bool Suppression::contains_fast(double x, double y) const {
     const uint16_t number = tiles_[tile(x, y)];
-    return number && holds(ellipses_[size_t(number) - 1], x, y);
+    return number && is_inside(ellipses_[size_t(number) - 1], x, y);
 }
 
 }  // namespace roundel

@@ -8,15 +8,16 @@
 
 namespace roundel {
 
-/// The parts of an image that found roundels cover.
-class Claims {
+/// The parts of an image covered by roundels that were found. No other roundel is accepted there.
+class Suppression {
   public:
-    Claims(int width, int height);
+    Suppression(int width, int height);
     void add(const Ellipse& ellipse);
-    /// Whether a point lies in an ellipse that was added.
-    bool cover(double x, double y) const;
-    /// The same at once, of the last ellipse near the point only: where two touch it may say no for yes.
-    bool cover_quickly(double x, double y) const;
+    /// Whether a point lies in one of the ellipses.
+    bool contains(double x, double y) const;
+    /// The same in constant time. Tests only the last ellipse added near the point, so the result can be
+    /// falsely negative where two ellipses touch.
+    bool contains_fast(double x, double y) const;
 
   private:
     size_t tile(double x, double y) const;

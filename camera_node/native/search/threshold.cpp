@@ -14,7 +14,7 @@ namespace {
 inline uint8_t least(uint8_t a, uint8_t b) { return a < b ? a : b; }
 inline uint8_t greatest(uint8_t a, uint8_t b) { return a > b ? a : b; }
 
-/// The darkest and the brightest pixel of a patch, one from the other.
+/// The difference of the brightest and the darkest pixel of a patch.
 template <int width, int height>
 int span_of(const ImageView& patch) {
     uint8_t low[width], high[width];
@@ -30,8 +30,8 @@ int span_of(const ImageView& patch) {
 }  // namespace
 
 double noise_level(const ImageView& image) {
-    constexpr int kPatches = 16, kWidth = 8, kHeight = 4;  // so many each way
-    constexpr double kFlat = 0.05, kDeviations = 2.9;      // the flattest twentieth of noise spans so many
+    constexpr int kPatches = 16, kWidth = 8, kHeight = 4;  // patches in either direction; pixels
+    constexpr double kFlat = 0.05, kDeviations = 2.9;      // the range of the flattest twentieth, in sigmas
     if (image.width < kWidth || image.height < kHeight) return 1;
     std::array<int, kPatches * kPatches> spans;
     for (int k = 0; k < kPatches * kPatches; ++k) {
@@ -44,23 +44,11 @@ double noise_level(const ImageView& image) {
     return std::clamp(*flat / kDeviations, 1.0, 8.0);
 }
 
-void Theta::settle(double dark, double bright) {
-    value_ = (dark + bright) / 2;
-    steps_ = 1;
-}
-
-void Theta::step() {
-    steps_ = steps_ % 31 + 1;
-    double share = 0, bit = 0.5;  // the binary digits of the step's number, mirrored at the point
-    for (unsigned digits = steps_; digits; digits >>= 1, bit /= 2) share += (digits & 1) * bit;
-    value_ = 256 * share;
-}
-
 namespace {
 
 constexpr int kShift = 3, kTile = 1 << kShift;
 
-/// Each of n values `kTile` times.
+/// Repeats each of n values `kTile` times.
 ROUNDEL_CLONES void repeat(const uint8_t* from, int n, uint8_t* to) {
     for (int x = 0; x < n; ++x)
         for (int k = 0; k < kTile; ++k) to[kTile * x + k] = from[x];
@@ -81,15 +69,15 @@ namespace {
 constexpr int kLevels = 5;
 
 /// The darkest and the brightest pixel of each tile, row by row.
-struct Range {
+struct TileRange {
     int columns, rows;
     std::vector<uint8_t> low, high;
-    Range(int c, int r) : columns(c), rows(r), low(size_t(c) * size_t(r), 255), high(low.size(), 0) {}
+    TileRange(int c, int r) : columns(c), rows(r), low(size_t(c) * size_t(r), 255), high(low.size(), 0) {}
     size_t at(int x, int y) const { return size_t(y) * size_t(columns) + size_t(x); }
 };
 
-/// Joins the ranges of n columns into others.
-inline void widen(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
+/// Extends n ranges by others.
+inline void extend(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
     for (int x = 0; x < n; ++x) {
         to_low[x] = least(to_low[x], low[x]);
         to_high[x] = greatest(to_high[x], high[x]);
@@ -105,7 +93,7 @@ inline void join_rows(const uint8_t* const rows[4], int n, uint8_t* low, uint8_t
     }
 }
 
-/// The extremes of n pairs of neighbours.
+/// The extremes of n pairs of adjacent columns.
 inline void join_neighbours(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low,
                             uint8_t* to_high) {
     for (int x = 0; x < n; ++x) {
@@ -114,17 +102,17 @@ inline void join_neighbours(const uint8_t* low, const uint8_t* high, int n, uint
     }
 }
 
-/// Room for the extremes of whole tiles, of single columns, of two and of four.
-struct Columns {
+/// Buffers for the extremes of single columns, of two and of four, as wide as whole tiles.
+struct ColumnExtremes {
     std::vector<uint8_t> low[3], high[3];
-    explicit Columns(int tiles) {
+    explicit ColumnExtremes(int tiles) {
         for (int k = 0; k < 3; ++k)
             low[k].assign(size_t(tiles) * size_t(kTile >> k), 255), high[k].assign(low[k].size(), 0);
     }
 };
 
-/// The range of every 8 columns of some rows, by every second one.
-ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int tiles, Columns& columns, uint8_t* to_low,
+/// The range of every 8 columns in every second of some rows.
+ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int tiles, ColumnExtremes& columns, uint8_t* to_low,
                                    uint8_t* to_high) {
     const uint8_t* four[4];
     for (int k = 0; k < 4; ++k) four[k] = rows.row(std::min(2 * k, (rows.height - 1) & ~1));
@@ -135,9 +123,9 @@ ROUNDEL_CLONES void range_of_tiles(const ImageView& rows, int tiles, Columns& co
     join_neighbours(low[2].data(), high[2].data(), tiles, to_low, to_high);
 }
 
-Range tile_range(const ImageView& image) {
-    Range range((image.width + kTile - 1) / kTile, (image.height + kTile - 1) / kTile);
-    Columns columns(range.columns);
+TileRange tile_range(const ImageView& image) {
+    TileRange range((image.width + kTile - 1) / kTile, (image.height + kTile - 1) / kTile);
+    ColumnExtremes columns(range.columns);
     for (int y = 0; y < image.height; y += kTile) {
         const size_t first = range.at(0, y / kTile);
         range_of_tiles(image.window(0, y, image.width, std::min(kTile, image.height - y)), range.columns,
@@ -146,7 +134,7 @@ Range tile_range(const ImageView& image) {
     return range;
 }
 
-/// The least and the greatest of three neighbours along a row; `padded` rows have one more tile at each end.
+/// The extremes of three adjacent tiles of a row. The input has one more tile at each end.
 inline void join_three(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
     for (int x = 0; x < n; ++x) {
         to_low[x] = least(least(low[x], low[x + 1]), low[x + 2]);
@@ -154,22 +142,22 @@ inline void join_three(const uint8_t* low, const uint8_t* high, int n, uint8_t* 
     }
 }
 
-/// Each tile's range joined with those of its eight neighbours.
-ROUNDEL_CLONES Range dilate(const Range& range) {
+/// Extends each tile's range by those of its eight neighbours.
+ROUNDEL_CLONES TileRange dilate(const TileRange& range) {
     const int n = range.columns;
-    Range wide(n, range.rows);
+    TileRange wide(n, range.rows);
     std::vector<uint8_t> low(size_t(n) + 2, 255), high(size_t(n) + 2, 0);
     for (int y = 0; y < range.rows; ++y) {
         std::fill(low.begin(), low.end(), 255);
         std::fill(high.begin(), high.end(), 0);
         for (int v = std::max(y - 1, 0); v <= std::min(y + 1, range.rows - 1); ++v)
-            widen(&range.low[range.at(0, v)], &range.high[range.at(0, v)], n, &low[1], &high[1]);
+            extend(&range.low[range.at(0, v)], &range.high[range.at(0, v)], n, &low[1], &high[1]);
         join_three(low.data(), high.data(), n, &wide.low[wide.at(0, y)], &wide.high[wide.at(0, y)]);
     }
     return wide;
 }
 
-/// Joins neighbours two by two; `n` is even.
+/// Extends ranges by those of pairs of adjacent tiles; `n` is even.
 inline void join_pairs(const uint8_t* low, const uint8_t* high, int n, uint8_t* to_low, uint8_t* to_high) {
     for (int x = 0; x < n / 2; ++x) {
         to_low[x] = least(to_low[x], least(low[2 * x], low[2 * x + 1]));
@@ -177,42 +165,42 @@ inline void join_pairs(const uint8_t* low, const uint8_t* high, int n, uint8_t* 
     }
 }
 
-/// Tiles of twice the side.
-ROUNDEL_CLONES Range halve(const Range& range) {
+/// The ranges of tiles of twice the side.
+ROUNDEL_CLONES TileRange halve(const TileRange& range) {
     const int n = range.columns;
-    Range coarse((n + 1) / 2, (range.rows + 1) / 2);
+    TileRange coarse((n + 1) / 2, (range.rows + 1) / 2);
     for (int y = 0; y < range.rows; ++y) {
         const uint8_t *low = &range.low[range.at(0, y)], *high = &range.high[range.at(0, y)];
         uint8_t *to_low = &coarse.low[coarse.at(0, y / 2)], *to_high = &coarse.high[coarse.at(0, y / 2)];
         join_pairs(low, high, n & ~1, to_low, to_high);
-        if (n % 2) widen(low + n - 1, high + n - 1, 1, to_low + n / 2, to_high + n / 2);
+        if (n % 2) extend(low + n - 1, high + n - 1, 1, to_low + n / 2, to_high + n / 2);
     }
     return coarse;
 }
 
-/// The mid-range where there is contrast, else what stands there (the coarser level's word).
-ROUNDEL_CLONES void settle_row(const uint8_t* low, const uint8_t* high, int n, uint8_t min_contrast,
-                               uint8_t* theta) {
+/// Sets the threshold to the mid-range if there is contrast; otherwise the coarser level's value remains.
+ROUNDEL_CLONES void set_thresholds(const uint8_t* low, const uint8_t* high, int n, uint8_t min_contrast,
+                                   uint8_t* theta) {
     for (int x = 0; x < n; ++x) {
         const auto middle = uint8_t((low[x] + high[x] + 1) >> 1), contrast = uint8_t(high[x] - low[x]);
         theta[x] = contrast >= min_contrast ? middle : theta[x];
     }
 }
 
-/// Every value twice.
+/// Repeats each value twice.
 ROUNDEL_CLONES void double_row(const uint8_t* from, int n, uint8_t* to) {
     for (int x = 0; x < n / 2; ++x) to[2 * x] = to[2 * x + 1] = from[x];
     if (n % 2) to[n - 1] = from[n / 2];
 }
 
-std::vector<uint8_t> settle_level(const Range& range, uint8_t min_contrast,
-                                  const std::vector<uint8_t>& coarser) {
+std::vector<uint8_t> refine_thresholds(const TileRange& range, uint8_t min_contrast,
+                                       const std::vector<uint8_t>& coarser) {
     std::vector<uint8_t> theta(range.low.size());
     const size_t columns = (size_t(range.columns) + 1) / 2;
     for (int y = 0; y < range.rows; ++y) {
         const size_t first = range.at(0, y);
         double_row(&coarser[size_t(y / 2) * columns], range.columns, &theta[first]);
-        settle_row(&range.low[first], &range.high[first], range.columns, min_contrast, &theta[first]);
+        set_thresholds(&range.low[first], &range.high[first], range.columns, min_contrast, &theta[first]);
     }
     return theta;
 }
@@ -220,12 +208,12 @@ std::vector<uint8_t> settle_level(const Range& range, uint8_t min_contrast,
 }  // namespace
 
 ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta) {
-    std::vector<Range> pyramid{dilate(tile_range(image))};
+    std::vector<TileRange> pyramid{dilate(tile_range(image))};
     while (pyramid.size() < kLevels) pyramid.push_back(halve(pyramid.back()));
-    std::vector<uint8_t> settled(pyramid.back().low.size(), theta);
+    std::vector<uint8_t> thresholds(pyramid.back().low.size(), theta);
     for (auto range = pyramid.rbegin(); range != pyramid.rend(); ++range)
-        settled = settle_level(*range, uint8_t(min_contrast), settled);
-    return {kShift, pyramid[0].columns, std::move(settled)};
+        thresholds = refine_thresholds(*range, uint8_t(min_contrast), thresholds);
+    return {kShift, pyramid[0].columns, std::move(thresholds)};
 }
 
 }  // namespace roundel

@@ -2,20 +2,28 @@
 #pragma once
 #include <optional>
 
-#include "numeric/image.hpp"
 #include "fit/photometric_fit.hpp"
-#include "settings.hpp"
+#include "fit/roundel_limits.hpp"
+#include "numeric/image.hpp"
 
 namespace roundel {
 
-/// Contrast, ratio and size within their limits, and levels that a camera can give.
-bool has_limits(const Fit& fit, const Settings& settings);
+/// Whether contrast, ratio and size are within their limits, and the grey levels within a camera's range.
+bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 
-/// The fit to the picture as it is, or to what is left of it where something covers a part, or, where its
-/// edges are ragged (drawn, sharpened, badly printed), to the softened one; nothing where none passes the
-/// gates that end false positives. They are wider for what is `known` from the last frame. From a model only
-/// the first of these is tried: what is not as it was needs another start.
-std::optional<Fit> fit_roundel(const ImageView& image, Start start, const Settings& settings, double noise,
-                               bool known);
+/// What the acceptance tests of a frame depend on, beside the fit.
+struct AcceptanceContext {
+    const RoundelLimits& limits;
+    double noise;  // of the image, grey levels
+};
+
+/// Fits a roundel and applies the acceptance tests that reject false positives. If the fit to the unmodified
+/// image fails, tries the fit without occluded sectors, then the fit to a smoothed image, which suits ragged
+/// edges (drawn, sharpened, badly printed). Returns nothing if none passes.
+///
+/// The tests are wider for a roundel that is `known` from the last frame. With a guess that has a model only
+/// the first fit is tried: if it fails, the caller needs another guess.
+std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
+                                      const AcceptanceContext& context, bool known);
 
 }  // namespace roundel

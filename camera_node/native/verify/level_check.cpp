@@ -8,27 +8,27 @@
 
 namespace roundel {
 
-Surface inspect(const ImageView& image, const Fit& fit) {
+LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
-    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // beyond it, levels are plain
+    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // levels further away are constant
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
-    Surface surface;
+    LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
         for (const float value : levels_on(image, e, scale)) {
             if (value < 0) continue;
             const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
-            ++surface.seen, surface.off += std::abs(share - (dark ? 0 : 1)) > 0.3;
+            ++samples.total, samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
         }
     };
     for (const double share : {0.25, 0.5, 0.75})
         if (std::min(share, 1 - share) * ring > edge) test(fit.ratio + share * (1 - fit.ratio), true);
     for (const double share : {0.2, 0.5, 0.8})
         if ((1 - share) * hole > edge) test(share * fit.ratio, false);
-    return surface;
+    return samples;
 }
 
-bool is_bullseye(const ImageView& image, const Fit& fit) {
-    // Thin rings are blurred and not so dark.
+bool is_bullseye(const ImageView& image, const RoundelFit& fit) {
+    // Blur makes thin rings less dark.
     const float theta = float(fit.bright - 0.3 * (fit.bright - fit.dark));
     const Ellipse& e = fit.outer;
     float least = 1e9f, most = 0;

@@ -1,19 +1,19 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
-#include "numeric/image.hpp"
 #include "fit/photometric_fit.hpp"
+#include "numeric/image.hpp"
 
 namespace roundel {
 
-/// Of samples in the ring, which is dark, and in the hole, which is bright: how many are seen, and how many
-/// are off by a third of the contrast.
-struct Surface {
-    int seen = 0, off = 0;
+/// Numbers of samples in the ring, which is dark, and in the hole, which is bright: all, and those whose
+/// level is wrong by more than 0.3 of the contrast.
+struct LevelSamples {
+    int total = 0, wrong = 0;
 };
-Surface inspect(const ImageView& image, const Fit& fit);
+LevelSamples check_levels(const ImageView& image, const RoundelFit& fit);
 
-/// Whether two more dark rings lie around a roundel within four of its diameters, which makes it a bullseye.
-/// One may be a plate that it stands on, or the line that its card was cut along.
-bool is_bullseye(const ImageView& image, const Fit& fit);
+/// Whether at least two more dark rings surround a ring within four of its diameters: then it is a bullseye.
+/// A single one may be a plate below the card, or the line along which the card was cut.
+bool is_bullseye(const ImageView& image, const RoundelFit& fit);
 
 }  // namespace roundel

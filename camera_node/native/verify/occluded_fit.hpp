@@ -2,27 +2,34 @@
 #pragma once
 #include <optional>
 
-#include "numeric/image.hpp"
 #include "fit/occlusion.hpp"
 #include "fit/photometric_fit.hpp"
+#include "numeric/image.hpp"
 
 namespace roundel {
 
-/// Whether noise, and a hundredth of the contrast, explain all that a fit leaves on the ring's edges.
-bool is_noise(const Fit& fit, double noise);
+/// Whether noise and a hundredth of the contrast explain the residuals on the ring's edges.
+bool is_explained_by_noise(const RoundelFit& fit, double noise);
 
-/// Whether what a fit leaves over gathers in some sectors, as where something covers a part; print, paper and
-/// lens spread it.
-bool shows_cover(const EdgeMisfit& misfit, const Fit& fit, double noise);
+/// Whether the residuals are concentrated in some sectors, as an occlusion makes them. Those of print, paper
+/// and lens are spread around the ring.
+bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noise);
 
-/// The fit to what is left of a roundel that something covers in part. Sectors of either edge that are off
-/// the fit `whole` are left out and the rest is fitted anew, ever more strictly, until what is left is as the
-/// model says; a biased fit does not come through, and the covariance is that of the rest. `misfit` is that
-/// of `whole`, where it is known already.
+/// The input of a fit to the visible part of a roundel.
+struct OccludedGuess {
+    const InitialGuess& guess;
+    const RoundelFit& full_fit;        // to all sectors
+    std::optional<EdgeMisfit> misfit;  // of `full_fit`, if it was computed
+    double noise;                      // of the image, grey levels
+    bool known;                        // from the last frame
+};
+
+/// Fits the visible part of a partly occluded roundel. Sectors of either edge with large residuals are masked
+/// and the fit is repeated with ever stricter limits, until the residuals of the rest agree with the model. A
+/// biased fit does not pass. The covariance is that of the visible part.
 ///
-/// A roundel that is `known` may look like a letter, and have a ratio a little off its print's; a new one may
-/// not.
-std::optional<Fit> fit_rest(const ImageView& image, Start start, const Fit& whole,
-                            std::optional<EdgeMisfit> misfit, double noise, bool known);
+/// A new roundel must not look like a letter, and its ratio must be that of a print within 0.01. Both is
+/// allowed for a known one.
+std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGuess& input);
 
 }  // namespace roundel

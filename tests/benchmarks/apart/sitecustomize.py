@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What Python runs first where this folder is in PYTHONPATH: hides the boot id, as if programs had machines apart."""
+"""Hides the boot id from Python programs with this folder in PYTHONPATH, as if they ran on separate machines."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the detector reaches, each figure beside its goal: `python -m tests.benchmarks.detector [PART ...]`."""
+"""Measures detectors and compares each figure with its goal: `python -m tests.benchmarks.detector [PART ...]`."""
 
 import sys
 from dataclasses import dataclass
@@ -26,20 +26,20 @@ PARTS = {
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Measure detectors against the goals of the issue. Everything is seeded; times are those of this machine."""
+    """Measure detectors against their goals. All random numbers are seeded; times depend on the machine."""
 
     parts: Annotated[
         tuple[Literal["speed", "accuracy", "recall", "motion", "false_positives", "pose", "all"], ...],
         tyro.conf.Positional,
     ] = ("all",)
-    """What to measure."""
+    """The parts to measure."""
     detector: tuple[str, ...] = ("chords",)
-    """Which detectors, as `Detector(detector=...)` takes them."""
+    """The detectors to measure: values of `Detector(detector=...)`."""
     thorough: bool = False
-    """The whole grid and many more draws, for hours, rather than two minutes."""
+    """Measure the whole grid with many more draws; takes hours instead of two minutes."""
 
     def run(self) -> None:
-        """Print the tables of every detector, then its goals."""
+        """Print the tables and goals of each detector."""
         console = Console(width=None if sys.stdout.isatty() else 140)
         parts = PARTS if "all" in self.parts else {name: PARTS[name] for name in dict.fromkeys(self.parts)}
         for name in self.detector:

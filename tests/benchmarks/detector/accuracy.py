@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Errors over the Cramer-Rao bound: centre, distance, and whether the reported covariance says so.
+"""Errors of centre and distance over the Cramer-Rao bound, and consistency of the reported covariance.
 
-The detector knows no lens, and is held to the bound for who does not. With the lens a pose is located, and its
-ellipse's centre is held to the bound for who does.
+The detector does not know the lens, so its centre is compared with the bound for an unknown lens. A pose is located
+with the lens; the centre of its ellipse is compared with the bound for a known lens.
 """
 
 from dataclasses import dataclass, replace
@@ -23,24 +23,24 @@ CENTRE, CENTRE_WORST, DISTANCE, BIAS = 1.15, 1.3, 1.5, 5e-4
 
 @dataclass(frozen=True)
 class Errors:
-    """What happened in a cell: means over all views found; the ratios are over the bound."""
+    """The results of a cell: means over all detections; ratios are over the bound."""
 
     found: float
-    centre: float  # as located with the lens
-    detected: float  # over the bound for who does not know the lens
-    chi2: float  # of the centre by its reported covariance, over its two degrees
+    centre: float  # of the located pose's ellipse
+    detected: float  # over the bound for an unknown lens
+    chi2: float  # squared Mahalanobis error of the centre over its two degrees of freedom
     distance: float
     bias: float  # of the distance, over itself
     bias_sigma: float  # of that mean
 
     @property
     def biased(self) -> bool:
-        """Beyond the goal by more than chance explains."""
+        """Whether the bias exceeds the goal by more than three sigmas."""
         return abs(self.bias) > BIAS + 3 * self.bias_sigma
 
 
 def measure_cell(run: Run, cell: Cell, count: int, draws: int) -> Errors:
-    """`draws` exposures of each of `count` views."""
+    """Measure `draws` exposures of each of `count` views."""
     rng = np.random.default_rng(round(1e3 * (cell.diameter + cell.tilt + cell.noise + cell.blur)))
     pieces = 6 if cell.diameter < 40 else 4
     rows: list[Array] = []
@@ -67,20 +67,18 @@ def measure_cell(run: Run, cell: Cell, count: int, draws: int) -> Errors:
 
 
 def _errors(run: Run, image: np.ndarray, sight: Sight, limit: Bound, noise: float) -> Array | None:
-    """Of a coordinate the squared error located and detected, each with its bound, and chi-square; of the distance the
-    error and its bound.
+    """(7,) errors of one exposure; None if the roundel is not found.
 
-    None where the roundel was not found.
+    Of one coordinate: the squared error located, its bound, the squared error detected, its bound, and chi-square. Of
+    the distance: the relative error and its bound.
     """
-    detector = run.make()
-    found = detector.detect(image)
+    found = run.make().detect(image)
     if len(found) != 1:
         return None
     true = ellipse_of(sight)[0]
     error = found[0].uv - true
     chi2 = error @ np.linalg.solve(found[0].cov, error)
-    offsets, covs = detector.disc_offsets()
-    poses = locate(found[0], sight.lens, sight.diameter_m, (offsets[0], covs[0]))
+    poses = locate(found[0], sight.lens, sight.diameter_m)
     if poses is None:
         return None
     distance = poses[0].position_m[2] / sight.distance_m - 1
@@ -92,13 +90,13 @@ def _errors(run: Run, image: np.ndarray, sight: Sight, limit: Bound, noise: floa
 
 
 def _ellipse_centre(sight: Sight, pose: DiscPose) -> Array:
-    """(2,) pixels, of what would be seen in a pose."""
+    """(2,) centre of the outer ellipse of a pose, pixels."""
     there = replace(sight, uv=tuple(pose.centre_uv), distance_m=float(pose.position_m[2]))
     return ellipse_of(there.with_normal(pose.normal))[0]
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print all cells; the verdicts on the goals of the issue."""
+    """Print all cells and return the verdicts on the goals."""
     count, draws = (12, 100) if run.thorough else (6, 50)
     done = {cell: measure_cell(run, cell, count, draws) for cell in cells(run.thorough)}
     headings = (

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The Cramer-Rao bound of a roundel's centre and distance: what no unbiased detector can do better.
+"""The Cramer-Rao bound of a roundel's centre and distance: the least variance of an unbiased estimator.
 
-The unknowns are the five of the pose, the dark, bright and ground levels, and the blur; their derivatives are those of
-the ray-traced picture, by central differences. Who does not know the lens has two more: the inner circle's image may
-then lie anywhere in the outer one's, as the unknown place of the optical axis has it.
+The unknowns are the five of the pose, the dark, bright and ground levels, and the blur. Derivatives are central
+differences of ray-traced images. An unknown lens adds two unknowns: the position of the optical axis, which displaces
+the image of the inner circle in that of the outer one.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,15 +16,15 @@ from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 from tests.camera_node.tracing import Sight, ellipse_of, trace
 
-AXIS_PX = 20.0  # a step of the optical axis: the inner circle moves by far less than a pixel
-ROUNDING = 1 / 12  # variance that 8 bits add, square grey levels
+AXIS_PX = 20.0  # step of the optical axis: the inner circle moves by much less than a pixel
+ROUNDING = 1 / 12  # variance of rounding to 8 bits, square grey levels
 
 
 @dataclass(frozen=True)
 class Bound:
     """For noise of one grey level: covariance (2, 2) of the ellipse's centre, and the distance's relative variance.
 
-    `without_lens` is the covariance for who does not know the lens.
+    `without_lens` is the covariance of the centre for an unknown lens.
     """
 
     centre: Array
@@ -32,17 +32,17 @@ class Bound:
     distance: float
 
     def centre_variance(self, noise: float, knows_lens: bool = True) -> float:
-        """Of one coordinate, the mean of both, square pixels, with the rounding to grey levels."""
+        """Mean variance of the two coordinates including the rounding to grey levels, square pixels."""
         cov = self.centre if knows_lens else self.without_lens
         return float(np.trace(cov)) / 2 * (noise**2 + ROUNDING)
 
     def distance_variance(self, noise: float) -> float:
-        """Of the distance over itself."""
+        """Variance of the relative error of the distance."""
         return self.distance * (noise**2 + ROUNDING)
 
 
 def bound(sight: Sight, pieces: int) -> Bound:
-    """The bound for a roundel seen by a lens without distortion."""
+    """The bound for a roundel and a lens without distortion."""
     grey, centre = [], []
     for move in _moves(sight):
         ahead, behind = move(1.0), move(-1.0)
@@ -57,7 +57,7 @@ def bound(sight: Sight, pieces: int) -> Bound:
 
 
 def _distance_step(sight: Sight) -> float:
-    """What moves the edge by 0.05 px, over the distance."""
+    """The relative change of the distance that moves the edge by 0.05 px."""
     return 0.1 / _width(sight)
 
 
@@ -66,7 +66,7 @@ def _width(sight: Sight) -> float:
 
 
 def _moves(sight: Sight) -> Iterator[Callable[[float], Sight]]:
-    """For each unknown, the scene after so many steps of it; each is small against what it makes nonlinear."""
+    """For each unknown, the scene as a function of a number of steps; a step is small against nonlinear effects."""
     n, angle, (u, v) = sight.normal, 0.3 / _width(sight), sight.uv
     first = np.cross(n, [1.0, 0.0, 0.0])
     second = np.cross(n, first)

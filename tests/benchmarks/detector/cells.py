@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The combinations of size, slant, noise, blur and ground at which accuracy is measured, and views of them."""
+"""The combinations of size, tilt, noise, blur and ground at which accuracy is measured, and views of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from tests.benchmarks.detector.pictures import F
 from tests.camera_node.tracing import Sight, pixels_across
 
 DIAMETERS, TILTS = (11, 14, 20, 30, 50, 100), (0, 15, 30, 45, 60)
-WHITE, GREY = 190.0, 90.0  # of what the card lies on: on white its edge tells nothing
+WHITE, GREY = 190.0, 90.0  # levels of the ground; on white the card's edge is invisible
 NOISES, BLURS = (1.0, 3.0, 5.0), (0.5, 0.7, 1.0, 1.5)
 
 
@@ -28,7 +28,7 @@ class Cell:
 
 
 def cells(thorough: bool) -> Iterator[Cell]:
-    """The whole grid, or the tilts at every size and the rest at one."""
+    """The whole grid, or all tilts at every size and one tilt for the other parameters."""
     if thorough:
         yield from (Cell(*values) for values in product(DIAMETERS, TILTS, NOISES, BLURS, (WHITE, GREY)))
         return
@@ -38,7 +38,7 @@ def cells(thorough: bool) -> Iterator[Cell]:
 
 
 def views(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[Sight]:
-    """Roundels of a cell at random places within a pixel, turned any way, up to 200 px off the optical axis."""
+    """Roundels of a cell at random subpixel positions and directions of tilt, up to 200 px from the optical axis."""
     side = int(1.4 * cell.diameter + 8 * cell.blur + 10)
     for _ in range(count):
         cx, cy = rng.uniform(-200, 200, 2) + side / 2

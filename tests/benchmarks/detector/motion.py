@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Roundels that move while they are exposed: share found, tracked and on a first frame, error, and what goes away."""
+"""Moving roundels: shares found when tracked and on a first frame, and false positives after one disappears."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,17 +18,17 @@ from tests.benchmarks.detector.table import Run, Verdict, table
 
 SIZE = (300, 400)
 DIAMETER = 32.0
-SMEARS = (8, 16, 24)  # pixels, at full speed
-EXPOSED = 0.5  # share of the time between frames
+LENGTHS = (8, 16, 24)  # pixels of motion during the exposure, at full speed
+EXPOSED = 0.5  # exposure over the frame interval
 RAMP = 4  # frames from rest to full speed
 FOUND = 0.95
 
 
-def smear(image: Array, way: Array) -> Array:
-    """The picture moved by `way` (2,), pixels, during its exposure: the mean of many shifted ones."""
+def blur_by_motion(image: Array, motion: Array) -> Array:
+    """The image moved by `motion` (2,), pixels, during its exposure: the mean of many shifted images."""
     h, w = image.shape
-    times = (np.arange(max(2, int(4 * np.linalg.norm(way)))) + 0.5)[:, None]
-    shifts = (times / len(times) - 0.5) * way
+    times = (np.arange(max(2, int(4 * np.linalg.norm(motion)))) + 0.5)[:, None]
+    shifts = (times / len(times) - 0.5) * motion
     moved = [
         cv2.warpAffine(image, np.array([[1, 0, u], [0, 1, v]]), (w, h), borderMode=cv2.BORDER_REPLICATE)
         for u, v in shifts
@@ -36,16 +36,16 @@ def smear(image: Array, way: Array) -> Array:
     return np.mean(moved, axis=0)
 
 
-def moving(ground: Array, card: Card, way: Array) -> Array:
-    """A card that moves over a ground that does not: the light of each, in proportion to what is seen of it."""
-    light = smear(paste(flat(SIZE, 0.0), [card]), way)
-    hidden = 1 - smear(paste(flat(SIZE, 1.0), [card], dark=0.0, bright=0.0), way)
+def moving(ground: Array, card: Card, motion: Array) -> Array:
+    """A card that moves over a still ground: the light of each in proportion to its visible share."""
+    light = blur_by_motion(paste(flat(SIZE, 0.0), [card]), motion)
+    hidden = 1 - blur_by_motion(paste(flat(SIZE, 1.0), [card], dark=0.0, bright=0.0), motion)
     return light + np.asarray(cv2.GaussianBlur(ground, (0, 0), 0.7)) * (1 - hidden)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame of a sequence, and the card in it in mid-exposure."""
+    """One frame of a sequence, and the card at mid-exposure."""
 
     image: Grey
     card: Card
@@ -53,7 +53,7 @@ class Shot:
 
 
 def sequence(ground: Array, length: float, rng: np.random.Generator) -> Iterator[Shot]:
-    """A card that starts from rest, so that at full speed it moves `length` pixels during an exposure."""
+    """A card that accelerates from rest to a speed of `length` pixels per exposure."""
     turn = rng.uniform(0, 2 * np.pi)
     ahead = np.array([np.cos(turn), np.sin(turn)])
     card = Card((0.0, 0.0), DIAMETER, float(rng.uniform(0, 0.5)), float(rng.uniform(0, 2 * np.pi)))
@@ -68,20 +68,20 @@ def sequence(ground: Array, length: float, rng: np.random.Generator) -> Iterator
 
 @dataclass(frozen=True)
 class Shares:
-    """Of the frames at full speed: the share found by a detector that saw all frames before, and by a new one."""
+    """Shares of the frames at full speed in which a tracking detector, and a new one, find the card."""
 
     tracked: float
     first: float
 
 
 def finds(detector: Detector, shot: Shot) -> bool:
-    """Whether a roundel is found within a tenth of the diameter of the card's centre."""
+    """Whether a roundel is found within a tenth of the diameter from the card's centre."""
     uv = detector.detect(shot.image).uv
     return bool((np.linalg.norm(uv - shot.card.uv, axis=1) < 0.1 * DIAMETER).any())
 
 
-def measure_smear(run: Run, kind: str, length: float, sequences: int) -> Shares:
-    """Sequences with one smear at full speed, on white or on clutter."""
+def measure_motion(run: Run, kind: str, length: float, sequences: int) -> Shares:
+    """Measure sequences with one length of motion at full speed, on white or on clutter."""
     tracked, first = [], []
     for seed in range(sequences):
         rng, detector = np.random.default_rng((seed, int(length))), run.make()
@@ -94,8 +94,8 @@ def measure_smear(run: Run, kind: str, length: float, sequences: int) -> Shares:
     return Shares(float(np.mean(tracked)), float(np.mean(first)))
 
 
-def gone(run: Run, pages: Iterator[Grey]) -> int:
-    """How many are found on pages from which a roundel has just gone."""
+def count_after_disappearance(run: Run, pages: Iterator[Grey]) -> int:
+    """The number of false positives on pages from which a roundel has just disappeared."""
     found = 0
     for seed, page in enumerate(pages):
         h, w = page.shape
@@ -109,29 +109,29 @@ def gone(run: Run, pages: Iterator[Grey]) -> int:
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print the shares by smear and ground; the verdicts on the goal, and on what goes away."""
+    """Print the shares by length and ground, and return the verdicts on the goals."""
     n = 60 if run.thorough else 12
-    cells = list(product(("white", "clutter"), SMEARS))
-    shares: dict[tuple[str, int], Shares] = {cell: measure_smear(run, *cell, n) for cell in cells}
+    cells = list(product(("white", "clutter"), LENGTHS))
+    shares: dict[tuple[str, int], Shares] = {cell: measure_motion(run, *cell, n) for cell in cells}
     rows = [
         (f"{kind}, {length} px", f"{100 * s.tracked:.0f}", f"{100 * s.first:.0f}")
         for (kind, length), s in shares.items()
     ]
     title = f"{run.name}: % found of {DIAMETER:g} px that move during the exposure"
-    console.print(table(title, ("ground, smear", "tracked", "first frame"), rows))
-    return [*_judge(shares), *_judge_gone(run, 5 * n)]
+    console.print(table(title, ("ground, motion", "tracked", "first frame"), rows))
+    return [*_judge(shares), *_judge_disappearance(run, 5 * n)]
 
 
 def _judge(shares: dict[tuple[str, int], Shares]) -> Iterator[Verdict]:
     goal = f">= {100 * FOUND:g} %"
-    for length in SMEARS:
+    for length in LENGTHS:
         for what in ("tracked", "first"):
             share = float(np.mean([getattr(s, what) for (_, px), s in shares.items() if px == length]))
-            name = f"{length} px smear on {DIAMETER:g} px, {what}"
+            name = f"motion of {length} px on {DIAMETER:g} px, {what}"
             yield Verdict(name, f"{100 * share:.1f} %", goal, share >= FOUND)
 
 
-def _judge_gone(run: Run, n: int) -> Iterator[Verdict]:
+def _judge_disappearance(run: Run, n: int) -> Iterator[Verdict]:
     kinds: dict[str, Callable[[int], Iterator[Grey]]] = {
         "letters": letters,
         "text": text_pages,
@@ -139,5 +139,7 @@ def _judge_gone(run: Run, n: int) -> Iterator[Verdict]:
         "photographs": photographs,
     }
     for what, pages in kinds.items():
-        found = gone(run, pages(n))
-        yield Verdict(f"false positives, {n} {what}, a roundel gone", str(found), "0", found == 0)
+        found = count_after_disappearance(run, pages(n))
+        yield Verdict(
+            f"false positives, {n} {what}, after a roundel disappeared", str(found), "0", found == 0
+        )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""False positives: letters, rings of other ratios, pages of text and photographs, none of which has a roundel."""
+"""False positives on images without roundels: letters, rings of other ratios, pages of text, photographs."""
 
 from collections.abc import Callable, Iterator
 
@@ -24,7 +24,7 @@ OTHER_RATIOS = (0.15, 0.2, 0.8, 0.85, 0.9)  # more than the tolerance of 0.1 awa
 
 
 def _seen(image: np.ndarray, rng: np.random.Generator) -> Grey:
-    """Through a lens and a sensor."""
+    """The image with the blur of a lens and the noise of a sensor."""
     blurred = np.asarray(
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), float(rng.uniform(0.5, 1.2))), float
     )
@@ -32,7 +32,7 @@ def _seen(image: np.ndarray, rng: np.random.Generator) -> Grey:
 
 
 def letters(n: int) -> Iterator[Grey]:
-    """Pages of o O 0 Q 8 and their like in OpenCV's fonts, sizes of 8 to 100 px and any weight."""
+    """Pages of the letters o O 0 Q 8 in OpenCV's fonts, of 8 to 100 px and any weight."""
     for seed in range(n):
         rng = np.random.default_rng(seed)
         page = np.full(SIZE, int(rng.integers(150, 240)), np.uint8)
@@ -56,7 +56,7 @@ def letters(n: int) -> Iterator[Grey]:
 
 
 def print_letters(n: int) -> Iterator[Grey]:
-    """Pages of o O Q 8 as print draws them: two ellipses of different shape, so strokes of two widths, with tails."""
+    """Pages of o Q 8 like printed ones: two ellipses of different shape (strokes of two widths), with tails."""
     for seed in range(n):
         rng = np.random.default_rng(seed)
         page = np.full(SIZE, int(rng.integers(150, 240)), np.uint8)
@@ -67,7 +67,7 @@ def print_letters(n: int) -> Iterator[Grey]:
 
 
 def _print_letter(page: np.ndarray, at: tuple[int, int], rng: np.random.Generator) -> None:
-    """Ratios within those of roundels in one direction at least; never in both, unless there is a tail or a twin."""
+    """The ratio is that of a roundel in one direction; in both directions only with a tail (Q) or a second ring (8)."""
     white, ink = int(page[0, 0]), int(rng.integers(0, 70))
     height, shape = rng.uniform(6, 26), rng.choice(list("oQ8"))
     width = height * rng.uniform(0.75, 1.0)
@@ -88,7 +88,7 @@ def _print_letter(page: np.ndarray, at: tuple[int, int], rng: np.random.Generato
 
 
 def rings(n: int) -> Iterator[Grey]:
-    """Rings whose ratio is none of the prints', 12 to 60 px wide, round and slanted."""
+    """Rings of 12 to 60 px with ratios that no print has, frontal and tilted."""
     for seed in range(n):
         rng = np.random.default_rng(seed)
         page = np.full(SIZE, int(rng.integers(150, 240)), np.uint8)
@@ -122,11 +122,11 @@ def clutter(n: int) -> Iterator[Grey]:
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print what was found where nothing is; the verdicts on the goals of the issue."""
+    """Print the numbers of false positives and return the verdicts on the goals."""
     n = 200 if run.thorough else 20
     kinds: dict[str, tuple[Callable[[int], Iterator[Grey]], int]] = {
         "letters o O 0 Q 8": (letters, n),
-        "letters as print draws them": (print_letters, n),
+        "printed letters": (print_letters, n),
         "rings of other ratios": (rings, n),
         "pages of text": (text_pages, n),
         "dead leaves": (clutter, n),
@@ -137,9 +137,7 @@ def measure(run: Run, console: Console) -> list[Verdict]:
         for what, (make, number) in kinds.items()
     }
     rows = [(what, len(found), sum(found), sum(k > 0 for k in found)) for what, found in counts.items()]
-    console.print(
-        table(f"{run.name}: found where no roundel is", ("pictures", "number", "found", "in pictures"), rows)
-    )
+    console.print(table(f"{run.name}: false positives", ("pictures", "number", "found", "in pictures"), rows))
     return [
         Verdict(
             f"false positives, {len(found)} {what}", str(sum(found)), "0", sum(found) == 0 if found else None

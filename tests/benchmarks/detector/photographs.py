@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs without roundels: those beside the checkout, frames of its videos, and what scikit-image ships."""
+"""Photographs without roundels: shared photographs, frames of shared videos, and the images of scikit-image."""
 
 import importlib
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ from camera_node.sources.replay import read_grey
 from tests.benchmarks.detector.pictures import Grey
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
-LENGTH = 960  # what scikit-image ships is brought to this length, and seen at half of it too
+LENGTH = 960  # pixels: images of scikit-image are scaled to this length and to half of it
 
 
 def photographs(n: int) -> Iterator[Grey]:
-    """Up to `n` photographs, as far as they are there."""
+    """Up to `n` photographs, as far as they are available."""
     files = [SHARED / "photos" / name for name in ("cctag_01.png", "monocam_Test_Image.jpg")]
     yield from (read_grey(path) for path in files if path.exists())
     shipped = list(_shipped())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures with roundels in them: grounds, and cards that are ray-traced onto them."""
+"""Renders images of cards: backgrounds, and ray-traced cards on them."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,13 +12,13 @@ from camera_node.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
 
-F = 600.0  # focal length of pictures of which nothing else is said, pixels
-NOISE = 3.0  # grey levels, of pictures of which nothing else is said
-PIECES = 4  # a pixel is cut into so many squared
+F = 600.0  # default focal length, pixels
+NOISE = 3.0  # default noise, grey levels
+PIECES = 4  # samples per pixel in either direction
 
 
 def dead_leaves(size: tuple[int, int], rng: np.random.Generator) -> Array:
-    """Clutter (h, w): shapes of all sizes that hide each other have the statistics of photographs (Lee et al. 2001)."""
+    """Clutter (h, w): shapes of all sizes that occlude each other, with statistics of photographs (Lee et al. 2001)."""
     h, w = size
     image = np.full(size, 110, np.uint8)
     sizes = 1 / np.sqrt(rng.uniform(1 / 160**2, 1 / 4**2, h * w // 150))  # a density of size^-3
@@ -39,7 +39,7 @@ def flat(size: tuple[int, int], level: float) -> Array:
 
 @dataclass(frozen=True)
 class Card:
-    """A card to paste: where its disc's centre is seen, how wide it would be frontally, pixels, and its attitude."""
+    """A card to render: the image of its disc's centre, its frontal diameter, both in pixels, and its orientation."""
 
     uv: tuple[float, float]
     diameter: float
@@ -56,7 +56,7 @@ def paste(
     bright: float = 190.0,
     focal: float = F,
 ) -> Array:
-    """The picture (h, w) blurred, with cards on it: each hides the ground in proportion to its part of a pixel."""
+    """The image (h, w), blurred, with cards on it; each occludes the ground by its coverage of a pixel."""
     h, w = image.shape
     out = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), float)
     for card in cards:
@@ -69,7 +69,7 @@ def paste(
 
 
 def _sight(card: Card, size: tuple[int, int], focal: float) -> Sight:
-    """A card in the picture (w, h)."""
+    """A card in an image of size (w, h)."""
     w, h = size
     lens = Lens(width=w, height=h, fx=focal, fy=focal, cx=(w - 1) / 2, cy=(h - 1) / 2)
     distance = pixels_across(lens, 0.1, card.diameter)
@@ -77,16 +77,16 @@ def _sight(card: Card, size: tuple[int, int], focal: float) -> Sight:
 
 
 def _bound(sight: Sight, blur: float) -> tuple[int, int, int, int]:
-    """What a card may touch of the picture, u0, v0, u1, v1: far off the axis it is seen larger than on it."""
+    """The part of the image that a card may touch, u0, v0, u1, v1. It is larger far from the optical axis."""
     (u, v), axes = ellipse_of(replace(sight, diameter_m=sight.card * sight.diameter_m))
     reach, (w, h) = axes.max() / 2 + 4 * blur + 3, (sight.lens.width, sight.lens.height)
     u0, v0 = max(int(u - reach), 0), max(int(v - reach), 0)
     return u0, v0, min(int(u + reach) + 1, w), min(int(v + reach) + 1, h)
 
 
-@lru_cache(maxsize=256)  # the same cards are shown on several grounds
+@lru_cache(maxsize=256)  # the same cards are rendered on several backgrounds
 def _layers(sight: Sight, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
-    """The light of a card in a box u0, v0, u1, v1 of the picture, and how much it covers of each pixel."""
+    """The light of a card in a box u0, v0, u1, v1 of the image, and its coverage of each pixel."""
     (u0, v0, u1, v1), lens, (u, v) = box, sight.lens, sight.uv
     moved = msgspec.structs.replace(lens, width=u1 - u0, height=v1 - v0, cx=lens.cx - u0, cy=lens.cy - v0)
     there = replace(sight, lens=moved, uv=(u - u0, v - v0))
@@ -94,7 +94,7 @@ def _layers(sight: Sight, box: tuple[int, int, int, int]) -> tuple[Array, Array]
 
 
 def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:
-    """`count` places on a grid that fills the picture (h, w), each moved by less than a pixel."""
+    """`count` positions on a grid that fills an image of size (h, w), each displaced by less than a pixel."""
     h, w = size
     columns = max(1, int(np.ceil(np.sqrt(count * w / h))))
     rows = int(np.ceil(count / columns))
@@ -107,13 +107,13 @@ def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tu
 
 
 def expose(image: Array, noise: float, rng: np.random.Generator) -> Grey:
-    """An 8-bit picture with Gaussian noise."""
+    """An 8-bit image with Gaussian noise."""
     noisy = image + np.float32(noise) * rng.standard_normal(image.shape, np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def missed(cards: list[Card], found: Array) -> int:
-    """How many cards no detection (N, 2) lies on: within a fifth of the diameter of the centre."""
+    """The number of cards without a detection (N, 2) within a fifth of the diameter from the centre."""
     if not (cards and len(found)):
         return len(cards)
     apart = np.linalg.norm(np.array([card.uv for card in cards])[:, None] - found, axis=2).min(axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The normal from one view: how often the likelier one is wrong, and how often where it is said to be sure."""
+"""The normal from one view: how often the likelier one is wrong, overall and among those with high probability."""
 
 import numpy as np
 from rich.console import Console
@@ -15,20 +15,14 @@ SURE, WRONG = 0.99, 0.01
 
 
 def judge_views(run: Run, cell: Cell, count: int, draws: int) -> np.ndarray:
-    """(N, 2) of each view found: the probability of the likelier pose, and whether it is the wrong one."""
+    """(N, 2) for each detection: the probability of the likelier pose, and whether it is wrong."""
     rng = np.random.default_rng(int(100 * cell.diameter + cell.tilt))
     rows = []
     for sight in views(cell, count, rng):
         clean = trace(sight, 6 if cell.diameter < 40 else 4)
         for _ in range(draws):
-            detector = run.make()
-            found = detector.detect(expose(clean, cell.noise, rng))
-            offsets, covs = detector.disc_offsets()
-            poses = (
-                locate(found[0], sight.lens, sight.diameter_m, (offsets[0], covs[0]))
-                if len(found) == 1
-                else None
-            )
+            found = run.make().detect(expose(clean, cell.noise, rng))
+            poses = locate(found[0], sight.lens, sight.diameter_m) if len(found) == 1 else None
             if poses:
                 right, wrong = (pose.normal @ sight.normal for pose in poses)
                 rows.append((poses[0].probability, float(right < wrong)))
@@ -36,7 +30,7 @@ def judge_views(run: Run, cell: Cell, count: int, draws: int) -> np.ndarray:
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print all cells; the verdict on the goal of the issue."""
+    """Print all cells and return the verdict on the goal."""
     count, draws = (60, 20) if run.thorough else (20, 10)
     done = {(d, t): judge_views(run, Cell(d, t), count, draws) for d in DIAMETERS for t in TILTS}
     rows = []
@@ -54,14 +48,14 @@ def measure(run: Run, console: Console) -> list[Verdict]:
                 int(wrong[sure].sum()),
             )
         )
-    headings = ("view", "found", "wrong %", "said wrong %", "sure", "of those wrong")
+    headings = ("view", "found", "wrong %", "expected wrong %", "sure", "sure but wrong")
     console.print(table(f"{run.name}: the likelier normal", headings, rows))
     p, wrong = np.concatenate(list(done.values())).T
     sure = p > SURE
     share = wrong[sure].mean() if sure.any() else np.nan
     return [
         Verdict(
-            f"normal wrong where it is said > 99 % ({sure.sum()} views)",
+            f"normals with a probability > 99 % that are wrong ({sure.sum()} views)",
             f"{100 * share:.2f} %",
             "<= 1 %",
             bool(share <= WRONG),

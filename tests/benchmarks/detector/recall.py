@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Share of roundels found on the first frame: small, slanted, covered, smeared and faint ones."""
+"""Share of roundels found on the first frame: small, tilted, occluded, motion-blurred and faint ones."""
 
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -38,18 +38,18 @@ Picture = Callable[[np.random.Generator], tuple[Grey, list[Card]]]
 
 
 def ground(name: str, rng: np.random.Generator) -> Array:
-    """White paper, clutter like a photograph's, or a dark floor."""
+    """White paper, clutter as in photographs, or a dark floor."""
     return dead_leaves(SIZE, rng) if name == "clutter" else flat(SIZE, 190.0 if name == "white" else 40.0)
 
 
 def show(px: Callable[[], float], tilt_deg: float, n: int, rng: np.random.Generator) -> list[Card]:
-    """`n` cards of one slant, turned any way."""
+    """`n` cards with one tilt in random directions."""
     tilt = float(np.radians(tilt_deg))
     return [Card(uv, px(), tilt, float(rng.uniform(0, 2 * np.pi))) for uv in grid(n, SIZE, rng)]
 
 
 def recall(run: Run, frames: int, picture: Picture) -> float:
-    """The share of the cards in so many pictures that a new detector finds."""
+    """The share of the cards in `frames` images that a new detector finds."""
     there = lost = 0
     for seed in range(frames):
         image, shown = picture(np.random.default_rng(seed))
@@ -58,7 +58,7 @@ def recall(run: Run, frames: int, picture: Picture) -> float:
 
 
 def of_size(name: str, diameter: float, tilt_deg: float) -> Picture:
-    """Sixty cards of one size on one ground, at sixty places within a pixel."""
+    """Sixty cards of one size on one ground, at sixty subpixel positions."""
 
     shown = show(lambda: diameter, tilt_deg, 60, np.random.default_rng(1))
 
@@ -68,23 +68,23 @@ def of_size(name: str, diameter: float, tilt_deg: float) -> Picture:
     return picture
 
 
-def covered(share: float, from_rim: bool) -> Picture:
-    """Each card with a bar over it, `share` of the diameter wide, of any grey level, direction and place on the disc.
+def occluded(share: float, from_rim: bool) -> Picture:
+    """Cards with a bar across, `share` of the diameter wide, of random grey level and direction.
 
-    Where it comes from the rim it takes the outermost part; else it lies anywhere within the disc.
+    The bar covers the outermost part of the disc if `from_rim`, otherwise a random part.
     """
 
     def picture(rng: np.random.Generator) -> tuple[Grey, list[Card]]:
         shown = show(lambda: float(rng.uniform(20, 44)), float(rng.uniform(0, 40)), 30, rng)
         image = paste(ground("clutter", rng), shown)
         for card in shown:
-            _cover(image, card, share, 1.0 if from_rim else rng.uniform(-1, 1), rng)
+            _occlude(image, card, share, 1.0 if from_rim else rng.uniform(-1, 1), rng)
         return expose(image, NOISE, rng), shown
 
     return picture
 
 
-def _cover(image: Array, card: Card, share: float, place: float, rng: np.random.Generator) -> None:
+def _occlude(image: Array, card: Card, share: float, place: float, rng: np.random.Generator) -> None:
     turn, level = rng.uniform(0, np.pi), float(rng.uniform(0, 255))
     reach = int(0.8 * card.diameter)
     x0, y0 = (int(c) - reach for c in card.uv)
@@ -97,8 +97,8 @@ def _cover(image: Array, card: Card, share: float, place: float, rng: np.random.
     box += part * (level - box)
 
 
-def smeared(image: Array, length: float, turn: float) -> Array:
-    """The picture moved by `length` pixels during its exposure."""
+def blur_by_motion(image: Array, length: float, turn: float) -> Array:
+    """The image moved by `length` pixels during its exposure."""
     side = int(length) // 2 * 2 + 3
     step = np.linspace(-0.5, 0.5, 8 * side)[:, None] * length * [np.cos(turn), np.sin(turn)] + side // 2
     kernel, low = np.zeros((side + 1, side + 1)), np.floor(step).astype(int)
@@ -112,30 +112,30 @@ def smeared(image: Array, length: float, turn: float) -> Array:
 
 
 def moving(rng: np.random.Generator) -> tuple[Grey, list[Card]]:
-    """Cards of 32 px that move by 24 px during the exposure, on white and on clutter by turns."""
+    """Cards of 32 px that move by 24 px during the exposure, on white or on clutter."""
     shown = show(lambda: 32.0, float(rng.uniform(0, 30)), 24, rng)
     image = paste(ground(str(rng.choice(["white", "clutter"])), rng), shown)
-    return expose(smeared(image, 24.0, rng.uniform(0, np.pi)), NOISE, rng), shown
+    return expose(blur_by_motion(image, 24.0, rng.uniform(0, np.pi)), NOISE, rng), shown
 
 
 def faint(rng: np.random.Generator) -> tuple[Grey, list[Card]]:
-    """Cards whose white is a tenth of the scale above their black, on their own white."""
+    """Cards with a contrast of a tenth of the scale, on a ground of their white."""
     shown = show(lambda: float(rng.uniform(20, 44)), float(rng.uniform(0, 40)), 30, rng)
     return expose(paste(flat(SIZE, 140.5), shown, dark=115.0, bright=140.5), NOISE, rng), shown
 
 
 HARD = (
-    ("occlusion of 20 % of the diameter", covered(0.2, False), 0.9),
-    ("occlusion of 30 % of the diameter", covered(0.3, False), 0.5),
-    ("occlusion of 20 %, from the rim", covered(0.2, True), 0.9),
-    ("occlusion of 30 %, from the rim", covered(0.3, True), 0.5),
+    ("occlusion of 20 % of the diameter", occluded(0.2, False), 0.9),
+    ("occlusion of 30 % of the diameter", occluded(0.3, False), 0.5),
+    ("occlusion of 20 %, from the rim", occluded(0.2, True), 0.9),
+    ("occlusion of 30 %, from the rim", occluded(0.3, True), 0.5),
     ("motion blur of 24 px on 32 px", moving, 0.95),
     ("contrast of 10 %", faint, 0.95),
 )
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print recall by diameter; the verdicts on the goals of the issue, those of covered and faint ones too."""
+    """Print recall by diameter and return the verdicts on the goals."""
     frames = 40 if run.thorough else 5
     tilts = (0, 30, 45, 60) if run.thorough else (0, 45)
     shares = {

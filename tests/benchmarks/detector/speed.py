@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Time a frame, of one thread: cold and tracked, beside one pass over the memory, OpenCV's contours, and tags."""
+"""Time per frame on one thread, cold and tracked, compared with a memory copy, OpenCV's contours and square tags."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -22,15 +22,15 @@ from tests.benchmarks.detector.pictures import (
     missed,
     paste,
 )
-from tests.benchmarks.detector.table import Run, Verdict, milliseconds, milliseconds_anew, table
+from tests.benchmarks.detector.table import Run, Verdict, milliseconds, milliseconds_prepared, table
 from tests.benchmarks.detector.tags import measure_tags, tag_detectors
 
 SIZES = ((480, 640), (720, 1280), (1080, 1920))
 COUNTS = (0, 1, 10, 50)
 STEP = (2.3, -1.4)  # pixels that the markers move from frame to frame
-TRUST = 16  # frames, in one of which what stands still is searched again: the unit in which tracking is timed
-EVENLY = 6  # frames in which they move so, before they turn back
-GOALS = {  # lines: milliseconds with 50 markers and with none or one
+INTERVAL = 16  # frames between two searches of unchanged parts: the unit in which tracking is timed
+EVENLY = 6  # frames of constant velocity before the markers turn back
+GOALS = {  # by lines: milliseconds with 50 markers, and with none or one
     480: (0.3, 0.1),
     720: (0.7, 0.25),
     1080: (1.5, 0.9),
@@ -41,7 +41,7 @@ OVER_OPENCV, TRACKED_US = 30, 15
 def place_cards(
     count: int, size: tuple[int, int], rng: np.random.Generator, px: float | None = None
 ) -> list[Card]:
-    """Frontal to 40 degrees, 18 to 44 px wide at 640 px and scaled with the width, or all `px` wide."""
+    """Cards at 0 to 40 degrees, 18 to 44 px wide in images 640 px wide and scaled with the width, or all `px` wide."""
     scale = size[1] / 640
     widths = rng.uniform(18, 44, count) * scale if px is None else np.full(count, px)
     turns = rng.uniform((0, 0), (0.7, 2 * np.pi), (count, 2))
@@ -50,7 +50,7 @@ def place_cards(
 
 
 def walk(there: list[Card], frames: int) -> list[list[Card]]:
-    """The same markers in every frame: for each, where they are in it."""
+    """The positions of the same markers in each frame."""
     return [
         [Card((c.uv[0] + k * STEP[0], c.uv[1] + k * STEP[1]), c.diameter, c.tilt, c.turn) for c in there]
         for k in range(frames)
@@ -58,7 +58,7 @@ def walk(there: list[Card], frames: int) -> list[list[Card]]:
 
 
 def contours(image: Grey) -> None:
-    """What people write first: a global threshold, its contours, and an ellipse for each."""
+    """The usual approach: a global threshold, its contours, and an ellipse for each."""
     _, binary = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     for contour in cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]:
         if len(contour) >= 20:
@@ -67,7 +67,7 @@ def contours(image: Grey) -> None:
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds of one picture: ours cold, and tracked in the mean, one pass over the memory, OpenCV's contours."""
+    """Milliseconds per image: ours cold and tracked (mean), a memory copy, and OpenCV's contours."""
 
     found: int
     cold: float
@@ -81,26 +81,26 @@ class Times:
 
 
 def measure_frame(run: Run, ground: Array, there: list[Card], seconds: float, steps: int = 2) -> Times:
-    """All of ours, and what it is compared with, in one picture; tracked to and fro over so many frames.
+    """Measure one image; tracking goes back and forth over `steps` frames.
 
     With two frames every prediction is wrong by two steps.
     """
     rng = np.random.default_rng(len(there))
-    focal = F * ground.shape[1] / 640  # one lens before cameras that resolve it more or less
+    focal = F * ground.shape[1] / 640  # the same lens at any resolution
     frames = [expose(paste(ground, cards, focal=focal), NOISE, rng) for cards in walk(there, steps)]
     image, scratch = frames[0], np.empty_like(frames[0])
     tracker, turns = run.make(), cycle([*frames, *frames[-2:0:-1]])
     return Times(
         len(there) - missed(there, run.make().detect(image).uv),
-        milliseconds_anew(lambda: partial(run.make().detect, image), seconds),
-        milliseconds(lambda: [tracker.detect(next(turns)) for _ in range(TRUST)], seconds) / TRUST,
+        milliseconds_prepared(lambda: partial(run.make().detect, image), seconds),
+        milliseconds(lambda: [tracker.detect(next(turns)) for _ in range(INTERVAL)], seconds) / INTERVAL,
         milliseconds(lambda: np.copyto(scratch, image), seconds / 2),
         milliseconds(lambda: contours(image), seconds / 2),
     )
 
 
 def measure(run: Run, console: Console) -> list[Verdict]:
-    """Print the times of all sizes; the verdicts on the goals of the issue."""
+    """Print the times of all sizes and return the verdicts on the goals."""
     cv2.setNumThreads(1)
     seconds = 0.5 if run.thorough else 0.1
     rows, in_clutter = [], {}
@@ -138,7 +138,7 @@ def _judge(times: dict[tuple[int, int], Times]) -> list[Verdict]:
 
 
 def _judge_tracked(run: Run, seconds: float, steps: int) -> Verdict:
-    """What one more tracked marker of 20 px costs: a frame of 50 less one of none."""
+    """The time for one more tracked marker of 20 px: a frame of 50 minus one of none."""
     ground = flat((480, 640), 128.0)
     there = place_cards(50, (480, 640), np.random.default_rng(5), 20.0)
     many, none = (measure_frame(run, ground, cards, 2 * seconds, steps).tracked for cards in (there, []))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What benchmarks print: tables of figures, then each goal with its verdict."""
+"""Tables of figures, verdicts on goals, and time measurements for benchmarks."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -16,7 +16,7 @@ MakeDetector = Callable[[], Detector]
 
 @dataclass(frozen=True)
 class Verdict:
-    """One goal: what was measured, and whether it is met; None where there was nothing to measure."""
+    """The verdict on one goal; `met` is None if nothing was measured."""
 
     what: str
     measured: str
@@ -26,7 +26,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Run:
-    """How a benchmark runs: the detector under test by its name, and whether the whole grid is wanted."""
+    """The options of a run: the detector's name and constructor, and whether to measure the whole grid."""
 
     name: str
     make: MakeDetector
@@ -34,7 +34,7 @@ class Run:
 
 
 def table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
-    """A table of figures, the first column on the left."""
+    """A table of figures with the first column left-aligned."""
     made = Table(title=title, title_justify="left")
     for k, heading in enumerate(headings):
         made.add_column(heading, justify="right" if k else "left")
@@ -44,22 +44,22 @@ def table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]])
 
 
 def print_verdicts(console: Console, name: str, verdicts: Iterable[Verdict]) -> None:
-    """The goals of one detector."""
+    """Print the verdicts on the goals of one detector."""
     marks = {True: "[green]met[/]", False: "[red]missed[/]", None: "-"}
     rows = [(v.what, v.measured, v.goal, marks[v.met]) for v in verdicts]
     console.print(table(f"{name}: goals", ("what", "measured", "goal", ""), rows))
 
 
 def milliseconds(work: Callable[[], object], seconds: float) -> float:
-    """The processor time of one call when little else runs: of ten calls one takes less.
+    """The processor time of one call: the first decile of many.
 
-    Not the least of all, since a virtual machine's thread clock stands still now and then.
+    The minimum is unsuitable because the thread clock of a virtual machine stops at times.
     """
-    return milliseconds_anew(lambda: work, seconds)
+    return milliseconds_prepared(lambda: work, seconds)
 
 
-def milliseconds_anew(prepare: Callable[[], Callable[[], object]], seconds: float) -> float:
-    """The same of work that can be done once: what prepares it each time is not counted."""
+def milliseconds_prepared(prepare: Callable[[], Callable[[], object]], seconds: float) -> float:
+    """The same for work that can be done only once after a preparation, which is not timed."""
     times, end = [], time.perf_counter() + seconds
     while time.perf_counter() < end or len(times) < 2:
         work = prepare()

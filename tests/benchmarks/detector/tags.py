@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Square tags and their detectors, for comparison: OpenCV's ArUco, and AprilTag 3 where pyapriltags is installed."""
+"""Square tags and their detectors, for comparison: OpenCV's ArUco, and AprilTag 3 if pyapriltags is installed."""
 
 import importlib
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from tests.benchmarks.detector.table import milliseconds
 
 
 def tagged(ground: Array, there: list[Card], dictionary: int, rng: np.random.Generator) -> Grey:
-    """The ground with square tags where the cards would be, as wide as the cards' discs."""
+    """The ground with square tags at the positions of the cards, as wide as their discs."""
     tags = cv2.aruco.getPredefinedDictionary(dictionary)
     image = np.asarray(cv2.GaussianBlur(ground, (0, 0), 0.7), float)
     for k, card in enumerate(there):
@@ -29,7 +29,7 @@ def tagged(ground: Array, there: list[Card], dictionary: int, rng: np.random.Gen
 
 
 def tag_detectors() -> dict[str, tuple[int, Callable[[Grey], object] | None]]:
-    """By name: the tags' dictionary, and what finds them, or None where it is not installed."""
+    """By name: the tags' dictionary and their detector, or None if it is not installed."""
     aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     try:
         april = importlib.import_module("pyapriltags").Detector(families="tag36h11", nthreads=1).detect
@@ -42,7 +42,7 @@ def tag_detectors() -> dict[str, tuple[int, Callable[[Grey], object] | None]]:
 
 
 def measure_tags(ground: Array, there: list[Card], seconds: float) -> list[str]:
-    """Milliseconds of the tag detectors, where their tags stand in the cards' places."""
+    """Milliseconds of the tag detectors with tags at the positions of the cards."""
     cells = []
     for dictionary, find in tag_detectors().values():
         if find is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A waved wand places cameras: exactly without noise, honestly with it, loudly when it can't."""
+"""Wand calibration: exact without noise, honest about its covariance, and explicit about faults."""
 
 import msgspec
 import numpy as np
@@ -9,17 +9,18 @@ from scipy.stats import chi2
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
+from calib.wand.result import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, WAND, Arena, assert_near, joint_error, record, ring, roughly
 
 
-def run(arena: Arena, messages: list[Detections]):
+def run(arena: Arena, messages: list[Detections]) -> WandCalibration:
     return calibrate(arena.intrinsics, arena.wand, messages)
 
 
-def test_exact_without_noise_when_cameras_fire_together():
-    """What remains is the pixel's rounding and the hand's prior, far below a tenth of a millimetre."""
+def test_exact_without_noise_for_synchronized_cameras():
+    """The rounding of pixels and the motion prior remain, far below 0.1 mm."""
     arena = ring()
     result = run(arena, record(arena, free_running=False))
     assert_near(result.rig, arena.truth, 1e-4, 1e-4)
@@ -28,29 +29,28 @@ def test_exact_without_noise_when_cameras_fire_together():
 
 
 @pytest.mark.parametrize(("seconds", "period_ms"), [(10, 100), (30, 300)], ids=["dense", "sparse"])
-def test_exact_without_noise_when_cameras_run_freely(seconds: float, period_ms: int):
-    """A quarter of a period apart at a metre a second, ignoring the times would cost centimetres."""
+def test_exact_without_noise_for_free_running_cameras(seconds: float, period_ms: int):
+    """Ignoring the timestamps, a quarter of a period apart at 1 m/s, would cost centimetres."""
     arena = ring()
     result = run(arena, record(arena, seconds, period_ns=period_ms * 1_000_000))
     assert_near(result.rig, arena.truth, 2e-4, 2e-4)
 
 
 def test_reported_covariance_is_honest():
-    """Squared Mahalanobis errors of all cameras together, without the world's 6 motions, follow chi-square with
-    6C - 6 degrees each: their sum is between its 0.1 % and 99.9 % quantiles. Lenses are off by what their figures
-    say."""
+    """Squared Mahalanobis errors of all poses follow chi-square with 6C - 6 degrees per recording: their sum is within
+    its 0.1 % and 99.9 % quantiles. Lens errors have the stated standard deviations."""
     arena, runs = ring(3), 12
-    rigs = [roughly(arena.intrinsics, CAREFUL, told=True, seed=seed) for seed in range(runs)]
-    waves = [record(arena, 4.0, sigma_px=0.1, seed=seed) for seed in range(runs)]
-    results = [calibrate(rig, arena.wand, wave) for rig, wave in zip(rigs, waves, strict=True)]
+    rigs = [roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed) for seed in range(runs)]
+    recordings = [record(arena, 4.0, sigma_px=0.1, seed=seed) for seed in range(runs)]
+    results = [calibrate(rig, arena.wand, messages) for rig, messages in zip(rigs, recordings, strict=True)]
     total = sum(joint_error(result, arena.truth)[0] for result in results)
     low, high = chi2.ppf([0.001, 0.999], runs * (6 * 3 - 6))
     assert low < total < high
 
 
-def test_gross_outliers_and_clutter_are_left_out_and_counted():
-    """Noise 0.1 px: position errors are some tenths of a millimetre; 3 mm is far beyond, and far below what 5 % of
-    errors of up to 60 px do to plain least squares."""
+def test_gross_errors_and_clutter_are_rejected_and_counted():
+    """Noise of 0.1 px causes position errors of some 0.1 mm; 5 % of errors of up to 60 px would cause far more than
+    3 mm in plain least squares."""
     arena = ring()
     numbered = run(arena, record(arena, sigma_px=0.1, outliers=0.05, numbered=True, sized=False))
     assert_near(numbered.rig, arena.truth, 3e-3, 1.5e-3)
@@ -59,10 +59,9 @@ def test_gross_outliers_and_clutter_are_left_out_and_counted():
     assert_near(cluttered.rig, arena.truth, 3e-3, 1.5e-3)
 
 
-def test_no_camera_comes_first():
-    """Renaming the cameras backwards changes nothing but the names and the world, to a sixth of what noise does:
-    the smoothness of the hand, and how far off lenses without figures are, is estimated from a first rig, which is
-    another one. Six seconds know places to 1.6 mm where they have to find the lenses."""
+def test_the_result_does_not_depend_on_the_order_of_cameras():
+    """Reversing the names changes the rig by less than a sixth of its noise. The motion prior and the lens prior are
+    estimated from the initial rig, which changes. Six seconds determine positions to 1.6 mm with unknown lenses."""
     arena = ring()
     messages = record(arena, 6.0, sigma_px=0.1)
     names = sorted(arena.truth.cameras)
@@ -85,8 +84,8 @@ def test_a_camera_that_shares_too_little_is_named_with_the_reason():
 
 
 @pytest.mark.parametrize("markers", [1, 2, 4])
-def test_wands_of_other_numbers_of_markers(markers: int):
-    """One roundel of known size gives the scale by its size, to about a percent; four are a plane."""
+def test_wands_with_other_numbers_of_markers(markers: int):
+    """The size of a single roundel gives the scale to about 1 %; four markers form a plane."""
     points = ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.25, 0.0), (0.33, 0.13, 0.0))[:markers]
     arena = ring(wand=Body(diameter_m=0.1, markers=points))
     result = run(arena, record(arena, 15.0, sigma_px=0.02))
@@ -106,8 +105,8 @@ def test_a_light_without_size_gives_a_rig_up_to_scale():
     assert distances[0] == pytest.approx(distances[1] / distances[1].max(), abs=3e-3)
 
 
-def test_world_is_upright_and_under_the_wave():
-    """Cameras without roll: z is up to within their noise; the wave is a metre around the origin."""
+def test_the_world_is_upright_with_its_origin_below_the_wand():
+    """z is up within the noise for cameras without roll; the wand moves within a metre of the origin."""
     arena = ring()
     rig = run(arena, record(arena)).rig
     heights = [camera.matrix()[2, 3] for camera in rig.cameras.values()]
@@ -116,7 +115,7 @@ def test_world_is_upright_and_under_the_wave():
     assert 0 < min(heights) < max(heights) < 3
 
 
-def test_faults_are_named():
+def test_errors_name_the_fault():
     arena = ring()
     messages = record(arena, 3.0)
     symmetric = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), (0.5, 0.0, 0.0)))
@@ -124,12 +123,12 @@ def test_faults_are_named():
         calibrate(arena.intrinsics, symmetric, messages)
     with pytest.raises(CalibrationError, match="one camera, 'cam0'"):
         run(arena, [m for m in messages if m.camera == "cam0"])
-    with pytest.raises(CalibrationError, match="'north' of the recording is not in the rig"):
+    with pytest.raises(CalibrationError, match=r"'north'.* not in the rig.*--camera north"):
         run(arena, [msgspec.structs.replace(m, camera="north") for m in messages])
-    with pytest.raises(CalibrationError, match="800 x 601 pixels, its intrinsics are for 800 x 600"):
+    with pytest.raises(CalibrationError, match=r"800 x 601 .*800 x 600"):
         run(arena, [msgspec.structs.replace(m, height=601) for m in messages])
     alone = [m for m in messages if (m.t_ns // 1_000_000_000) % 4 == int(m.camera[3])]
-    with pytest.raises(CalibrationError, match="no two cameras ever saw the wand at once"):
+    with pytest.raises(CalibrationError, match=r"no two cameras .*cam0 \d+, cam1 \d+"):
         run(arena, alone)
     longer = Body(diameter_m=0.12, markers=tuple((4 * x, y, z) for x, y, z in WAND.markers))
     with pytest.raises(CalibrationError, match="wand"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The distance of two cameras: the scale of a wand of one marker, and a check of all others."""
+"""The measured distance of two cameras: the scale for a wand of one marker, a check of other wands."""
 
 from itertools import combinations
 from pathlib import Path
@@ -9,35 +9,34 @@ import pytest
 from scipy.stats import chi2
 
 from calib.__main__ import execute
-from calib.commands.check import placed, split
+from calib.commands.check import split
 from calib.errors import CalibrationError
-from calib.live.wand_session import try_part
+from calib.live.wand_session import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.agreement import Agreement
-from calib.wand.quality.agreement import compare as compare_rigs
-from calib.wand.scale import Distance, compare
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
+from calib.wand.scale import Distance, compare_distance
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.observations import write_observations
+from tests.calib.recordings import WandScenario
+from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly
-from tests.calib.wave import Wave
-from tests.calib.wave import record as record_wave
 
 LIGHT = Body(diameter_m=0.1)
 
 
-def apart(arena: Arena, a: str, b: str) -> float:
+def true_distance(arena: Arena, a: str, b: str) -> float:
     first, second = (arena.truth.cameras[name].matrix()[:3, 3] for name in (a, b))
     return float(np.linalg.norm(first - second))
 
 
-def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
-    """0.1 px at 2.6 m, f = 520 px, is 0.5 mm across a ray, over the root of some hundred moments: 2 mm is far beyond.
-    The distance's own deviation comes on top: of any two cameras' distance it is the same part."""
+def test_a_distance_gives_a_light_its_scale():
+    """Noise of 0.1 px at 2.6 m and f = 520 px is 0.5 mm across a ray, and less over a hundred frame sets; the limit is
+    2 mm. The standard deviation of the measured distance is added to all distances, as the same part of each."""
     arena = ring(wand=LIGHT)
     messages = record(arena, 20.0, sigma_px=0.1, sized=False)
-    true = apart(arena, "cam0", "cam2")
+    true = true_distance(arena, "cam0", "cam2")
     exact, rough = (
         calibrate(arena.intrinsics, LIGHT, messages, Distance("cam0", "cam2", true, sigma))
         for sigma in (0.0, 0.02)
@@ -45,14 +44,14 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
     assert exact.report.metric
     assert_near(exact.rig, arena.truth, 2e-3, 1e-3)
     for a, b in combinations(exact.names, 2):
-        wanted = Distance(a, b, apart(arena, a, b), 0.0)
-        sure, loose = (compare(wanted, told.names, told.adjusted) for told in (exact, rough))
-        assert sure is not None
-        assert loose is not None
-        added = np.sqrt(loose.sigma_m**2 - sure.sigma_m**2)
-        assert added == pytest.approx(0.02 * sure.by_wand_m / true, rel=1e-3)
+        wanted = Distance(a, b, true_distance(arena, a, b), 0.0)
+        small, large = (compare_distance(wanted, result.names, result.adjusted) for result in (exact, rough))
+        assert small is not None
+        assert large is not None
+        added = np.sqrt(large.sigma_m**2 - small.sigma_m**2)
+        assert added == pytest.approx(0.02 * small.by_wand_m / true, rel=1e-3)
     assert rough.report.as_dict()["distance"]["metres"] == true
-    sized = record(arena, 12.0, sigma_px=0.1)  # a roundel's size, a tenth off, gives way
+    sized = record(arena, 12.0, sigma_px=0.1)  # the distance overrides a size that is 10 % off
     wrong = Body(diameter_m=0.11)
     by_tape = calibrate(arena.intrinsics, wrong, sized, Distance("cam0", "cam2", true))
     assert_near(by_tape.rig, arena.truth, 5e-3, 2e-3)
@@ -60,46 +59,51 @@ def test_a_light_and_a_distance_give_metres_as_well_as_is_known():
 
 @pytest.mark.parametrize("off", [EXACT, OLD])
 def test_halves_of_a_light_are_compared_by_their_shape(off: tuple[float, float, float]):
-    """Each half sets its two farthest cameras 1 m apart, and these are not the same ones in both; and a distance that
-    is exact changes, by the square of a turn, by more than its own deviation: it told 10^4 times too large a
-    difference. Chi-square, summed over waves, lies below its 99.9 % quantile."""
-    found = [shape_apart(seed, off) for seed in (20, 21, 23)]
-    assert all(told.degrees == 6 * 4 - 7 for told in found)
-    assert sum(told.chi2 for told in found) < chi2.ppf(0.999, sum(told.degrees for told in found))
+    """Each half sets its two farthest cameras 1 m apart, not the same ones in both: the scales are aligned before the
+    test. Chi-square, summed over recordings, is below its 99.9 % quantile."""
+    found = [compare_halves(seed, off) for seed in (20, 21, 23)]
+    assert all(agreement.degrees == 6 * 4 - 7 for agreement in found)
+    assert sum(a.chi2 for a in found) < chi2.ppf(0.999, sum(a.degrees for a in found))
 
 
-def test_halves_of_a_light_that_differ_in_shape_are_told():
-    """A camera that was moved by 2 cm between the halves of its wave."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21)
-    recorded = record_wave(wave)
+def test_a_camera_of_a_light_that_moved_is_named():
+    """One camera moved by 2 cm between the halves of the recording."""
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21
+    )
+    recorded = record_wave(scenario)
     first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split(recorded.messages))
-    moved = placed(second)
-    moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # of 6 m, that are 1 here
-    told = compare_rigs(placed(first), moved)
-    assert not told.holds
-    assert told.guilty == "cam02"
+    moved = CameraPoses.of_calibration(second)
+    moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # the scale: 6 m are 1 here
+    agreement = compare_calibrations(CameraPoses.of_calibration(first), moved)
+    assert not agreement.holds
+    assert agreement.moved == "cam02"
 
 
-def shape_apart(seed: int, off: tuple[float, float, float]) -> Agreement:
-    """How the halves of 6 s differ."""
-    wave = Wave(cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed)
-    recorded = record_wave(wave)
+def compare_halves(seed: int, off: tuple[float, float, float]) -> Agreement:
+    """Compare the halves, of 6 s each, of a recording of a light."""
+    scenario = WandScenario(
+        cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=seed
+    )
+    recorded = record_wave(scenario)
     rig = roughly(recorded.intrinsics, off, seed=seed)
-    return compare_rigs(*(placed(calibrate(rig, LIGHT, half)) for half in split(recorded.messages)))
+    return compare_calibrations(
+        *(CameraPoses.of_calibration(calibrate(rig, LIGHT, half)) for half in split(recorded.messages))
+    )
 
 
-def test_a_wand_that_knows_metres_is_compared():
-    """A true distance is within three sigmas; one that is 2 % off is told, as a part of it, with its sign."""
+def test_a_distance_is_compared_with_the_wand():
+    """The true distance agrees within three standard deviations; one that is 2 % off causes a warning with its size."""
     arena = ring()
-    messages, true = record(arena, 6.0, sigma_px=0.1), apart(arena, "cam0", "cam1")
+    messages, true = record(arena, 6.0, sigma_px=0.1), true_distance(arena, "cam0", "cam1")
     plain = calibrate(arena.intrinsics, arena.wand, messages)
     for given, warned in ((true, False), (1.02 * true, True)):
         result = calibrate(arena.intrinsics, arena.wand, messages, Distance("cam0", "cam1", given))
-        told = result.report.compared
-        assert told is not None
-        assert told.sentence().startswith("warning: ") == warned
-        assert_near(result.rig, plain.rig, 1e-12, 1e-7)  # what rounding leaves
-        assert told.off_m / given == pytest.approx(true / given - 1, abs=1e-3)
+        compared = result.report.compared
+        assert compared is not None
+        assert compared.sentence().startswith("warning: ") == warned
+        assert_near(result.rig, plain.rig, 1e-12, 1e-7)  # rounding
+        assert compared.difference_m / given == pytest.approx(true / given - 1, abs=1e-3)
 
 
 def test_faults_are_named(tmp_path: Path):
@@ -123,7 +127,7 @@ def test_faults_are_named(tmp_path: Path):
         ("cam0 cam1 nan", "is nan m; it must be above 0"),
         ("cam0 cam0 1", "names camera 'cam0' twice"),
         ("cam0 cam1 2 --distance-sigma -1", "must be 0 or more"),
-        ("cam0 cam3 3", "gives no scale, as camera 'cam3' has no place"),
+        ("cam0 cam3 3", "gives no scale, because camera 'cam3'"),
     ):
         with pytest.raises(CalibrationError, match=fault):
             execute([*options, "--distance", *words.split()])
@@ -135,12 +139,13 @@ def test_faults_are_named(tmp_path: Path):
     assert np.linalg.norm(places[0] - places[1]) == pytest.approx(2, abs=1e-6)
 
 
-def test_a_check_and_the_trials_of_a_live_wave_know_the_distance(tmp_path: Path):
-    """By a light and a distance both foretell millimetres; without it there are none."""
+def test_check_and_the_trials_of_a_session_use_the_distance(tmp_path: Path):
+    """Both predict errors in millimetres for a light with a distance, and none without."""
     arena = ring(3, wand=LIGHT)
-    messages, true = record(arena, 20.0, sigma_px=0.1, sized=False), apart(arena, "cam0", "cam1")
-    told = Distance("cam0", "cam1", true)
-    given, missing = (try_part(arena.intrinsics, LIGHT, d, messages, 1.0) for d in (told, None))
+    messages, true = record(arena, 20.0, sigma_px=0.1, sized=False), true_distance(arena, "cam0", "cam1")
+    measured = Distance("cam0", "cam1", true)
+    sessions = [WandSession(rig=arena.intrinsics, wand=LIGHT, distance=d) for d in (measured, None)]
+    given, missing = (compute_trial(session, messages, 1.0) for session in sessions)
     assert given.expected_mm is not None
     assert missing.expected_mm is None
     save_rig(arena.intrinsics, tmp_path / "rig.yaml")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The detector on rendered images: right, honest about how right, and silent where there is no roundel."""
+"""The detector on rendered images: accurate, with a consistent covariance, and without false positives."""
 
 import cv2
 import numpy as np
@@ -22,12 +22,12 @@ def rng(seed: int = 1) -> np.random.Generator:
 @pytest.mark.parametrize("diameter", [14, 24, 40])
 @pytest.mark.parametrize("tilt_deg", [0, 30, 50])
 @pytest.mark.parametrize("blur", [0.5, 1.0])
-def test_without_noise_only_rounding_remains(diameter: float, tilt_deg: float, blur: float):
-    """Centre within 0.02 px (rounding to grey levels is noise of 0.29), axes within 1.5 %, ratio within 0.02."""
+def test_without_noise_only_rounding_errors_remain(diameter: float, tilt_deg: float, blur: float):
+    """Centre within 0.02 px (rounding to grey levels has a standard deviation of 0.29), axes 1.5 %, ratio 0.02."""
     for u, v in rng().uniform(50, 70, (3, 2)):
         disc = Disc((u + 20, v), diameter, np.radians(tilt_deg), turn=0.7)
         if diameter * np.cos(disc.tilt) < 5.5 + 8 * blur:
-            continue  # the card's margin, a seventh of this, drowns in the blur
+            continue  # blur hides the card's margin, a seventh of this
         (found,) = Detector().detect(expose(render([disc], blur=blur), 0, rng()))
         centre, axes = outer_conic(disc, PRINCIPAL)
         assert np.abs(found.uv - centre).max() < 0.02
@@ -35,10 +35,10 @@ def test_without_noise_only_rounding_remains(diameter: float, tilt_deg: float, b
         assert abs(found.ratio - 0.6) < 0.02
 
 
-def test_reported_covariance_is_honest():
-    """Squared Mahalanobis errors have mean 2, and variance 4 / n over n = 200 frames: sigma 0.14, four are allowed.
+def test_reported_covariance_is_consistent():
+    """Squared Mahalanobis errors have mean 2; the mean of 200 has the standard deviation 0.14, four are allowed.
 
-    A quarter more is granted to the model, which is a first order one at these 16 px.
+    A quarter more is allowed for the first-order model at 16 px.
     """
     generator, squared = rng(), []
     for turn in np.linspace(0, 3, 10):
@@ -51,20 +51,21 @@ def test_reported_covariance_is_honest():
     assert 2 - 0.56 < np.mean(squared) < 2 * 1.25 + 0.56
 
 
-def test_the_inner_ellipse_tells_the_discs_own_centre():
-    """At 60 px and 45 degrees they are 1 px apart; the measured offset is right within four of its sigmas."""
+def test_the_inner_ellipse_gives_the_centre_of_the_disc():
+    """At 60 px and 45 degrees it is 1 px from the ellipse's centre; the measured offset is within four sigmas."""
     disc = Disc((80.2, 60.4), 60, np.radians(45), turn=0.4)
-    detector = Detector()
-    (found,) = detector.detect(expose(render([disc]), 1, rng()))
-    offset, cov = (column[0] for column in detector.disc_offsets())
+    (found,) = Detector().detect(expose(render([disc]), 1, rng()))
+    offset, cov = found.offset_px, found.pose_cov
+    assert offset is not None
+    assert cov is not None
     error = found.uv + offset - disc.uv
     assert np.linalg.norm(offset) > 0.5
     from_centre = cov[:2, :2] + cov[:2, 5:] + cov[5:, :2] + cov[5:, 5:]
     assert error @ np.linalg.solve(from_centre, error) < 16 + 2
 
 
-def test_half_shadow_and_a_gradient():
-    """A light that falls to a quarter across the image, and a shadow over every second roundel."""
+def test_shadow_and_gradient():
+    """The light decreases to 0.4 across the image, and a shadow halves it in a part."""
     discs = [Disc((25 + 45 * i, 25 + 40 * j), 22) for i in range(3) for j in range(2)]
     light = np.tile(np.linspace(1, 0.4, 160), (120, 1))
     light[:, 48:92] *= 0.5
@@ -72,7 +73,7 @@ def test_half_shadow_and_a_gradient():
     assert len(found) == 6
 
 
-def test_many_roundels_touch_nothing_else():
+def test_adjacent_roundels_do_not_disturb_each_other():
     discs = [Disc((20 + 24 * i, 20 + 24 * j), 14) for i in range(6) for j in range(4)]
     found = Detector().detect(expose(render(discs), 2, rng()))
     apart = np.linalg.norm(found.uv[:, None] - [disc.uv for disc in discs], axis=2)
@@ -81,12 +82,12 @@ def test_many_roundels_touch_nothing_else():
 
 
 @pytest.mark.parametrize("ratio", [0.6, 0.41, 0.35])
-def test_both_common_prints_are_found_unasked(ratio: float):
+def test_the_common_prints_are_found_by_default(ratio: float):
     assert len(Detector().detect(expose(render([Disc((80, 60), 30, ratio=ratio)]), 2, rng()))) == 1
 
 
-def test_a_roundel_on_a_dark_round_plate_is_one():
-    """One dark ring around a card is what it stands on; two are a bullseye."""
+def test_a_roundel_on_a_dark_round_plate_is_found():
+    """One dark ring around a card may be a plate below it; two make a bullseye."""
     card = render([Disc((80, 60), 30)], ground=40)
     v, u = np.mgrid[:120, :160]
     plate = np.where(np.hypot(u - 80, v - 60) < 30, card, 150)
@@ -120,7 +121,7 @@ def letters(image: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("draw", [bullseye, small_dot, tag_in_disc, square, letters])
-def test_what_is_no_roundel_is_not_found(draw):
+def test_other_shapes_are_not_found(draw):
     image = np.full((120, 160), 190, np.uint8)
     draw(image)
     for blur in (0.5, 1.0):
@@ -132,7 +133,7 @@ def test_what_is_no_roundel_is_not_found(draw):
 @pytest.mark.parametrize("blur", [0.0, 0.4, 0.7])
 @pytest.mark.parametrize("radius", [8, 12, 20, 40, 80, 150])
 def test_drawn_circles_are_found(line: int, blur: float, radius: int):
-    """A person's first picture: edges as hard as the pixel grid, right to the half pixel that drawing rounds by."""
+    """Circles drawn by OpenCV, with edges as sharp as the pixel grid; drawing rounds them to half a pixel."""
     image = np.full((480, 640), 220, np.uint8)
     cv2.circle(image, (320, 240), radius, 20.0, -1, line)
     cv2.circle(image, (320, 240), round(0.6 * radius), 220.0, -1, line)
@@ -144,7 +145,7 @@ def test_drawn_circles_are_found(line: int, blur: float, radius: int):
 
 
 def test_clutter_that_touches_the_card_costs_no_accuracy():
-    """A bright and a dark bar across the surround: the centre stays within 0.05 px, a few of its sigmas."""
+    """A bright and a dark bar across the surround: the error of the centre is below 0.05 px, a few sigmas."""
     disc = Disc((80.3, 59.8), 24, 0.5, 0.3)
     image = render([disc], blur=0)
     image[:, 95:99] = 250
@@ -165,13 +166,13 @@ def test_a_track_stays_with_its_roundel():
     assert far.track[0] not in numbers[0]
 
 
-def test_a_masked_roundel_is_left_out():
+def test_a_masked_roundel_is_discarded():
     image = expose(render([Disc((40, 60), 20), Disc((120, 60), 20)]), 2, rng())
     found = Detector(mask=[[(0, 0), (80, 0), (80, 119), (0, 119)]]).detect(image)
     assert found.uv[:, 0] == pytest.approx([120], abs=0.1)
 
 
-def test_any_layout_of_memory_gives_the_same():
+def test_the_result_does_not_depend_on_the_memory_layout():
     image = expose(render([Disc((80, 60), 20, 0.4)]), 2, rng())
     wide = np.zeros((240, 400), np.uint8)
     wide[::2, 100:260] = image
@@ -187,8 +188,8 @@ def test_any_layout_of_memory_gives_the_same():
     seed=st.integers(0, 1000),
     levels=st.sampled_from([1, 2, 256]),
 )
-def test_no_image_is_too_odd(height: int, width: int, seed: int, levels: int):
-    """Any size from 0 x 0; constant, black and white, or random pixels."""
+def test_any_image_gives_finite_results(height: int, width: int, seed: int, levels: int):
+    """Sizes from 0 x 0; constant, black and white, or random pixels."""
     image = rng(seed).integers(0, levels, (height, width)).astype(np.uint8) * np.uint8(255 // levels)
     found = Detector(min_contrast=5).detect(image)
     assert np.isfinite(found.uv).all()
@@ -213,14 +214,14 @@ def test_a_wrong_setting_is_refused(wrong: dict):
         Detector(**wrong)
 
 
-def test_only_grey_images_are_taken():
+def test_an_image_that_is_not_grey_is_refused():
     with pytest.raises(ValueError, match="grey"):
         Detector().detect(np.zeros((4, 4, 3), np.uint8))
 
 
-def test_theta_converges_to_half_between_the_levels():
-    """Section III-B: theta = (m_d + m_b) / 2 after one frame, to the fit's own precision; it steps when all is lost."""
-    detector = Detector()
+def test_theta_of_the_papers_detector():
+    """Section III-B: theta = (m_d + m_b) / 2 after one frame, within a level; it steps while nothing is found."""
+    detector = Detector(detector="paper")
     detector.detect(expose(render([Disc((80, 60), 40)]), 1, rng()))
     assert detector.threshold == pytest.approx((40 + 190) / 2, abs=1)
     flat = np.full((120, 160), 90, np.uint8)
@@ -233,8 +234,14 @@ def test_theta_converges_to_half_between_the_levels():
     assert 224 <= max(steps) < 256
 
 
+def test_only_the_papers_detector_has_a_threshold():
+    detector = Detector()
+    detector.detect(expose(render([Disc((80, 60), 40)]), 1, rng()))
+    assert detector.threshold is None
+
+
 def test_distance_by_the_principal_axis():
-    """Section III-C: of any tilt, the major axis in the normalised plane gives the distance; exact when frontal."""
+    """Section III-C: at any tilt the major axis in the normalized plane gives the distance; exact for frontal discs."""
     for tilt in np.radians([0, 30, 60]):
         disc = Disc((79.5, 59.5), 30, tilt)
         major = outer_conic(disc, PRINCIPAL)[1][0] / disc.f
@@ -244,8 +251,8 @@ def test_distance_by_the_principal_axis():
         _core.distance_by_principal_axis(0.1, 0.0)
 
 
-def test_a_known_roundel_may_be_covered_in_part():
-    """A bar as bright as paper over the outer fifth: a letter might look so, but not one of the last frame."""
+def test_a_known_roundel_may_be_partly_occluded():
+    """A bar as bright as paper covers the outer fifth. A new ring of this shape is rejected as a letter."""
     disc = Disc((80.3, 59.8), 36, 0.3, 0.4)
     clean = render([disc], blur=0)
     covered = clean.copy()

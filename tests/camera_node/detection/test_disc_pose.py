@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Both poses of a disc, out of one ellipse."""
+"""The two poses of a disc that explain one ellipse."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def project_circle(lens: Lens, centre: np.ndarray, normal: np.ndarray, radius: f
 @pytest.mark.parametrize(("lens", "tolerance_m"), [(PINHOLE, 1e-9), (WIDE, 2e-3)])
 @pytest.mark.parametrize("tilt", [0.0, 0.3, 1.0])
 def test_one_of_the_two_is_the_true_pose(lens: Lens, tolerance_m: float, tilt: float):
-    """Exact in a pinhole; a circle's image through distortion is no ellipse: 0.1 % of 2 m for a disc of 0.1 m."""
+    """Exact for a pinhole. A distorted image of a circle is not an ellipse: 0.1 % of 2 m for a disc of 0.1 m."""
     for turn in (0.0, 1.0, 4.0):
         normal = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
         centre = np.array([0.3, -0.2, 2.0])
@@ -50,15 +50,13 @@ def test_one_of_the_two_is_the_true_pose(lens: Lens, tolerance_m: float, tilt: f
         assert sum(pose.probability for pose in poses) == pytest.approx(1)
 
 
-def test_a_measured_offset_settles_the_normal():
-    """At 60 px and 40 degrees the centres of the two poses are 2 px apart: many sigmas."""
+def test_a_measured_offset_determines_the_normal():
+    """At 60 px and 40 degrees the centres of the two poses are 2 px apart: many standard deviations."""
     lens = Lens(width=160, height=120, fx=600, fy=600, cx=79.5, cy=59.5)
     for turn in (0.4, 2.0, 5.0):
         disc = Disc((82, 61), 60, np.radians(40), turn)
-        detector = Detector()
-        (found,) = detector.detect(expose(render([disc]), 2, np.random.default_rng(3)))
-        offsets, covs = detector.disc_offsets()
-        poses = locate(found, lens, 0.1, (offsets[0], covs[0]))
+        (found,) = Detector().detect(expose(render([disc]), 2, np.random.default_rng(3)))
+        poses = locate(found, lens, 0.1)
         assert poses is not None
         assert poses[0].probability > 0.99
         assert poses[0].normal @ disc.normal > np.cos(np.radians(2))
@@ -70,8 +68,8 @@ def columns(roundels: list[Roundel]) -> Roundels:
     return Roundels(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def test_all_roundels_at_once_are_each_one():
-    """The same as one by one, to rounding; what the lens can't see has no pose and spoils no other's."""
+def test_locate_all_agrees_with_locate():
+    """Within rounding. A roundel outside of the lens's field of view has no pose and does not affect the others."""
     normals = [np.array([s, 0.1, -np.sqrt(0.99 - s * s)]) for s in (0.0, 0.3, 0.8)]
     seen = [project_circle(WIDE, np.array([0.1, 0.2, 2.0]), n, 0.05) for n in normals]
     far = Roundel(np.array([9e4, 9e4]), np.eye(2), np.array([10.0, 9.0]), 0.0, 0.6, 100.0)
@@ -92,11 +90,11 @@ DEMO = {"fx": 566.4, "fy": 566.1, "distortion": (-0.112, 0.031, 0.0004, -0.0003,
 
 @pytest.mark.parametrize("at", [(322.0, 237.0), (80.0, 80.0)])
 @pytest.mark.parametrize("tilt_deg", [20, 50])
-def test_through_the_demos_lens_nothing_is_biased(at: tuple[float, float], tilt_deg: float):
-    """Distance within 0.05 %, and where the disc's centre projects within 0.01 px, plus three sigmas of the mean.
+def test_poses_through_the_demos_lens_are_unbiased(at: tuple[float, float], tilt_deg: float):
+    """Distance within 0.05 % and the image of the disc's centre within 0.01 px, plus three sigmas of the mean.
 
-    Ray-traced through the lens in the middle and near a corner; at 40 px the noise of one grey level moves the
-    distance of one view by 0.01 % and the centre by 0.002 px.
+    The images are ray-traced through the lens, at the centre and near a corner. At 40 px noise of one grey level makes
+    errors of 0.01 % of the distance and 0.002 px of the centre.
     """
     rng, distance, centre = np.random.default_rng(4), [], []
     for turn in rng.uniform(0, 2 * np.pi, 6):
@@ -104,10 +102,8 @@ def test_through_the_demos_lens_nothing_is_biased(at: tuple[float, float], tilt_
         lens = Lens(width=80, height=80, cx=cx, cy=cy, **DEMO)
         uv = (40 + rng.uniform(-0.5, 0.5), 40 + rng.uniform(-0.5, 0.5))
         sight = Sight(lens, uv, pixels_across(lens, 0.1, 40), tilt=np.radians(tilt_deg), turn=turn)
-        detector = Detector()
-        (found,) = detector.detect(expose(trace(sight, 4), 1, rng))
-        offsets, covs = detector.disc_offsets()
-        poses = locate(found, lens, 0.1, (offsets[0], covs[0]))
+        (found,) = Detector().detect(expose(trace(sight, 4), 1, rng))
+        poses = locate(found, lens, 0.1)
         assert poses is not None
         assert poses[0].normal @ sight.normal > np.cos(np.radians(1))
         distance.append(np.linalg.norm(poses[0].position_m) / np.linalg.norm(sight.position) - 1)
@@ -118,8 +114,8 @@ def test_through_the_demos_lens_nothing_is_biased(at: tuple[float, float], tilt_
     assert np.abs(np.mean(centre, axis=0)).max() < 0.01 + 3 * 0.002 / np.sqrt(6)
 
 
-def test_the_normal_is_right_where_it_is_said_to_be():
-    """Of views said to be surer than 99 %, one in a hundred may be wrong: of 300 views, 3, and 5 sigmas more."""
+def test_the_probability_of_the_normal_is_consistent():
+    """Of normals with a probability above 0.99 one in a hundred may be wrong: 3 of 300, plus five sigmas."""
     rng, wrong = np.random.default_rng(5), 0
     lens = Lens(width=44, height=44, fx=600, fy=600, cx=60, cy=-20)
     for turn in rng.uniform(0, 2 * np.pi, 15):
@@ -133,9 +129,9 @@ def test_the_normal_is_right_where_it_is_said_to_be():
         )
         clean = trace(sight)
         for _ in range(20):
-            detector = Detector()
-            (found,) = detector.detect(expose(clean, 3, rng))
-            poses = locate_all(columns([found]), lens, 0.1, detector.disc_offsets())[0]
+            found = Detector().detect(expose(clean, 3, rng))
+            assert len(found) == 1
+            poses = locate_all(found, lens, 0.1)[0]
             assert poses is not None
             right, other = (pose.normal @ sight.normal for pose in poses)
             wrong += poses[0].probability > 0.99 and right < other
@@ -146,7 +142,7 @@ def test_the_normal_is_right_where_it_is_said_to_be():
 @pytest.mark.parametrize("diameter_m", [0.1, 0.6])
 @pytest.mark.parametrize("place", [(0.0, 0.0, 2.0), (0.8, -0.5, 2.0)])
 def test_distance_by_the_principal_axis(tilt: float, diameter_m: float, place: tuple):
-    """Right to the fourth order in d_o / L at any slant and place; uncorrected it is off by the second order."""
+    """The error is of fourth order in d_o / L at any slant and position, and of second order uncorrected."""
     centre = np.array(place)
     normal = np.array([0.6 * np.sin(tilt), 0.8 * np.sin(tilt), -np.cos(tilt)])
     roundel, L = project_circle(PINHOLE, centre, normal, diameter_m / 2), float(np.linalg.norm(centre))
@@ -159,13 +155,13 @@ def test_distance_by_the_principal_axis(tilt: float, diameter_m: float, place: t
         )
 
 
-def test_an_ellipse_that_the_lens_can_not_see_has_no_pose():
+def test_an_ellipse_outside_of_the_field_of_view_has_no_pose():
     far = Roundel(np.array([9e4, 9e4]), np.eye(2), np.array([10.0, 9.0]), 0.0, 0.6, 100.0)
     assert locate(far, WIDE, 0.1) is None
     assert np.isnan(distance_by_principal_axis(far, WIDE, 0.1))
 
 
-def test_the_renderer_knows_its_ellipse():
+def test_the_renderers_ellipse():
     """A frontal disc on the axis is a circle of its diameter."""
     centre, axes = outer_conic(Disc((79.5, 59.5), 30), np.array([79.5, 59.5]))
     assert centre == pytest.approx([79.5, 59.5])

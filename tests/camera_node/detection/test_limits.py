@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the detector reaches (a part of `python -m tests.benchmarks.detector`), and that chords and paper agree."""
+"""The detector against its goals (a part of `python -m tests.benchmarks.detector`); agreement of both detectors."""
 
 import numpy as np
 import pytest
@@ -19,9 +19,7 @@ from tests.camera_node.tracing import Sight, pixels_across
 
 RUN = Run("chords", Detector, False)
 VIEWS, DRAWS = 4, 40
-CHANCE = 1 + 4 / np.sqrt(
-    2 * VIEWS * DRAWS
-)  # four sigmas of an RMS of so many errors; the centre has twice as many
+CHANCE = 1 + 4 / np.sqrt(2 * VIEWS * DRAWS)  # four sigmas of the RMS of so many errors
 
 
 @pytest.mark.parametrize(
@@ -49,33 +47,33 @@ def errors(request: pytest.FixtureRequest) -> Errors:
     return measure_cell(RUN, Cell(*request.param), VIEWS, DRAWS)
 
 
-def test_the_centre_is_as_good_as_an_unknown_lens_allows(errors: Errors):
-    """The goal, 1.15 times the bound, and four sigmas."""
+def test_the_centre_is_near_the_bound_for_an_unknown_lens(errors: Errors):
+    """The goal is 1.15 times the bound; four sigmas are added."""
     assert errors.found == 1
     assert errors.detected < 1.15 * CHANCE
 
 
 def test_the_distance_is_near_its_bound_and_unbiased(errors: Errors):
-    """The goals, 1.5 times the bound and 0.05 %, and chance."""
+    """The goals are 1.5 times the bound and 0.05 %; four and three sigmas are added."""
     assert errors.distance < 1.5 * CHANCE
     assert not errors.biased
 
 
-def test_the_reported_covariance_is_honest(errors: Errors):
-    """Chi-square over its two degrees: 1 within 4 sigmas (1 / sqrt of the number each), and a fifth for the model."""
+def test_the_reported_covariance_is_consistent(errors: Errors):
+    """Half the squared Mahalanobis error has mean 1: within four sigmas, plus a fifth for the model."""
     assert abs(errors.chi2 - 1) < 0.2 + 4 / np.sqrt(VIEWS * DRAWS)
 
 
 @pytest.mark.parametrize(
     ("ground", "tilt", "diameter"), [("white", 0, 9), ("white", 45, 12), ("clutter", 0, 16), ("dark", 0, 12)]
 )
-def test_small_ones_are_found_on_the_first_frame(ground: str, tilt: int, diameter: int):
-    """99 of 100; of 120 that leaves 1.2, and four sigmas of it."""
+def test_small_roundels_are_found_on_the_first_frame(ground: str, tilt: int, diameter: int):
+    """The goal is 99 %: of 120 roundels 1.2 may be missed, plus four sigmas."""
     assert recall(RUN, 2, of_size(ground, diameter, tilt)) > 1 - (1.2 + 4 * np.sqrt(1.2)) / 120
 
 
-def test_faint_ones_are_found():
-    """95 of 100, less four sigmas of 90."""
+def test_faint_roundels_are_found():
+    """The goal is 95 %, less four sigmas of 90 roundels."""
     assert recall(RUN, 3, faint) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 90)
 
 
@@ -85,7 +83,7 @@ def test_nothing_is_found_in_clutter():
 
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
-    """One to four roundels apart from each other, their bright level, the blur and a seed for the noise."""
+    """One to four separate roundels, their bright level, the blur and a seed for the noise."""
     places = draw(
         st.lists(
             st.sampled_from([(40.0, 30.0), (120.0, 30.0), (40.0, 90.0), (120.0, 90.0)]),
@@ -108,11 +106,11 @@ def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(scenes())
-def test_both_detectors_see_the_same(scene: tuple[list[Disc], float, float, int]):
-    """Every roundel is found by both, where it is; their fits start elsewhere and end at the same place.
+def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
+    """Both find every roundel; their fits have different initial guesses and the same result.
 
-    Within a sigma of each other, as a one-step estimate does not depend on its start to first order; and within four
-    sigmas, and the 0.02 px of rounding, of the truth.
+    Their difference is below one sigma (a one-step estimate does not depend on its initial guess to first order), and
+    their errors below four sigmas plus 0.02 px for rounding.
     """
     discs, bright, blur, seed = scene
     image = expose(render(discs, bright=bright, blur=blur), 2, np.random.default_rng(seed))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Roundels that move during the exposure: followed from frame to frame, and as sure as they say.
+"""Roundels that move during the exposure: they are tracked and found, with a consistent covariance.
 
-The pictures are means of many sharp ones (`rendering.render`), so nothing is shared with the fit's own mean.
+The images are means of many sharp ones (`rendering.render`), independent of the averaged model of the fit.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ PRINCIPAL = np.array([(SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2])
 DIAMETER = 32.0
 START = (34.0, 38.0)
 AT = (45.3, 34.8)  # in mid-exposure
-PART = 1.0  # pixels of motion from one sharp picture to the next
+PART = 1.0  # pixels of motion from one sharp image to the next
 
 
 def exposed(length: float, turn: float, tilt: float, ground: float) -> np.ndarray:
@@ -28,11 +28,11 @@ def exposed(length: float, turn: float, tilt: float, ground: float) -> np.ndarra
 
 
 @pytest.mark.parametrize("length", [12.0, 24.0])
-def test_they_are_followed_with_an_honest_covariance(length: float):
-    """Found in all of 6 directions; squared Mahalanobis errors have mean 2, and variance 4 / n over n = 96 frames.
+def test_moving_roundels_are_tracked_with_a_consistent_covariance(length: float):
+    """They are found in six directions; squared Mahalanobis errors have mean 2, and four sigmas of the mean are 0.82.
 
-    Four sigmas are 0.82. The renderer's pieces of an eighth of a pixel, and its view, which changes on the way (by a
-    fiftieth radian), are granted a quarter.
+    A quarter more is allowed for the renderer: for its resolution of an eighth of a pixel, and for the view, which
+    changes by 0.02 rad during the motion.
     """
     rng, squared = np.random.default_rng(11), []
     for k, turn in enumerate(np.pi * np.arange(6) / 6):
@@ -51,24 +51,24 @@ def test_they_are_followed_with_an_honest_covariance(length: float):
 
 
 @pytest.mark.parametrize("length", [12.0, 24.0])
-def test_they_are_found_on_the_first_frame_with_an_honest_covariance(length: float):
-    """In twelve directions, by a detector that has seen nothing before, 95 of 100; squared errors are as above."""
-    rng, squared, shown = np.random.default_rng(12), [], 0
+def test_moving_roundels_are_found_on_the_first_frame_with_a_consistent_covariance(length: float):
+    """A new detector finds 95 % in twelve directions; the limits on squared errors are those of tracked roundels."""
+    rng, squared, n_frames = np.random.default_rng(12), [], 0
     for k, turn in enumerate(np.pi * np.arange(12) / 12):
         tilt, ground = (0.0, 0.3, 0.6)[k % 3], (190.0, 90.0)[k % 2]
         clean = exposed(length, turn, tilt, ground)
         centre = outer_conic(Disc(AT, DIAMETER, tilt, turn=1.0), PRINCIPAL)[0]
         for _ in range(8):
-            shown += 1
+            n_frames += 1
             for found in Detector().detect(expose(clean, 3, rng)):
                 error = found.uv - centre
                 squared.append(error @ np.linalg.solve(found.cov, error))
-    assert len(squared) >= 0.95 * shown
+    assert len(squared) >= 0.95 * n_frames
     assert 2 - 0.82 < np.mean(squared) < 2 + 0.82 + 0.25
 
 
-def test_a_new_one_is_found_whatever_its_direction():
-    """Where all of the frame changed, in that frame; by halves of the rows, in two."""
+def test_a_new_moving_roundel_is_found_in_both_diagonal_directions():
+    """In the first frame; with a search share of a half, within two frames."""
     rng, plain = np.random.default_rng(6), np.full(SIZE, 190.0)
     for share in (1.0, 0.5):
         for turn in (np.pi / 4, 3 * np.pi / 4):
@@ -77,8 +77,8 @@ def test_a_new_one_is_found_whatever_its_direction():
             assert any(len(detector.detect(expose(clean, 3, rng))) for _ in range(round(1 / share)))
 
 
-def test_size_and_contrast_are_those_of_a_sharp_picture():
-    """Axes within 1 %, contrast within 3 %: a smear of 20 px spreads a ring of 6 px over three times its area."""
+def test_size_and_contrast_are_those_of_a_sharp_image():
+    """Axes within 1 %, contrast within 3 %, although a motion of 20 px spreads a ring of 6 px over thrice its area."""
     detector, rng = Detector(), np.random.default_rng(4)
     detector.detect(expose(render([Disc(START, DIAMETER, 0.4, turn=1.0)], SIZE), 2, rng))
     (found,) = detector.detect(expose(exposed(20.0, 0.7, 0.4, 90.0), 2, rng))
@@ -89,7 +89,7 @@ def test_size_and_contrast_are_those_of_a_sharp_picture():
 
 
 @pytest.mark.parametrize("ground", [60.0, 190.0])
-def test_one_that_goes_away_is_not_found_in_noise(ground: float):
+def test_a_roundel_that_disappears_is_not_found_in_noise(ground: float):
     detector, rng = Detector(), np.random.default_rng(5)
     assert len(detector.detect(expose(render([Disc(START, DIAMETER)], SIZE, ground=ground), 3, rng))) == 1
     assert len(detector.detect(expose(np.full(SIZE, ground), 3, rng))) == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Roundels that something covers in part: where they are is right and honest, or they are not found."""
+"""Partly occluded roundels: they are found with a consistent covariance, or not at all."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundel
 from tests.benchmarks.detector.negatives import print_letters, rings
 from tests.benchmarks.detector.pictures import Card, flat, grid, paste
-from tests.benchmarks.detector.recall import covered, recall
+from tests.benchmarks.detector.recall import occluded, recall
 from tests.benchmarks.detector.table import Run
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])
-SHARES = np.arange(-0.1, 0.45, 0.05)  # of the diameter that is covered, from the rim
+SHARES = np.arange(-0.1, 0.45, 0.05)  # of the diameter that is occluded, from the rim
 NOISE = 2.5
-MODEL_PX = 0.02  # what is granted to the model where a cover of nearly the paper's level touches the rim
+MODEL_PX = 0.02  # allowed model error, if an occluding object of nearly the paper's level touches the rim
 
 
 @dataclass(frozen=True)
 class Step:
-    """A roundel of which a share is covered, as it was found; None where it was not."""
+    """The detection of a roundel of which a share is occluded; None if it was not found."""
 
     share: float
     error: Array | None = None
@@ -32,14 +32,14 @@ class Step:
 
     @property
     def squared(self) -> float:
-        """Squared Mahalanobis distance from the truth, the model's part granted."""
+        """Squared Mahalanobis error, with the allowed model error."""
         assert self.error is not None
         assert self.cov is not None
         return float(self.error @ np.linalg.solve(self.cov + MODEL_PX**2 * np.eye(2), self.error))
 
 
-def cover(clean: Array, disc: Disc, share: float, turn: float, level: float) -> Array:
-    """All that lies beyond a straight edge becomes `level`; the edge takes `share` of the diameter from the rim."""
+def occlude(clean: Array, disc: Disc, share: float, turn: float, level: float) -> Array:
+    """Set the image beyond a straight edge to `level`; `share` of the diameter lies beyond the edge."""
     v, u = np.mgrid[: clean.shape[0], : clean.shape[1]]
     centre, _ = outer_conic(disc, PRINCIPAL)
     along = (u - centre[0]) * np.cos(turn) + (v - centre[1]) * np.sin(turn)
@@ -47,13 +47,13 @@ def cover(clean: Array, disc: Disc, share: float, turn: float, level: float) -> 
     return cv2.GaussianBlur(clean + part * (level - clean), (0, 0), 0.7)
 
 
-def creep_over(disc: Disc, turn: float, level: float, rng: np.random.Generator) -> list[Step]:
-    """What a detector that knows the roundel finds, while a cover comes over it."""
+def occlude_slowly(disc: Disc, turn: float, level: float, rng: np.random.Generator) -> list[Step]:
+    """The detections of a tracked roundel while an object occludes more and more of it."""
     detector, clean, steps = Detector(), render([disc], blur=0), []
     centre, _ = outer_conic(disc, PRINCIPAL)
-    detector.detect(expose(cover(clean, disc, -1, turn, level), NOISE, rng))
+    detector.detect(expose(occlude(clean, disc, -1, turn, level), NOISE, rng))
     for share in SHARES.tolist():
-        found = detector.detect(expose(cover(clean, disc, share, turn, level), NOISE, rng))
+        found = detector.detect(expose(occlude(clean, disc, share, turn, level), NOISE, rng))
         near: list[Roundel] = [r for r in found if np.linalg.norm(r.uv - centre) < disc.diameter / 3]
         steps.append(Step(share, near[0].uv - centre, near[0].cov) if near else Step(share))
     return steps
@@ -61,26 +61,26 @@ def creep_over(disc: Disc, turn: float, level: float, rng: np.random.Generator) 
 
 @pytest.fixture(scope="module")
 def steps() -> list[Step]:
-    """Forty roundels of 14 to 40 px at any slant to 50 degrees, covered from anywhere by any grey level."""
+    """Forty roundels of 14 to 40 px, tilted by up to 50 degrees, occluded from any side by any grey level."""
     rng, steps = np.random.default_rng(3), []
     for _ in range(40):
         u, v = rng.uniform(-1, 1, 2)
         tilt, turn, side = rng.uniform(0, (0.9, 6.3, 6.3))
         disc = Disc((80 + u, 60 + v), float(rng.uniform(14, 40)), float(tilt), float(turn))
-        steps += creep_over(disc, float(side), float(rng.uniform(0, 255)), rng)
+        steps += occlude_slowly(disc, float(side), float(rng.uniform(0, 255)), rng)
     return steps
 
 
-def test_a_known_roundel_is_followed_under_a_cover(steps: list[Step]):
-    """While three tenths are covered nine of ten are found."""
+def test_a_known_roundel_is_tracked_while_it_is_occluded(steps: list[Step]):
+    """Nine of ten are found while up to three tenths of the diameter are occluded."""
     found = [step.error is not None for step in steps if step.share < 0.31]
     assert np.mean(found) > 0.9
 
 
-def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
-    """Squared Mahalanobis errors over all steps have mean 2, and a quarter more is granted to the model, as elsewhere.
+def test_the_covariance_of_an_occluded_roundel_is_consistent(steps: list[Step]):
+    """Squared Mahalanobis errors have mean 2; a quarter more is allowed for the model and four sigmas for chance.
 
-    Their chance is 4 sigmas of the mean; none is beyond 5 sigmas of its own (one in 270,000 by chance), and four more.
+    No error exceeds nine sigmas.
     """
     squared = np.array([step.squared for step in steps if step.error is not None])
     assert squared.mean() < 2 * 1.25 + 4 * 2 / np.sqrt(len(squared))
@@ -91,24 +91,22 @@ def test_what_is_found_of_a_covered_roundel_is_honest(steps: list[Step]):
     ("share", "from_rim", "least"),
     [(0.2, True, 0.97), (0.2, False, 0.86), (0.3, True, 0.71), (0.3, False, 0.62)],
 )
-def test_a_covered_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
-    """What the benchmark measures, less four sigmas of 90."""
+def test_an_occluded_roundel_is_found_on_the_first_frame(share: float, from_rim: bool, least: float):
+    """The shares that the benchmark measures, less four sigmas of 90 roundels."""
     chance = 4 * np.sqrt(least * (1 - least) / 90)
-    assert recall(Run("chords", Detector, False), 3, covered(share, from_rim)) > least - chance
+    assert recall(Run("chords", Detector, False), 3, occluded(share, from_rim)) > least - chance
 
 
-def test_a_new_one_is_where_it_seems_although_much_is_hidden():
-    """Of those found under bars over 30 % of the diameter one disc's centre in fifty at most is beyond nine sigmas.
+def test_the_position_of_a_new_occluded_roundel_is_consistent():
+    """With bars over 30 % of the diameter, at most one in fifty errors of disc centres exceeds nine sigmas.
 
-    A cover that hides in an edge unseen is told by the ratio, which then is not the print's.
+    An occlusion that the residuals do not show changes the ratio, which then is not that of the print.
     """
     squared = []
     for seed in range(300, 308):
-        frame, cards = covered(0.3, False)(np.random.default_rng(seed))
-        detector = Detector()
-        found = detector.detect(frame)
-        offsets, cov = detector.disc_offsets()
-        for centre, C in zip(found.uv + offsets, cov, strict=True):
+        frame, cards = occluded(0.3, False)(np.random.default_rng(seed))
+        found = Detector().detect(frame)
+        for centre, C in zip(found.uv + found.offset_px, found.pose_cov, strict=True):
             error = min((centre - card.uv for card in cards), key=lambda e: float(e @ e))
             both = C[:2, :2] + C[5:, 5:] + C[:2, 5:] + C[5:, :2] + MODEL_PX**2 * np.eye(2)
             squared.append(error @ np.linalg.solve(both, error))
@@ -116,17 +114,17 @@ def test_a_new_one_is_where_it_seems_although_much_is_hidden():
     assert np.mean(np.array(squared) > 9**2) < 0.02
 
 
-def test_letters_and_other_rings_are_no_covered_roundels():
-    """Qs and 8s are rings of the print's own ratio, with ink over them; six pages hold 400 such letters."""
+def test_letters_and_other_rings_are_not_occluded_roundels():
+    """Q and 8 are rings with the ratio of a print and ink across them; six pages contain 400 such letters."""
     pages = [*print_letters(6), *rings(6)]
     assert sum(len(Detector().detect(page)) for page in pages) == 0
 
 
 @pytest.mark.parametrize(("ground", "least", "most"), [(190.0, 0, 0), (120.0, 6, 12)])
-def test_ink_over_a_new_one_is_a_cover_where_its_card_ends_around_it(ground: float, least: int, most: int):
-    """A Phi is a ring of the print's own ratio with a bar across, of the same ink; none stands on a round card.
+def test_a_bar_of_ink_is_an_occlusion_if_the_card_is_round(ground: float, least: int, most: int):
+    """A Phi is a ring with the ratio of a print and a bar of ink across, but no letter is on a round card.
 
-    Of twelve covered by a fifth 86 in a hundred are found, less four sigmas.
+    86 % of twelve roundels with a fifth occluded are found, less four sigmas.
     """
     rng = np.random.default_rng(3)
     cards = [Card(uv, 32.0) for uv in grid(12, (240, 320), rng)]
@@ -138,8 +136,8 @@ def test_ink_over_a_new_one_is_a_cover_where_its_card_ends_around_it(ground: flo
 
 
 @pytest.mark.parametrize("thin", [0.55, 0.65])
-def test_a_stroke_of_two_widths_is_no_ring(thin: float):
-    """A hole narrower than it is high by a tenth of the outer radius and more is a letter's, at any blur."""
+def test_a_ring_of_two_stroke_widths_is_rejected(thin: float):
+    """A hole that is narrower than high by a tenth of the outer radius or more is that of a letter, at any blur."""
     rng = np.random.default_rng(5)
     for blur in (0.6, 0.9, 1.2):
         for radius in (7, 8, 10, 14):

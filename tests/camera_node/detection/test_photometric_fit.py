@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The photometric fit, seen through the detector: unbiased, as sure as it says, and not moved by what covers it."""
+"""The photometric fit, tested through the detector: unbiased, with a consistent covariance, robust to occlusion."""
 
 from collections.abc import Iterator
 
@@ -20,7 +20,7 @@ def frames(
 
 
 def mahalanobis(disc: Disc, images: Iterator[np.ndarray]) -> list[float]:
-    """Squared, of the centre; a roundel that is not found is a failure."""
+    """Squared Mahalanobis errors of the centre; fails if the roundel is not found."""
     squared = []
     for image in images:
         (found,) = Detector().detect(image)
@@ -31,10 +31,10 @@ def mahalanobis(disc: Disc, images: Iterator[np.ndarray]) -> list[float]:
 
 @pytest.mark.parametrize("diameter", [14, 24, 60])
 @pytest.mark.parametrize("blur", [0.5, 1.0])
-def test_noise_and_blur_leave_an_honest_covariance(diameter: float, blur: float):
-    """Squared Mahalanobis errors have mean 2 and variance 4 / n over n = 60 frames: four sigmas are 1.03.
+def test_the_covariance_is_consistent_at_any_size_and_blur(diameter: float, blur: float):
+    """Squared Mahalanobis errors have mean 2; four standard deviations of the mean of 60 are 1.03.
 
-    The renderer's own pieces of an eighth of a pixel are off by up to a thousandth, a half sigma at 60 px.
+    A quarter more is allowed for the renderer's resolution of an eighth of a pixel: half a sigma at 60 px.
     """
     disc = Disc((81.3, 60.2), diameter, np.radians(25), turn=0.6)
     assert 2 - 1.03 < np.mean(mahalanobis(disc, frames(disc, 60, 3, blur=blur))) < 2 + 1.03 + 0.25
@@ -42,8 +42,8 @@ def test_noise_and_blur_leave_an_honest_covariance(diameter: float, blur: float)
 
 @pytest.mark.parametrize("tilt_deg", [0, 30, 45])
 @pytest.mark.parametrize("blur", [0.5, 1.0, 1.5])
-def test_curvature_and_perspective_do_not_bend_the_size(tilt_deg: float, blur: float):
-    """Axes of 30 px within 0.1 %: the fit takes curved, blurred edges to second order (the first is 1 % off)."""
+def test_curvature_and_perspective_do_not_bias_the_size(tilt_deg: float, blur: float):
+    """Axes of 30 px within 0.1 %: the model of blurred, curved edges is of second order (1 % error at first order)."""
     disc = Disc((83.1, 61.4), 30, np.radians(tilt_deg), turn=0.6)
     axes = np.mean([Detector().detect(image)[0].axes_px for image in frames(disc, 10, 1, blur=blur)], axis=0)
     assert np.allclose(axes, outer_conic(disc, PRINCIPAL)[1], rtol=1e-3)
@@ -51,10 +51,10 @@ def test_curvature_and_perspective_do_not_bend_the_size(tilt_deg: float, blur: f
 
 @pytest.mark.parametrize("level", [20.0, 240.0])
 @pytest.mark.parametrize("share", [0.1, 0.2])
-def test_what_covers_a_part_does_not_move_the_rest(level: float, share: float):
-    """A straight edge over a part of the diameter: if it is found, it is where its own covariance says.
+def test_an_occlusion_does_not_bias_the_position(level: float, share: float):
+    """Beyond a straight edge the roundel is occluded: if it is found, its error agrees with its covariance.
 
-    What is left of it tells its place to 0.02 px; one in a thousand is off by more than chi-square's 13.8.
+    The rest determines its position to 0.02 px; one in a thousand squared errors exceeds 13.8.
     """
     disc = Disc((80.3, 60.6), 32, 0.3, turn=0.5)
     clean, (centre, axes) = render([disc]), outer_conic(disc, PRINCIPAL)
@@ -65,8 +65,8 @@ def test_what_covers_a_part_does_not_move_the_rest(level: float, share: float):
         assert off @ np.linalg.solve(found.cov, off) < 13.8
 
 
-def test_a_print_that_is_not_configured_is_measured():
-    """The prior of the configured prints gives way to what the picture says: 0.63 at 40 px is no 0.6."""
+def test_a_ratio_that_is_not_configured_is_measured():
+    """The prior of the configured prints does not bias a ratio of 0.63 at 40 px towards 0.6."""
     disc = Disc((80.3, 60.6), 40, 0.3, ratio=0.63)
     for image in frames(disc, 5, 2):
         (found,) = Detector().detect(image)
@@ -74,8 +74,8 @@ def test_a_print_that_is_not_configured_is_measured():
         assert found.axes_px == pytest.approx(outer_conic(disc, PRINCIPAL)[1], rel=2e-3)
 
 
-def test_a_known_print_tells_the_size_of_small_roundels():
-    """The spread of the major axis at 14 px, print known (0.6) and not (a configured ratio that is refused)."""
+def test_a_known_print_improves_the_size_of_small_roundels():
+    """The scatter of the major axis at 14 px with a known print (0.6) and without (a configured ratio that differs)."""
     disc = Disc((80.3, 60.6), 14, 0.5)
     images = list(frames(disc, 40, 3, ground=190))
     known, unknown = (
@@ -85,11 +85,10 @@ def test_a_known_print_tells_the_size_of_small_roundels():
     assert np.std(known) < 0.8 * np.std(unknown)
 
 
-def test_noise_does_not_make_another_print_of_it():
-    """Blurred by 1.5 px and with noise of 5, the ratio at 20 px is known to 0.02, and its errors are skewed.
+def test_noise_does_not_disable_the_prior_of_the_print():
+    """With a blur of 1.5 px and noise of 5 the ratio at 20 px has a sigma of 0.02 and a skewed distribution.
 
-    Sizes without the print's prior are eight sigmas off; of 60 Gaussian ones none is beyond five, and the median
-    distance from the middle is 0.67 sigma.
+    Sizes without the prior differ by eight sigmas. Of 60 Gaussian ones none exceeds five; the median deviation is 0.67.
     """
     disc = Disc((80.3, 60.6), 20, 0.5)
     images = frames(disc, 60, 5, blur=1.5, ground=190)
@@ -99,8 +98,8 @@ def test_noise_does_not_make_another_print_of_it():
     assert off.max() < 5 * np.median(off) / 0.67
 
 
-def test_blur_does_not_make_another_print_of_it():
-    """The rays that a fit starts from see a blurred hole smaller, near the other configured ratio; the fit does not."""
+def test_blur_does_not_select_another_print():
+    """Blur reduces the hole in the initial guess, to nearly the other configured ratio, but not in the fit."""
     disc = Disc((80.3, 60.6), 20, 0.5)
     for image in frames(disc, 10, 1, blur=1.5, ground=190):
         both, one = (Detector(inner_ratios=ratios).detect(image)[0] for ratios in ((0.6, 0.41), (0.6,)))
@@ -109,7 +108,7 @@ def test_blur_does_not_make_another_print_of_it():
 
 @pytest.mark.parametrize(("dark", "bright"), [(60, 275), (-15, 120)])
 def test_clipped_levels_do_not_move_the_edges(dark: float, bright: float):
-    """Whites beyond the scale: taken for 255 they would shift each edge, by 0.3 % of a diameter of 32 px here."""
+    """Overexposed white: if it were taken for 255, each edge would shift by 0.3 % of the diameter of 32 px."""
     disc = Disc((80.3, 60.6), 32, 0.4, turn=0.5)
     clean, rng = render([disc], dark=dark, bright=bright, ground=100), np.random.default_rng(5)
     axes = np.mean([Detector().detect(expose(clean, 2, rng))[0].axes_px for _ in range(10)], axis=0)
@@ -117,10 +116,10 @@ def test_clipped_levels_do_not_move_the_edges(dark: float, bright: float):
 
 
 @pytest.mark.parametrize("diameter", [14, 18, 24])
-def test_the_middle_of_a_slanted_hole_is_no_edge(diameter: float):
-    """At 60 degrees a hole's two sides are a few pixels apart: between them distances from an edge bend most.
+def test_small_slanted_roundels_are_fitted(diameter: float):
+    """At 60 degrees the two sides of a hole are a few pixels apart, where the second-order distance is least accurate.
 
-    Taken to second order they once changed sign there, and good fits were thrown away: one in three at 16 px.
+    A distance with the wrong sign there rejects good fits: one in three at 16 px.
     """
     rng = np.random.default_rng(6)
     for turn in np.linspace(0, np.pi, 12, endpoint=False):
@@ -130,10 +129,10 @@ def test_the_middle_of_a_slanted_hole_is_no_edge(diameter: float):
 
 
 @pytest.mark.parametrize("diameter", [14, 32])
-def test_a_roundel_that_moves_evenly_is_fitted_as_from_scratch(diameter: float):
-    """From the last frame's model, one step, or from rays: the same minimum, to half a standard deviation.
+def test_a_fit_from_the_last_model_agrees_with_a_new_fit(diameter: float):
+    """At constant velocity, one step from the last frame's model reaches the minimum within half a sigma.
 
-    In the last frame it has jumped: its number stays, and the rays take over.
+    In the last frame the roundel jumps: its track continues with a fit from rays.
     """
     tracker, rng = Detector(), np.random.default_rng(8)
     for u, v in [*((70.2 + 1.3 * k, 62.1 - 0.6 * k) for k in range(6)), (83.4, 57.7)]:
@@ -145,9 +144,9 @@ def test_a_roundel_that_moves_evenly_is_fitted_as_from_scratch(diameter: float):
 
 
 @pytest.mark.parametrize("diameter", [20, 32, 70])
-def test_a_roundel_that_moves_unevenly_is_fitted_as_from_scratch(diameter: float):
-    """Up to 0.28 px from where it is expected, it is fitted from its last model, by a step on few of its pixels first:
-    the same minimum, to half a standard deviation."""
+def test_a_fit_from_an_inaccurate_prediction_agrees_with_a_new_fit(diameter: float):
+    """Up to 0.28 px from its predicted position, the fit takes a step on a sample of the pixels first, and reaches the
+    minimum within half a sigma."""
     tracker, rng = Detector(), np.random.default_rng(11)
     for k in range(10):
         u, v = np.array([70.2 + 1.3 * k, 62.1 - 0.6 * k]) + rng.uniform(-0.05, 0.05, 2)

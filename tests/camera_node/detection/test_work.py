@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How much of a frame is looked at: shares of it, a bound on the work, and settings that change between frames."""
+"""Bounded work per frame: search shares, the limit on fits, and settings that change between frames."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ def frame(*discs: Disc, seed: int = 1) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
 @pytest.mark.parametrize("begin", range(4))
-def test_a_share_of_each_frame_finds_all_that_is_new(share: float, begin: int):
-    """Wherever it comes up and whenever in the round, it is found within 1 / share frames, and no round skips any."""
+def test_a_search_share_finds_every_new_roundel(share: float, begin: int):
+    """At any position and any time of the cycle, a new roundel is found within 1 / share frames."""
     plain, rounds = frame(), round(1 / share)
     for v in (16.0, 40.0, 60.0, 80.0, 104.0):
         detector, shown = Detector(search_share=share), frame(Disc((80, v), 24))
@@ -26,7 +26,7 @@ def test_a_share_of_each_frame_finds_all_that_is_new(share: float, begin: int):
         assert any(len(detector.detect(shown)) for _ in range(rounds))
 
 
-def test_what_is_tracked_is_found_in_every_frame():
+def test_tracked_roundels_are_found_in_every_frame():
     detector, discs = Detector(search_share=0.1), [Disc((40, 20), 20), Disc((120, 100), 20)]
     shown = frame(*discs)
     while len(detector.detect(shown)) < 2:
@@ -41,26 +41,25 @@ def crowd() -> NDArray[np.uint8]:
     return expose(np.tile(tile, (45, 60)), 1, np.random.default_rng(1))
 
 
-def test_a_frame_costs_a_bounded_number_of_fits_and_none_starves(crowd: NDArray[np.uint8]):
-    """512 new places a frame: six frames are needed for all, and then nothing is left over."""
+def test_the_fits_of_a_frame_are_limited_and_all_seeds_are_fitted(crowd: NDArray[np.uint8]):
+    """At most 512 new seeds per frame: six frames are enough for all, and then none is postponed."""
     detector = Detector()
-    counts = [len(detector.detect(crowd)) for _ in range(7)]
+    results = [detector.detect(crowd) for _ in range(7)]
+    counts = [len(found) for found in results]
     assert counts[0] <= 512
-    assert detector.postponed == 0
+    assert results[-1].n_postponed == 0
     assert counts[-1] > 0.99 * 2700
     assert np.diff(counts).max() <= 512
     assert all(np.diff(counts[:4]) > 256)
 
 
-def test_what_is_put_off_is_counted(crowd: NDArray[np.uint8]):
+def test_postponed_seeds_are_counted(crowd: NDArray[np.uint8]):
     detector = Detector()
-    detector.detect(frame(Disc((80, 60), 24)))
-    assert detector.postponed == 0
-    detector.detect(crowd)
-    assert detector.postponed > 1000
+    assert detector.detect(frame(Disc((80, 60), 24))).n_postponed == 0
+    assert detector.detect(crowd).n_postponed > 1000
 
 
-def test_new_settings_keep_the_tracks():
+def test_new_settings_preserve_the_tracks():
     discs = [Disc((40, 60), 20), Disc((120, 60), 30)]
     detector = Detector()
     before = detector.detect(frame(*discs))

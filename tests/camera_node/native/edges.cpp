@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
-/// For roundels of some sizes and slants: into how many parts their pixels fall, and by how much the normal
-/// equations of the parts differ from those of the same pixels taken together, over the roots of the
-/// diagonal.
+/// For roundels of several sizes and slants, prints the number of parts of their pixels and the largest
+/// difference between the normal equations of the parts and those of the same pixels as one part, normalized
+/// by the square roots of the diagonal.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -13,7 +13,7 @@
 using namespace roundel;
 
 constexpr int kSide = 256;
-constexpr double kAllAgree = 1e4;  // grey levels: a scale by which no residual weighs less
+constexpr double kAllAgree = 1e4;  // grey levels: with this scale all weights are 1
 
 /// `slant` is the cosine of the tilt; perspective is that of a focal length of five diameters.
 Parameters seen(double diameter, double slant) {
@@ -27,10 +27,10 @@ Parameters seen(double diameter, double slant) {
     return p;
 }
 
-NormalEquations products(const EdgePixels& pixels, const Parameters& p) {
-    static Linearisation model;
-    model.evaluate(pixels, p);
-    return model.accumulate(kAllAgree);
+GaussNewtonSystem<kCount> products(const EdgePixels& pixels, const Parameters& p) {
+    static NormalEquations equations;
+    equations.linearize(pixels, p);
+    return equations.accumulate(kAllAgree);
 }
 
 int main() {
@@ -42,9 +42,9 @@ int main() {
             select_pixels({grey.data(), kSide, kSide, kSide}, p, {1.25, 2.5, true, 2.5}, EdgePixels::kMax,
                           pixels);
             const int parts = pixels.part_count;
-            const NormalEquations apart = products(pixels, p);
+            const auto apart = products(pixels, p);
             pixels.parts[0] = {kAnyEdge, 0, pixels.count}, pixels.part_count = 1;
-            const NormalEquations together = products(pixels, p);
+            const auto together = products(pixels, p);
             double worst = 0;
             for (int i = 0; i < kCount; ++i)
                 for (int j = 0; j <= i; ++j)

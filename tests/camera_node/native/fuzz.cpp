@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The detector's core on pictures made to break it, for a build with sanitizers: `fuzz ROUNDS [SEED]`. Every
-// picture lies in memory of exactly its own size, so that a read beyond it is caught. Exits with 1 where a
-// result is no roundel that could be.
+// Runs the detector on hostile images, for a build with sanitizers: `fuzz ROUNDS [SEED]`. Every image is in
+// memory of exactly its size, so that the sanitizer reports reads beyond it. Exits with 1 if a result is
+// impossible.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -20,7 +20,7 @@ int between(Random& random, int low, int high) {
     return std::uniform_int_distribution<int>(low, high)(random);
 }
 
-/// A picture whose last row ends where its memory does; rows lie `stride` bytes apart.
+/// An image whose last row ends with its memory; rows are `stride` bytes apart.
 class Picture {
   public:
     Picture(int width, int height, int stride)
@@ -43,7 +43,8 @@ void paint(Picture& picture, Level level) {
         for (int x = 0; x < picture.view.width; ++x) picture.at(x, y) = uint8_t(level(x, y));
 }
 
-/// Rings, `wide` each, around the centres of a grid: roundels of the smallest size, bullseyes, nested ones.
+/// Rings of width `wide` around the centres of a grid: roundels of the smallest size, bullseyes, nested
+/// rings.
 void paint_rings(Picture& picture, int step, double wide, int rings) {
     paint(picture, [=](int x, int y) {
         const double r = std::hypot(x % step - step / 2.0, y % step - step / 2.0) / wide;
@@ -84,25 +85,24 @@ void paint_any(Picture& picture, Random& random) {
     for (int passes = between(random, 0, 2); passes > 0; --passes) blur(picture);
 }
 
-bool is_possible(const roundel::Fit& fit, const roundel::ImageView& image) {
+bool is_possible(const roundel::RoundelFit& fit, const roundel::ImageView& image) {
     const auto positive = [](const roundel::Symmetric& m) { return m.xx > 0 && m.yy > 0 && m.det() > 0; };
     return fit.outer.x > -image.width && fit.outer.x < 2 * image.width && fit.outer.y > -image.height &&
            fit.outer.y < 2 * image.height && fit.outer.minor > 0 && fit.outer.major >= fit.outer.minor &&
            positive(fit.centre_covariance()) && positive(fit.offset_covariance()) && std::isfinite(fit.ratio);
 }
 
-/// Several pictures to one detector, which remembers what it saw in the last; of one size or of several.
+/// Runs one detector, which tracks from image to image, on several images of one size or of several sizes.
 bool survives(Random& random, bool by_paper) {
-    roundel::Detector detector({.min_diameter = double(between(random, 6, 12)),
-                                .min_contrast = double(between(random, 5, 40)),
-                                .search_share = between(random, 0, 3) ? 1.0 : 0.1,
-                                .by_paper = by_paper});
+    roundel::RoundelLimits limits{.min_diameter = double(between(random, 6, 12)),
+                                  .min_contrast = double(between(random, 5, 40))};
+    roundel::Detector detector(limits, between(random, 0, 3) ? 1.0 : 0.1, by_paper);
     int width = between(random, 0, 90), height = between(random, 0, 90);
     for (int k = 0; k < 3; ++k) {
         if (!between(random, 0, 3)) width = between(random, 0, 260), height = between(random, 0, 200);
         Picture picture(width, height, width + between(random, 0, 1) * between(random, 0, 70));
         if (width && height) paint_any(picture, random);
-        for (const auto& found : detector.detect(picture.view))
+        for (const auto& found : detector.detect(picture.view).roundels)
             if (!is_possible(found.fit, picture.view)) return false;
     }
     return true;
@@ -115,7 +115,7 @@ int main(int argc, char** argv) {
     for (int k = 0; k < rounds; ++k) {
         Random random(unsigned(seed + k));
         if (survives(random, k % 4 == 3)) continue;
-        std::fprintf(stderr, "seed %d: a result that can't be\n", seed + k);
+        std::fprintf(stderr, "seed %d: impossible result\n", seed + k);
         return 1;
     }
     std::printf("%d rounds\n", rounds);

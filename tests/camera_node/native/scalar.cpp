@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: BSD-3-Clause
-/// Detects roundels in frames from standard input, each its width and height and then its pixels, and prints
-/// what the binding's table has, to the last bit.
+/// Detects roundels in frames from standard input (width and height, then the pixels) and prints all columns
+/// of the results as exact hexadecimal numbers, one line per roundel.
 #include <cstdio>
 #include <vector>
 
 #include "detector.hpp"
-#include "table.hpp"
+#include "frame_columns.hpp"
 
 int main() {
     roundel::Detector detector({});
@@ -13,9 +13,15 @@ int main() {
         std::vector<uint8_t> pixels(size_t(width) * size_t(height));
         std::getchar();
         if (std::fread(pixels.data(), 1, pixels.size(), stdin) != pixels.size()) return 1;
-        for (const auto& roundel : detector.detect({pixels.data(), width, height, width})) {
-            for (const double value : row_of(roundel)) std::printf("%a ", value);
-            std::puts("");
+        const auto found = detector.detect({pixels.data(), width, height, width}).roundels;
+        const roundel::FrameColumns columns(found);
+        for (size_t k = 0; k < found.size(); ++k) {
+            for (const auto& column : {columns.uv, columns.axes_px, columns.angle_rad, columns.ratio,
+                                       columns.contrast, columns.offset_px, columns.pose_cov}) {
+                const size_t n = column.size() / found.size();
+                for (size_t i = 0; i < n; ++i) std::printf("%a ", column[k * n + i]);
+            }
+            std::printf("%a\n", double(columns.track[k]));
         }
     }
 }

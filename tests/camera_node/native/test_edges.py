@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pixels of a single edge say of the pose what they say as pixels of a whole roundel."""
+"""The normal equations of the single edges agree with those of the whole roundel."""
 
 import subprocess
 from pathlib import Path
@@ -13,12 +13,12 @@ NATIVE = ROOT / "camera_node" / "native"
 SOURCES = "edge_pixels", "normal_equations", "ellipse"
 
 
-def test_edges_apart_and_together_give_the_same_normal_equations(tmp_path: Path):
-    """All 13 x 13 products, by the moves of three ellipses and by the columns of the whole.
+def test_separate_edges_and_the_whole_give_the_same_normal_equations(tmp_path: Path):
+    """All 13 x 13 products, by the Jacobians of three ellipses and by the columns of the whole.
 
-    Those of the whole are taken at a pixel, of an ellipse at the point of the edge that is nearest to it: half a blur
-    (0.4 px) in radii of the hole, 0.3 of the diameter, is the difference, and what is left of it in a product of one
-    column that is even across the edge and one that is odd.
+    The whole model takes derivatives at the pixel, that of a single edge at the nearest point of the edge. They differ
+    by about half a blur (0.4 px) over the radius of the hole (0.3 diameters), in products of a column that is even
+    across the edge with an odd one.
     """
     driver = Path(__file__).with_name("edges.cpp")
     edges = build(NATIVE, driver, tmp_path, SOURCES)

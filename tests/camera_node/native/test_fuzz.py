@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The detector on pictures made to break it: under sanitizers, and by the clock."""
+"""The detector on hostile images: under sanitizers, and with a limit on its time."""
 
 import time
 from pathlib import Path
@@ -16,14 +16,14 @@ NATIVE = ROOT / "camera_node" / "native"
 
 
 @pytest.mark.slow
-def test_no_picture_breaks_the_core(tmp_path: Path):
+def test_no_image_breaks_the_core(tmp_path: Path):
     """Sizes from 0 x 0, any stride, noise, rings, checkerboards and strokes, under AddressSanitizer and UBSan."""
     driver = Path(__file__).with_name("fuzz.cpp")
     assert fuzz(NATIVE, driver, 500, tmp_path) == (0, "")
 
 
 def rings(size: tuple[int, int], step: int, *radii: float) -> np.ndarray:
-    """A grid of circles, black and white by turns from the outermost."""
+    """A grid of concentric circles, alternately black and white from the outermost."""
     v, u = (x % step - step / 2 for x in np.mgrid[: size[0], : size[1]])
     within = sum((np.hypot(u, v) < radius).astype(int) for radius in radii)
     return cv2.GaussianBlur(np.where(within % 2, 30, 220).astype(np.float32), (0, 0), 0.6).astype(np.uint8)
@@ -51,7 +51,7 @@ HOSTILE = {
 
 
 def seconds(image: np.ndarray) -> float:
-    """Processor time of one search by a new detector, the least of three."""
+    """Processor time of one search by a new detector, minimum of three."""
     times = []
     for _ in range(3):
         detector = Detector(min_diameter_px=6, min_contrast=5)
@@ -62,10 +62,10 @@ def seconds(image: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_the_worst_pictures_cost_a_bounded_time(name: str):
-    """Four times the pixels cost about four times the time; what grew with their square would cost sixteen times.
+def test_the_time_for_the_worst_images_is_bounded(name: str):
+    """Four times the pixels take about four times the time; a quadratic algorithm would take sixteen times.
 
-    And no more than 5000 times an empty picture: 2 us a pixel, a few fits for each place that one could stand at.
+    The limit is 5000 times that of an empty image: 2 us per pixel, a few fits for each possible position.
     """
     small, large = (seconds(HOSTILE[name](size)) for size in ((240, 320), (480, 640)))
     plain = seconds(np.full((480, 640), 128, np.uint8))

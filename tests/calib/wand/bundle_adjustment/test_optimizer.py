@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The parts of the adjustment: derivatives by differences, discs' centres, trial shifts."""
+"""The bundle adjustment: derivatives, disc centres, initial clocks, outliers, clocks and lenses."""
 
 from dataclasses import replace
 
@@ -25,18 +25,18 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
 from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import altered, repack
+from tests.calib.recordings import SimulatedRecording, WandScenario
+from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import camera_errors, outlines, record, ring
-from tests.calib.wave import Recorded, Wave
-from tests.calib.wave import record as record_wave
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Recorded:
-    return record_wave(Wave(cameras=6, seconds=15.0, rate_hz=30.0, seed=3))
+def recorded() -> SimulatedRecording:
+    return record_wave(WandScenario(cameras=6, seconds=15.0, rate_hz=30.0, seed=3))
 
 
 def test_jacobians_are_those_of_the_residuals():
-    """By central differences: the error is of second order in the step, 1e-5 of the largest entry at most."""
+    """Against central differences, whose error is of second order in the step: 1e-5 of the largest entry at most."""
     arena = ring(3)
     result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
     problem = result.adjusted.problem.with_free(POSE, OFFSET, DRIFT, LENS)
@@ -53,7 +53,7 @@ def test_jacobians_are_those_of_the_residuals():
         assert J[:, :, parameter] == pytest.approx(expected, abs=1e-3 * np.abs(expected).max() + 1e-6)
 
 
-def test_a_world_that_moves_changes_no_residual():
+def test_gauge_directions_change_no_residual():
     """Moves the cameras by `gauge_directions`, and the wand with them, by 1e-5: the rest is of second order, 1e-10
     times the 600 px of a radian."""
     arena = ring(3)
@@ -70,7 +70,7 @@ def test_a_world_that_moves_changes_no_residual():
 
 
 def test_velocity_is_the_derivative_of_position():
-    """Also beyond the knots; in between, of third order."""
+    """Against central differences, inside and outside the knots."""
     knot_s, t_s, step = np.array([0.0, 0.1, 0.25, 1.0]), np.array([-0.03, 0.02, 0.13, 0.2, 0.4, 1.02]), 1e-6
     place = locate(knot_s, t_s, 0.3)
     change = position_weights(knot_s, t_s + step, place) - position_weights(knot_s, t_s - step, place)
@@ -78,8 +78,8 @@ def test_velocity_is_the_derivative_of_position():
     assert place.inside.tolist() == [False, True, True, True, False, False]
 
 
-def test_ellipses_centres_lie_off_discs_centres_by_what_perspective_does():
-    """Against the outline's exact conic: without distortion there is no other cause. About D^2/4f sin t cos t."""
+def test_the_displacement_of_ellipse_centres_is_that_of_perspective():
+    """Against the exact conic of the outline, without distortion: about D^2/4f sin t cos t."""
     lens = msgspec.structs.replace(ring(3).truth.cameras["cam0"], distortion=())
     points, tilt = np.array([[0.2, -0.1, 2.0], [0.0, 0.0, 1.5]]), np.radians(45)
     normals = np.array([[0.0, np.sin(tilt), -np.cos(tilt)], [np.sin(tilt), 0.0, -np.cos(tilt)]])
@@ -90,14 +90,14 @@ def test_ellipses_centres_lie_off_discs_centres_by_what_perspective_does():
     assert np.linalg.norm(off[1]) == pytest.approx(D**2 / (4 * lens.fx) / 2, rel=0.02)
 
 
-def test_clocks_far_apart_are_found_before_anything_else_is_known(recorded: Recorded):
-    """To a few milliseconds, from which the adjustment converges; a frame lasts 33."""
+def test_the_initial_clock_shifts_of_pairs_are_right(recorded: SimulatedRecording):
+    """To 6 ms, from which the adjustment converges; a frame lasts 33 ms."""
     names = sorted(recorded.truth.cameras)
     lenses = [recorded.truth.cameras[n] for n in names]
     frames, seen = gather(recorded.messages, names, lenses)
-    labelled, _ = label(frames, seen, Wave().wand, lenses)
-    pairs = TwoViewGeometry(labelled, lenses, Wave().wand, frames.period_s())
-    shared = np.triu(pairs.shared(), 1)
+    labelled, _ = label(frames, seen, WandScenario().wand, lenses)
+    pairs = TwoViewGeometry(labelled, lenses, WandScenario().wand, frames.period_s())
+    shared = np.triu(pairs.count_shared(), 1)
     for a, b in np.argwhere(shared > 40):
         pair = pairs.relate(int(a), int(b))
         assert pair is not None
@@ -105,45 +105,45 @@ def test_clocks_far_apart_are_found_before_anything_else_is_known(recorded: Reco
         assert pair.shift_s * 1e3 == pytest.approx(expected, abs=6)
 
 
-def test_a_jump_of_the_wand_costs_no_sighting():
-    """A third of a second is cut out of the count: what all cameras agree on stays."""
-    wave = Wave(
+def test_missing_time_in_all_cameras_rejects_no_observation():
+    """The stamps of all cameras skip 0.3 s: the wand's motion jumps, and observations that agree are used."""
+    scenario = WandScenario(
         cameras=6, seconds=8.0, rate_hz=30.0, offset_ms=0, drift_ppm=0, free_running=False, outliers=0, seed=3
     )
-    recorded = record_wave(wave)
+    recorded = record_wave(scenario)
     first, cut = min(m.t_ns for m in recorded.messages), 300_000_000
     late = [m for m in recorded.messages if m.t_ns - first >= 3_000_000_000 + cut]
     early = [m for m in recorded.messages if m.t_ns - first < 3_000_000_000]
     closed = early + [msgspec.structs.replace(m, t_ns=m.t_ns - cut) for m in late]
-    result = calibrate(recorded.intrinsics, wave.wand, closed)
+    result = calibrate(recorded.intrinsics, scenario.wand, closed)
     assert len(result.names) == 6
     assert result.adjusted.used.mean() > 0.98
     assert not result.time_offset_ms.any()
 
 
-def test_clocks_and_lenses_are_adjusted_where_the_data_say_so(recorded: Recorded):
-    """Offsets within four standard deviations and 0.3 ms; a focal length that is two percent off is found, to three
-    times its standard deviation of 0.2 %, whatever its figures say; true lenses stay within theirs."""
-    result = calibrate(recorded.intrinsics, Wave().wand, recorded.messages)
+def test_clocks_and_lenses_are_adjusted_where_the_data_need_it(recorded: SimulatedRecording):
+    """Offsets are right within four standard deviations and 0.3 ms; true lenses stay within four of theirs. A focal
+    length that is 2 % off is estimated within three times its standard deviation of 0.2 %."""
+    result = calibrate(recorded.intrinsics, WandScenario().wand, recorded.messages)
     truth = np.array([recorded.truth.cameras[n].time_offset_ms for n in result.names])
     error = result.time_offset_ms - truth
     error -= error.mean()
     assert (np.abs(error) < np.minimum(4 * result.time_sigma_ms, 0.3)).all()
     assert (np.abs(result.adjusted.state.lenses) < 4 * result.adjusted.problem.lens_sigma).all()
     wrong = scale_focal(recorded, "cam02", 1.02)
-    result = calibrate(wrong, Wave().wand, recorded.messages)
+    result = calibrate(wrong, WandScenario().wand, recorded.messages)
     assert result.rig.cameras["cam02"].fx == pytest.approx(recorded.truth.cameras["cam02"].fx, rel=0.006)
 
 
-def scale_focal(recorded: Recorded, name: str, factor: float) -> Rig:
+def scale_focal(recorded: SimulatedRecording, name: str, factor: float) -> Rig:
     camera = recorded.intrinsics.cameras[name]
     wrong = msgspec.structs.replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
     return Rig(cameras={**recorded.intrinsics.cameras, name: wrong})
 
 
-def test_cameras_that_the_wave_contradicts_are_named_and_left_out(recorded: Recorded):
-    """The others stand as well as without them: a wave of 15 s knows places to 0.5 mm, 1 sigma."""
-    rig, wand = recorded.intrinsics, Wave().wand
+def test_cameras_that_the_recording_contradicts_are_named_and_left_out(recorded: SimulatedRecording):
+    """The other cameras are as accurate as without them: 15 s determine positions to 0.5 mm, 1 sigma."""
+    rig, wand = recorded.intrinsics, WandScenario().wand
     swapped = {**rig.cameras, "cam00": rig.cameras["cam03"], "cam03": rig.cameras["cam00"]}
     mirrored = [mirror(m) if m.camera == "cam01" else m for m in recorded.messages]
     cases = [
@@ -158,13 +158,13 @@ def test_cameras_that_the_wave_contradicts_are_named_and_left_out(recorded: Reco
         assert camera_errors(result.rig, recorded.truth)[0].max() < 2e-3
 
 
-def test_no_majority_is_one_line(recorded: Recorded):
+def test_no_majority_is_one_line(recorded: SimulatedRecording):
     rig = recorded.intrinsics
     wrong = dict(rig.cameras)
     for name, factor in {"cam00": 1.15, "cam02": 0.85, "cam04": 1.2}.items():
         wrong[name] = scale_focal(recorded, name, factor).cameras[name]
     with pytest.raises(CalibrationError, match="no majority of the cameras agrees: camera 'cam0") as fault:
-        calibrate(Rig(cameras=wrong), Wave().wand, recorded.messages)
+        calibrate(Rig(cameras=wrong), WandScenario().wand, recorded.messages)
     assert "\n" not in str(fault.value)
 
 
@@ -174,38 +174,39 @@ def mirror(message: Detections) -> Detections:
     return repack(message, altered(roundels, uv=uv, angle_rad=-roundels.angle_rad))
 
 
-def test_a_wand_file_that_the_wave_contradicts_is_refused(recorded: Recorded):
-    rig, wand = recorded.intrinsics, Wave().wand
+def test_a_wand_file_that_the_recording_contradicts_is_refused(recorded: SimulatedRecording):
+    rig, wand = recorded.intrinsics, WandScenario().wand
     longer = Body(diameter_m=wand.diameter_m, markers=tuple((1.08 * x, y, z) for x, y, z in wand.markers))
     with pytest.raises(CalibrationError, match="lengths and its roundels' sizes disagree"):
         calibrate(rig, longer, recorded.messages)
 
 
-def test_drift_is_found_and_cameras_in_step_stay_in_step():
-    """Clocks up to 50 ppm apart over a minute, not one offset in its middle: found to four sigmas (Bonferroni over four
-    cameras: once in 4000), and no offset is told beside it; cameras in step are left alone."""
-    wave = Wave(cameras=4, rate_hz=30.0, offset_ms=0, seed=6)
-    recorded = record_wave(wave)
-    result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
+def test_drift_is_estimated_and_synchronized_cameras_get_no_offsets():
+    """Clocks drift up to 50 ppm apart over a minute without an offset in its middle: drifts are right within four
+    sigmas (Bonferroni over four cameras: wrong once in 4000) and there are no offsets; synchronized cameras have
+    neither."""
+    scenario = WandScenario(cameras=4, rate_hz=30.0, offset_ms=0, seed=6)
+    recorded = record_wave(scenario)
+    result = calibrate(recorded.intrinsics, scenario.wand, recorded.messages)
     truth = np.array([recorded.drift_ppm[name] for name in result.names])
     assert not result.time_sigma_ms.any()
     assert (np.abs(result.drift_ppm - truth + truth.mean()) < 4 * result.drift_sigma_ppm).all()
-    wave = Wave(cameras=4, seconds=15, rate_hz=30, offset_ms=0, drift_ppm=0, free_running=False)
-    recorded = record_wave(wave)
-    result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
+    scenario = WandScenario(cameras=4, seconds=15, rate_hz=30, offset_ms=0, drift_ppm=0, free_running=False)
+    recorded = record_wave(scenario)
+    result = calibrate(recorded.intrinsics, scenario.wand, recorded.messages)
     assert not result.time_sigma_ms.any()
     assert not result.drift_sigma_ppm.any()
 
 
-def test_time_offsets_of_a_short_wave_are_as_sure_as_they_say():
-    """Ten seconds, waved briskly, of clocks up to 80 ppm apart, which so short a wave does not show: squared
-    Mahalanobis errors of the offsets, over four waves, lie between the 0.1 % and 99.9 % quantiles of chi-square. With
-    the drift taken as none where none is told, they were five times the mean."""
+def test_the_covariance_of_time_offsets_of_a_short_recording_is_right():
+    """Ten seconds of fast motion do not show drifts of up to 80 ppm: the squared Mahalanobis errors of the offsets,
+    over four recordings, are between the 0.1 % and 99.9 % quantiles of chi-square. With drifts fixed at zero they would
+    be five times the mean."""
     squared, degrees = 0.0, 0
     for seed in range(4):
-        wave = Wave(cameras=4, seconds=10, speed=1.5, drift_ppm=80, seed=seed)
-        recorded = record_wave(wave)
-        result = calibrate(recorded.intrinsics, wave.wand, recorded.messages)
+        scenario = WandScenario(cameras=4, seconds=10, speed=1.5, drift_ppm=80, seed=seed)
+        recorded = record_wave(scenario)
+        result = calibrate(recorded.intrinsics, scenario.wand, recorded.messages)
         truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
         apart = np.linalg.svd(np.ones((len(truth), 1)))[0][:, 1:]
         off = apart.T @ (result.time_offset_ms - truth) / 1e3
@@ -214,17 +215,17 @@ def test_time_offsets_of_a_short_wave_are_as_sure_as_they_say():
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
 
-def test_noise_is_no_clock():
-    """Three cameras in step, 15 s of a stick at 10 Hz, 1.5 px of noise, 5 % of gross errors: no clock is told, and 3 ms
-    are, to four standard deviations. Schwarz's criterion is wrong now and then: of ten seeds at 10 Hz and ten at 30 Hz
-    it told a drift once (seed 3 at 10 Hz)."""
+def test_noise_gives_no_clock_parameters():
+    """Three synchronized cameras, 15 s of a stick at 10 Hz, 1.5 px of noise, 5 % of gross errors: there are no offsets;
+    an offset of 3 ms is estimated within four standard deviations. Schwarz's criterion has false positives: of ten
+    seeds at 10 Hz and ten at 30 Hz, one gave a drift (seed 3 at 10 Hz)."""
     stick = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
-    wave = Wave(
+    scenario = WandScenario(
         cameras=3, arc=0.5, seconds=15, rate_hz=10, sigma_px=1.5, offset_ms=0, drift_ppm=0, wand=stick
     )
-    wave = replace(wave, free_running=False, numbered=True, sized=False, both_sides=True)
+    scenario = replace(scenario, free_running=False, numbered=True, sized=False, both_sides=True)
     for seed in (2, 1, 0):
-        recorded = record_wave(replace(wave, seed=seed))
+        recorded = record_wave(replace(scenario, seed=seed))
         result = calibrate(recorded.intrinsics, stick, recorded.messages)
         assert not result.time_sigma_ms.any()
         assert not result.drift_sigma_ppm.any()

@@ -1,36 +1,36 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A clock that is set while the wand is waved is named; nothing else is taken for one."""
+"""A clock that jumps during the recording is named; other clocks are not."""
 
 import msgspec
 import pytest
 
 from calib.wand.calibrate import calibrate
-from calib.wand.outcome import WandCalibration
+from calib.wand.result import WandCalibration
+from tests.calib.recordings import EPOCH_S, WandScenario, record
 from tests.calib.synthetic import OLD, roughly
-from tests.calib.wave import EPOCH_S, Wave, record
 
 
-def waved(
-    wave: Wave, camera: str = "", at_s: float = 0.0, ms: float = 0.0, rough: bool = False
+def calibrated(
+    scenario: WandScenario, camera: str = "", at_s: float = 0.0, ms: float = 0.0, rough: bool = False
 ) -> WandCalibration:
-    """Of a wave in which a camera's stamps jump."""
-    recorded, at_ns = record(wave), (EPOCH_S + at_s) * 1e9
+    """Calibrate a recording in which a camera's stamps jump."""
+    recorded, at_ns = record(scenario), (EPOCH_S + at_s) * 1e9
     messages = [
         msgspec.structs.replace(m, t_ns=m.t_ns + round(ms * 1e6))
         if m.camera == camera and m.t_ns > at_ns
         else m
         for m in recorded.messages
     ]
-    rig = roughly(recorded.intrinsics, OLD, seed=wave.seed) if rough else recorded.intrinsics
-    return calibrate(rig, wave.wand, messages)
+    rig = roughly(recorded.intrinsics, OLD, seed=scenario.seed) if rough else recorded.intrinsics
+    return calibrate(rig, scenario.wand, messages)
 
 
 @pytest.mark.parametrize(("seed", "camera", "ms"), [(3, "cam01", -20.0)])
 def test_a_clock_that_jumps_is_named(seed: int, camera: str, ms: float):
-    """By how much, to four standard deviations and a tenth of a millisecond, which drifts by 50 ppm leave in some
-    seconds; when, to half a second, in which the camera may have seen nothing."""
-    wave = Wave(cameras=6, seconds=40, rate_hz=30, seed=seed)
-    result = waved(wave, camera, 20.0, ms)
+    """The size is right within four standard deviations and 0.1 ms, which drifts of 50 ppm leave in some seconds; the
+    time within 0.5 s, in which the camera may not see the wand."""
+    scenario = WandScenario(cameras=6, seconds=40, rate_hz=30, seed=seed)
+    result = calibrated(scenario, camera, 20.0, ms)
     jump = result.jump
     assert jump is not None
     assert jump.camera == camera
@@ -38,12 +38,12 @@ def test_a_clock_that_jumps_is_named(seed: int, camera: str, ms: float):
     assert jump.sigma_ms < 0.5
     assert jump.at_s == pytest.approx(20.0, abs=0.5)
     assert set(result.as_dict()["clock_jump"]) == {camera}
-    assert "its clock jumps by" in jump.words()
+    assert "its clock jumps by" in jump.sentence()
 
 
-def test_a_camera_that_is_left_out_for_its_clock_is_told_so():
-    """A tenth of a second half way: half of what it saw contradicts the others."""
-    result = waved(Wave(cameras=6, seconds=40, rate_hz=30, seed=6), "cam03", 20.0, 100.0)
+def test_the_reason_of_a_camera_that_is_left_out_names_its_clock():
+    """A jump of 0.1 s half way: half of the camera's observations contradict the others."""
+    result = calibrated(WandScenario(cameras=6, seconds=40, rate_hz=30, seed=6), "cam03", 20.0, 100.0)
     assert "its clock jumps by +" in result.report.unplaced["cam03"]
     assert len(result.names) == 5
 
@@ -51,6 +51,6 @@ def test_a_camera_that_is_left_out_for_its_clock_is_told_so():
 @pytest.mark.parametrize("rough", [False, True])
 @pytest.mark.parametrize("drift_ppm", [50.0, 800.0])
 def test_ordinary_clocks_do_not_jump(drift_ppm: float, rough: bool):
-    """Not those that drift as crystals do, nor those that a time service slews, whatever the lenses."""
-    wave = Wave(cameras=5, seconds=20, rate_hz=30, drift_ppm=drift_ppm, seed=2)
-    assert waved(wave, rough=rough).jump is None
+    """Neither free-running crystals nor clocks that a time service slews, with good and with inaccurate lenses."""
+    scenario = WandScenario(cameras=5, seconds=20, rate_hz=30, drift_ppm=drift_ppm, seed=2)
+    assert calibrated(scenario, rough=rough).jump is None

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Adjusts a rough rig in stages: robustly on few frame sets, then exactly on more, with the clocks that these show."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import CalibrationError
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
+from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
+from calib.wand.bundle_adjustment.problem import (
+    CRYSTAL_DRIFT,
+    SLEWED_DRIFT,
+    Estimate,
+    WandObservations,
+)
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
+from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
+from calib.wand.trajectory import acceleration_density
+from camera_node.arrays import Array
+
+COARSE_SETS, FINE_SETS = 250, 800  # frame sets of either stage
+MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
+
+
+@dataclass(frozen=True, slots=True)
+class RoughRig:
+    """The start of an adjustment.
+
+    Attributes:
+        cameras: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = stamp + offset.
+        metric: whether the start has the world's scale.
+        distance: two cameras and their measured distance, which gives the scale where the wand has no length.
+    """
+
+    cameras: Array
+    offset_s: Array
+    metric: bool
+    distance: tuple[int, int, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The adjusted rig, and its observations of the discs' own centres."""
+
+    adjusted: Adjusted
+    observations: WandObservations
+
+
+def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
+    """Adjust a rough rig by a recording of the wand.
+
+    Where nothing gives the scale, the two cameras farthest apart are put 1 m apart.
+
+    Raises:
+        CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
+        CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
+    """
+    rough = _scale(rough)
+    coarse = _adjust_coarsely(recording, rough)
+    check_lenses(recording.names, coarse)
+    coarse = inflate_covariance(coarse)
+    clocks = _choose_clocks(coarse)
+    fine = _prepare_fine(recording, rough, coarse, clocks)
+    solution = _adjust_finely(fine, coarse.inflation)
+    check_agreement(recording.names, solution.adjusted, solution.observations)
+    if rough.metric:
+        check_sizes(recording.wand, solution.adjusted, solution.observations)
+        check_spacing(recording.wand, solution.adjusted, solution.observations)
+    return replace(solution, adjusted=inflate_covariance(solution.adjusted))
+
+
+def _scale(rough: RoughRig) -> RoughRig:
+    """The rig scaled to the measured distance, or to 1 m between the farthest cameras if it has no scale."""
+    if rough.distance is None and rough.metric:
+        return rough
+    a, b, wanted = rough.distance or (*_farthest(rough.cameras)[:2], 1.0)
+    cameras = rough.cameras.copy()
+    cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
+    return replace(rough, cameras=cameras)
+
+
+def _farthest(cameras: Array) -> tuple[int, int, float]:
+    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
+    return int(a), int(b), float(gaps[a, b])
+
+
+def _build(recording: LabeledRecording, rough: RoughRig, budget: int) -> Estimate:
+    start = build_problem(recording, rough.cameras, rough.offset_s, budget)
+    if start is None:
+        raise CalibrationError(
+            "the wand's lengths do not fit the detections; check the wand file, and that the rig file has the "
+            "intrinsics of these cameras"
+        )
+    if len(start.problem.wand.lengths):
+        return start
+    distance = rough.distance or _farthest(rough.cameras)
+    return replace(start, problem=replace(start.problem, fixed_distance=distance))
+
+
+def _adjust_coarsely(recording: LabeledRecording, rough: RoughRig) -> Adjusted:
+    """Adjust poses, clocks and lenses on few frame sets, after a robust optimization of poses and clocks."""
+    start = _build(recording, rough, COARSE_SETS)
+    clocks = (OFFSET, DRIFT) if np.ptp(start.problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
+    problem = start.problem.with_free(POSE, *clocks)
+    state = optimize_robustly(problem, start.observations, start.state)
+    # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
+    # motion absorbs noise and the residuals are too small.
+    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.gap_s)
+    problem = replace(problem.with_free(problem.free, LENS), density=density)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    return adjust(problem, observations, state)
+
+
+@dataclass(frozen=True, slots=True)
+class _ClockModel:
+    """Groups of clock parameters that are free, (C, 2) initial offsets and drifts, and the prior of the drift."""
+
+    free: tuple[tuple[int, ...], ...]
+    clocks: Array
+    drift_sigma: float
+
+
+def _choose_clocks(coarse: Adjusted) -> _ClockModel:
+    """Which clock parameters the recording shows. With an offset, the drift is free too: a clock that runs on its own
+    drifts, though a short recording may not show it."""
+    candidates = tuple(group for group in (OFFSET, DRIFT) if group[0] in coarse.problem.free)
+    shown = tuple(group for group in candidates if _is_significant(coarse, group))
+    free = candidates if OFFSET in shown else shown
+    clocks = np.where([OFFSET in shown, DRIFT in shown], coarse.state.clocks, 0.0)
+    return _ClockModel(free, clocks, SLEWED_DRIFT if DRIFT in shown else CRYSTAL_DRIFT)
+
+
+def _is_significant(coarse: Adjusted, group: tuple[int, ...]) -> bool:
+    """Whether the clocks differ in a parameter, by Schwarz's criterion (BIC) with the inflated covariance and the
+    number of independent observations that it implies."""
+    values = coarse.state.clocks[:, group[0] - OFFSET[0]]
+    values = values - values.mean()
+    cov = camera_covariance(coarse).of(group)[:, 0, :, 0]
+    squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
+    return bool(squared > (len(values) - 1) * np.log(2 * coarse.used.sum() / coarse.inflation))
+
+
+def _prepare_fine(
+    recording: LabeledRecording, rough: RoughRig, coarse: Adjusted, clocks: _ClockModel
+) -> Estimate:
+    """The problem of the fine stage, from the coarse stage's cameras, lenses and clocks."""
+    lenses = [coarse.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
+    start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
+    state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses)
+    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.gap_s)
+    problem = start.problem.with_free(POSE, LENS, *clocks.free)
+    problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    return Estimate(problem, state, observations)
+
+
+def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1)
+    problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
+    return Solution(adjust(problem, fine.observations, first.state), fine.observations)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Builds the bundle adjustment of a labeled recording: its frame sets, the initial motion, and the observations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_frames
+from calib.wand.bundle_adjustment.initial_motion import initial_positions
+from calib.wand.bundle_adjustment.lens_prior import usual_sigma
+from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
+from calib.wand.detections import WandDetections
+from calib.wand.tracks import MarkerTrack
+from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
+from camera_node.arrays import Array, Index
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+
+MIN_SIGMA_PX = 0.02  # error of every lens model, in addition to the covariance of the detector
+MIN_KNOTS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LabeledRecording:
+    """The labeled detections of C placed cameras, numbered 0 to C - 1.
+
+    Attributes:
+        detections: of these cameras.
+        names, lenses: of the cameras.
+        tracks: by camera and marker, by stamps.
+        wand: that was recorded.
+        period_s: frame period of the cameras; 0 if unknown.
+        gap_s: longest time over which the motion is interpolated.
+        middle_s: stamp in the middle of the recording, at which time offsets are defined.
+    """
+
+    detections: WandDetections
+    names: Sequence[str]
+    lenses: Sequence[Lens]
+    tracks: Sequence[Sequence[MarkerTrack]]
+    wand: Body
+    period_s: float
+    gap_s: float
+    middle_s: float
+
+    def undistort_tracks(self, lenses: Sequence[Lens]) -> "LabeledRecording":
+        """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
+        tracks = [
+            [
+                MarkerTrack.of(
+                    track.t_s, new.normalise(old.project(np.column_stack([track.xy, np.ones(len(track.xy))])))
+                )
+                for track in mine
+            ]
+            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
+        ]
+        return replace(self, tracks=tracks)
+
+
+def build_problem(
+    recording: LabeledRecording, cameras: Array, offset_s: Array, budget: int
+) -> Estimate | None:
+    """Build the problem around a rig that is nearly right.
+
+    Args:
+        recording: labeled detections.
+        cameras: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = stamp + offset.
+        budget: number of frame sets to use, about.
+
+    Returns:
+        the problem with its start; None where fewer than two frame sets give the wand's position.
+    """
+    rows, knot, knot_s = _choose_detections(recording, offset_s, budget)
+    wand, gap_s = AffineWand.of(recording.wand), recording.gap_s
+    basis = initial_positions(recording.tracks, wand, cameras, offset_s, knot_s, gap_s)
+    known = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
+    if known.sum() < MIN_KNOTS:
+        return None
+    renumbered = np.cumsum(known) - 1
+    rows, knot = rows[known[knot]], renumbered[knot[known[knot]]]
+    knot_s, basis = knot_s[known], basis[known]
+    density = acceleration_density(knot_s, basis, gap_s)
+    lens_sigma = np.array([usual_sigma(lens) for lens in recording.lenses])
+    problem = Problem(list(recording.lenses), wand, knot_s, gap_s, density, recording.middle_s, lens_sigma)
+    motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
+    return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
+
+
+def _choose_detections(
+    recording: LabeledRecording, offset_s: Array, budget: int
+) -> tuple[Index, Index, Array]:
+    """The n detections of the chosen frame sets, (n,) their knots, and (K,) the knots' times."""
+    detections = recording.detections
+    true_s = detections.t_s + offset_s[detections.camera]
+    order = np.argsort(true_s, kind="stable")
+    frame_set = _frame_sets(recording, true_s, order)
+    rows = order[frame_set[order] >= 0]
+    sizes = np.array([(lens.width, lens.height) for lens in recording.lenses], float)
+    chosen = choose_frame_sets(detections.select(rows), frame_set[rows], sizes, budget)
+    rows = rows[chosen[frame_set[rows]]]
+    knot = np.unique(frame_set[rows], return_inverse=True)[1]
+    return rows, knot, _middle_times(true_s[rows], knot)
+
+
+def _frame_sets(recording: LabeledRecording, true_s: Array, order: Index) -> Index:
+    """(n,) the frame set of every detection, -1 where only one camera has a frame."""
+    detections = recording.detections
+    frames, first, back = np.unique(detections.frame[order], return_index=True, return_inverse=True)
+    t_s, camera = true_s[order][first], detections.camera[order][first]
+    by_time = np.argsort(t_s, kind="stable")
+    of_frame = np.empty(len(frames), np.intp)
+    of_frame[by_time] = group_frames(t_s[by_time], camera[by_time], recording.period_s)
+    frame_set = np.empty(len(order), np.intp)
+    frame_set[order] = of_frame[back]
+    return frame_set
+
+
+def _middle_times(t_s: Array, knot: Index) -> Array:
+    """(K,) the middle between the first and the last time of each knot: two knots are never close together."""
+    low, high = np.full(knot.max() + 1, np.inf), np.full(knot.max() + 1, -np.inf)
+    np.minimum.at(low, knot, t_s)
+    np.maximum.at(high, knot, t_s)
+    return (low + high) / 2
+
+
+def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> WandObservations:
+    detections = recording.detections.select(rows)
+    return WandObservations(
+        camera=detections.camera,
+        knot=knot,
+        label=detections.label,
+        t_s=detections.t_s,
+        stamp_sigma_s=detections.stamp_sigma_s,
+        uv=detections.uv,
+        cov=detections.cov + MIN_SIGMA_PX**2 * np.eye(2),
+        axes_px=detections.axes_px,
+        angle_rad=detections.angle_rad,
+    )

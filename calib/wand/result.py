@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The result of a wand calibration: the rig, the adjustment behind it, and the figures for users and `rig.yaml`."""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.optimizer import Adjusted
+from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.scale import Distance, DistanceComparison
+from camera_node.arrays import Array
+
+NOT_RECORDED = "it is not in the recording"  # reason of a camera without detections messages
+
+
+@dataclass(frozen=True, slots=True)
+class CameraReport:
+    """Figures of one placed camera.
+
+    Attributes:
+        frames, frames_used: frames with the wand, and those that the adjustment used.
+        observations, outliers: marker centres used and rejected.
+        residual_px: RMS distance of detected from expected centres.
+        sigma_mm: expected error of the position along one axis.
+        left_out: number of frames that were not used, by reason.
+    """
+
+    name: str
+    frames: int
+    frames_used: int
+    observations: int
+    outliers: int
+    residual_px: float
+    sigma_mm: float
+    left_out: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Outlier:
+    """A rejected marker centre: seconds after the first frame, and pixels from the expected centre."""
+
+    camera: str
+    t_s: float
+    marker: int
+    off_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClockJump:
+    """A jump of a camera's timestamps by `ms` with standard deviation `sigma_ms`, at `at_s`, seconds after the first
+    frame of the recording."""
+
+    camera: str
+    ms: float
+    sigma_ms: float
+    at_s: float
+
+    def sentence(self) -> str:
+        """State the jump and its remedy."""
+        return (
+            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s: make "
+            "sure that nothing sets it and that no frames are dropped, and wave the wand again"
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the entry for the `calibration` map of `rig.yaml`."""
+        return {"ms": round(self.ms, 2), "sigma": round(self.sigma_ms, 2), "at_s": round(self.at_s, 2)}
+
+
+@dataclass(frozen=True, slots=True)
+class WandReport:
+    """Figures of a wand calibration.
+
+    Attributes:
+        cameras: of the placed cameras.
+        unplaced: the reason for each camera without a pose.
+        wand_poses: number of estimated poses of the wand.
+        scale: residuals over the standard deviations that the detector gives.
+        length_mean_mm, length_std_mm: measured less nominal lengths of the wand; None with one marker.
+        outliers: the rejected marker centres, worst first.
+        metric: whether the scale is known.
+        sigma_inflation: factor of the standard deviations for the correlation of residuals in time.
+        scaled_by: the measured distance that gives the scale.
+        compared: a measured distance compared with the wand.
+        adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
+    """
+
+    cameras: list[CameraReport]
+    unplaced: dict[str, str]
+    wand_poses: int
+    scale: float
+    length_mean_mm: float | None
+    length_std_mm: float | None
+    outliers: list[Outlier]
+    metric: bool
+    sigma_inflation: float
+    scaled_by: Distance | None
+    compared: DistanceComparison | None
+    adjusted_lenses: dict[str, Any]
+
+    @property
+    def residual_px(self) -> float:
+        """RMS distance of detected from expected centres, over all cameras."""
+        total = sum(row.observations for row in self.cameras)
+        return (sum(row.residual_px**2 * row.observations for row in self.cameras) / total) ** 0.5
+
+    def left_out(self) -> Counter[str]:
+        """Count the frames of placed cameras that were not used, by reason."""
+        return sum((Counter(row.left_out) for row in self.cameras), Counter())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entries for the `calibration` map of `rig.yaml`."""
+        return {
+            "metric": self.metric,
+            "wand_poses": self.wand_poses,
+            "residual_px": round(self.residual_px, 4),
+            "sigma_inflation": round(self.sigma_inflation, 2),
+            "wand_length_error_mm": self._length_error(),
+            **self._distance(),
+            "cameras": {
+                row.name: {
+                    "frames": row.frames_used,
+                    "observations": row.observations,
+                    "outliers": row.outliers,
+                    "residual_px": round(row.residual_px, 4),
+                    "sigma_mm": round(row.sigma_mm, 3),
+                }
+                for row in self.cameras
+            },
+            "left_out": dict(self.left_out()),
+            "unplaced": dict(self.unplaced),
+        }
+
+    def _length_error(self) -> dict[str, float] | None:
+        if self.length_mean_mm is None or self.length_std_mm is None:
+            return None
+        return {"mean": round(self.length_mean_mm, 3), "std": round(self.length_std_mm, 3)}
+
+    def _distance(self) -> dict[str, Any]:
+        compared = {"by_wand_m": round(self.compared.by_wand_m, 5)} if self.compared else {}
+        if (distance := self.compared.distance if self.compared else self.scaled_by) is None:
+            return {}
+        measured = {
+            "cameras": [distance.a, distance.b],
+            "metres": distance.metres,
+            "sigma_m": distance.sigma_m,
+        }
+        return {"distance": measured | compared}
+
+
+@dataclass(frozen=True, slots=True)
+class WandCalibration:
+    """The calibrated rig, its report, and the adjustment.
+
+    Attributes:
+        rig, report: the result.
+        names: of the C placed cameras, the order of all below.
+        adjusted: the adjustment; `observations` are its rows.
+        covariance: (6C, 6C) of all poses together, each in its camera's own frame, rotation then translation; the gauge
+            is the mean of the cameras.
+        time_offset_ms, time_sigma_ms: (C,) true time = timestamp + offset in the middle of the recording, median 0; and
+            standard deviations, 0 if the data need no offsets.
+        drift_ppm, drift_sigma_ppm: (C,) growth of the offsets, microseconds per second, mean 0; and standard
+            deviations.
+        jump: the clock jump during the recording, if there is one.
+    """
+
+    rig: Rig
+    report: WandReport
+    names: list[str]
+    adjusted: Adjusted
+    observations: WandObservations
+    covariance: Array
+    time_offset_ms: Array
+    time_sigma_ms: Array
+    drift_ppm: Array
+    drift_sigma_ppm: Array
+    jump: ClockJump | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the `calibration` map of `rig.yaml`: report, clocks if the data need them, and changes of lenses."""
+        columns = {
+            "time_offset_ms": (self.time_offset_ms, self.time_sigma_ms),
+            "drift_ppm": (self.drift_ppm, self.drift_sigma_ppm),
+        }
+        clocks = {key: self._by_camera(*column) for key, column in columns.items() if (column[1] > 0).any()}
+        jump = {"clock_jump": {self.jump.camera: self.jump.as_dict()}} if self.jump else {}
+        return {**self.report.as_dict(), **clocks, **jump, "adjusted_lenses": self.report.adjusted_lenses}
+
+    def _by_camera(self, values: Array, sigmas: Array) -> dict[str, dict[str, float]]:
+        return {
+            name: {"value": round(float(value), 4), "sigma": round(float(sigma), 4)}
+            for name, value, sigma in zip(self.names, values, sigmas, strict=True)
+        }

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "blur/acceptance.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace roundel {
+
+namespace {
+
+constexpr double kMisfit = 0.03;        // of the contrast: RMS residual on the ring's edges
+constexpr double kMinSupport = 0.7;     // share of the pixels on the path that are in the image
+constexpr double kMaxMotion = 1.2;      // major axes
+constexpr double kMaxSigma = 0.05;      // standard deviation of the centre, minor axes
+constexpr double kMaxChange = 1.3;      // factor by which contrast and axes differ from the last frame's
+constexpr double kMinMinor = 12;        // pixels: smaller ones cannot be distinguished from clutter
+constexpr double kReach = 0.75;         // minor axes searched around the predicted position, plus
+constexpr double kReachPerSpeed = 0.5;  // so many frames of motion,
+constexpr double kMaxReach = 2.5;       // at most so many minor axes
+
+bool is_accepted(const RoundelFit& fit, const AcceptanceContext& context) {
+    const Symmetric centre = fit.centre_covariance();
+    return is_within_limits(fit, context.limits) &&
+           fit.edge_residual < std::hypot(1.2 * context.noise, kMisfit * (fit.bright - fit.dark)) &&
+           fit.support > kMinSupport &&
+           std::hypot(fit.motion_x, fit.motion_y) < kMaxMotion * fit.outer.major &&
+           std::sqrt(centre.xx + centre.yy) < kMaxSigma * fit.outer.minor;
+}
+
+bool is_similar(double value, double last) { return value < kMaxChange * last && last < kMaxChange * value; }
+
+/// From frame to frame neither the levels nor the view change much.
+bool is_similar(const RoundelFit& fit, const RoundelFit& last) {
+    return is_similar(fit.bright - fit.dark, last.bright - last.dark) &&
+           is_similar(fit.outer.major, last.outer.major) && is_similar(fit.outer.minor, last.outer.minor);
+}
+
+}  // namespace
+
+std::optional<RoundelFit> fit_new_moving(const ImageView& image, const MovingGuess& guess,
+                                         const AcceptanceContext& context) {
+    const auto fit = fit_moving(image, guess);
+    return fit && is_accepted(*fit, context) ? fit : std::nullopt;
+}
+
+std::optional<RoundelFit> fit_known_moving(const ImageView& image, const KnownRoundel& known,
+                                           const AcceptanceContext& context) {
+    const RoundelFit& last = known.last;
+    const auto fit_from = [&](const MovingGuess& guess) {
+        const auto fit = fit_new_moving(image, guess, context);
+        return fit && is_similar(*fit, last) ? fit : std::nullopt;
+    };
+    MovingGuess predicted{{last.outer, last.ratio, last.dark, last.bright}, last.motion_x, last.motion_y};
+    predicted.still.outer.x += known.vx, predicted.still.outer.y += known.vy;
+    if (std::hypot(last.motion_x, last.motion_y) > 0)
+        if (const auto fit = fit_from(predicted)) return fit;
+    const double minor = last.outer.minor;
+    if (minor < kMinMinor) return std::nullopt;
+    const double speed = std::hypot(known.vx, known.vy);
+    const double reach = std::min(kReach * minor + kReachPerSpeed * speed, kMaxReach * minor);
+    for (const MovingMatch& match : MotionBlurMatcher::match_known(image, predicted.still, reach))
+        if (const auto fit = fit_from(match.guess)) return fit;
+    return std::nullopt;
+}
+
+}  // namespace roundel

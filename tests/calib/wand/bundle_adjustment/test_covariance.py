@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Covariances account for residuals that are correlated in time."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from calib.commands.check import split
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
+from calib.wand.result import WandCalibration
+from camera_node.arrays import Array
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections
+from tests.calib.synthetic import Arena, record, ring
+
+SEEDS = range(4)
+
+
+def with_correlated_errors(messages: list[Detections], seed: int) -> list[Detections]:
+    """Shift all centres of a camera together by 0.3 px RMS, with periods of 1 to 4 s."""
+    rng = np.random.default_rng(seed)
+    names = sorted(Counter(message.camera for message in messages))
+    rate = 2 * np.pi / rng.uniform(1, 4, (len(names), 2, 4))
+    phase = rng.uniform(0, 2 * np.pi, rate.shape)
+    moved = []
+    for message in messages:
+        k = names.index(message.camera)
+        off: Array = 0.3 / np.sqrt(2) * np.sin(rate[k] * message.t_ns * 1e-9 + phase[k]).sum(axis=1)
+        seen = message.unpack()
+        header = {name: getattr(message, name) for name in ("camera", "seq", "t_ns", "width", "height")}
+        moved.append(Detections.pack(Roundels.from_points(seen.uv + off, 0.1, seen.id), **header))
+    return moved
+
+
+def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibration], Agreement]:
+    found = [calibrate(arena.intrinsics, arena.wand, half) for half in split(messages)]
+    return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
+
+
+@pytest.mark.parametrize(("correlated", "expected"), [(False, 1.0), (True, 2.5)])
+def test_halves_agree_within_their_covariance(correlated: bool, expected: float):
+    """Compares the two halves of recordings. The summed chi-square of their differences has the degrees of freedom D as
+    mean and (2 D)^1/2 as standard deviation; with independent errors it is within 4 of these, and the inflation is 1 up
+    to chance.
+
+    Blocks of 1 s see a part of errors with periods up to 4 s: standard deviations are right within a factor of 2;
+    without inflation they are too small by more than 3.5, although adjusted lenses absorb some of these errors.
+    """
+    arena, chi2, degrees, plain, factors = ring(3), 0.0, 0, 0.0, []
+    for seed in SEEDS:
+        messages = record(
+            arena, 20.0, sigma_px=0.1, seed=seed, numbered=True, sized=False, free_running=False
+        )
+        found, agreement = halves(arena, with_correlated_errors(messages, seed) if correlated else messages)
+        chi2, degrees = chi2 + agreement.chi2, degrees + agreement.degrees
+        factor = float(np.mean([half.adjusted.inflation for half in found]))
+        plain, factors = plain + agreement.chi2 * factor, [*factors, factor]
+    if correlated:
+        assert np.mean(factors) > expected
+        assert plain / degrees > 3.5**2
+        assert chi2 / degrees < 2.0**2
+    else:
+        assert np.mean(factors) == pytest.approx(expected, abs=0.15)
+        assert chi2 == pytest.approx(degrees, abs=4 * np.sqrt(2 * degrees))

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Draws a view in a thread, and opens its page in Chromium."""
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+
+from web.view import View
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = [
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--disable-sync",
+    "--disable-component-update",
+    "--no-first-run",
+]
+
+
+@contextmanager
+def drawing(view: View) -> Iterator[None]:
+    """Draw until the block ends, then close the view."""
+    stop = threading.Event()
+    thread = threading.Thread(target=view.run, args=(stop,))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        view.close()
+
+
+@contextmanager
+def browsing(view: View) -> Iterator[Page]:
+    """Open the page of a view; an error on its console fails the test. Skips without Chromium."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed; apt-get install chromium")
+    errors: list[str] = []
+
+    def record(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            errors.append(message.text)
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page.on("console", record)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(view.url)
+        yield page
+        browser.close()
+    assert not errors

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot is defined by clicks on its markers, with a real browser and a real server."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, TimeoutError
+
+from camera_node.protocol.session import open_client
+from fusion.client.arena import Arena as Client
+from tests.conftest import free_port
+from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot
+from tests.fusion.synthetic import WIDE
+from tests.waiting import wait_for
+from tests.web.browser import browsing, drawing
+from web.feed import Feed
+from web.marker_picker import MarkerPicker
+from web.subscription import Subscription
+from web.view import View
+
+
+@pytest.fixture
+def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Client, View, MarkerPicker]]:
+    """The page of a running arena with an undeclared robot.
+
+    The view draws five times a second: the browser has no graphics card and needs the time for clicks.
+    """
+    monkeypatch.setattr("web.view.PERIOD_S", 0.2)
+    monkeypatch.setattr("web.view.PANEL_INTERVAL", 2)
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
+        subscription = Subscription(session, Feed("test"))
+        view = View(subscription.feed, port=free_port())
+        picker = MarkerPicker(view.server, subscription)
+        view.add(picker)
+        with drawing(view):
+            yield client, view, picker
+        subscription.close()
+
+
+def marker_positions() -> np.ndarray:
+    """(3, 3) positions of the robot's markers, world."""
+    R, p = WIDE_MOTION(0.0)
+    return p + WIDE.points @ R.T
+
+
+def pixel(view: View, page: Page, point: np.ndarray) -> tuple[float, float]:
+    """Project a point of the world to the page; the camera of the browser has z forward and y down."""
+    (client,) = view.server.get_clients().values()
+    box = page.locator("canvas").first.bounding_box()
+    assert box is not None
+    ahead = np.subtract(client.camera.look_at, client.camera.position)
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, client.camera.up_direction)
+    right = right / np.linalg.norm(right)
+    to = point - client.camera.position
+    x, y = np.array([to @ right, to @ np.cross(ahead, right)]) / (to @ ahead)
+    focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
+    return box["x"] + box["width"] / 2 + focal * x, box["y"] + box["height"] / 2 + focal * y
+
+
+def click(act: Callable[[], None], page: Page, answer: str) -> None:
+    """Click up to three times until the page shows the answer: a marker may be missing in single messages."""
+    for _ in range(3):
+        act()
+        with contextlib.suppress(TimeoutError):
+            return page.get_by_text(answer).wait_for(timeout=20_000)
+    raise AssertionError(f"three clicks without '{answer}'")
+
+
+def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
+    """Select its markers, enter its name; then the server tracks it, with x towards the first selected marker."""
+    client, view, picker = arena
+    with browsing(view) as page:
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.get_by_role("button", name="Select markers").click()
+        page.get_by_text("click the robot's grey markers").wait_for()
+        page.get_by_text("cam0").first.wait_for()  # the rig is drawn, and the view shows all of it
+        for k, point in enumerate(marker_positions()):
+            click(lambda point=point: page.mouse.click(*pixel(view, page, point)), page, f"{k + 1} selected")
+        assert np.linalg.norm(np.array(picker.selected) - marker_positions(), axis=1).max() < 0.01
+        inputs = "[...document.querySelectorAll('input')].find(input => input.value === 'robot')"
+        name = page.evaluate_handle(inputs).as_element()
+        assert name is not None
+        name.fill("wide")
+        wait_for(lambda: picker._name.value == "wide")
+        define = page.get_by_role("button", name="Define robot")
+        click(define.click, page, "the server looks for wide, of 3 markers")
+    wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
+    robot = client.change_robots()["wide"]
+    assert robot.diameter_m == 0.12
+    first = WIDE.points[0] - WIDE.points.mean(0)
+    assert abs(robot.points[0, 0] - np.linalg.norm(first)) < 2e-3
+    assert picker.selected == []
+
+
+def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
+    """No marker selected; a marker deselected; one that is not there; two markers only; an invalid name."""
+    _, _, picker = arena
+    assert "no marker" in picker.define()
+    picker._toggle()
+    above = marker_positions()[0] + [0.0, 0.0, 2.0]
+    wait_for(lambda: picker.selected, lambda: picker.select(above, (0.0, 0.0, -1.0)))
+    picker.select(above, (0.0, 0.0, -1.0))
+    assert picker.selected == []
+    picker.select(above, (1.0, 0.0, 0.0))
+    assert picker.selected == [], "there is no marker in this direction"
+    picker.selected = [np.array([0.9, 0.9, 0.1])]
+    assert "0.90, 0.90, 0.10 m" in picker.define()
+    picker.selected = list(marker_positions()[:2])
+    assert "make no robot" in picker.define()
+    picker._name.value = "a/b"
+    assert "'a/b'" in picker.define()
+
+
+def test_clicks_select_nothing_before_the_button(arena: tuple[Client, View, MarkerPicker]):
+    _, _, picker = arena
+    wait_for(lambda: len(picker._unlabeled))
+    picker.select(marker_positions()[0] + [0.0, 0.0, 2.0], (0.0, 0.0, -1.0))
+    assert picker.selected == []

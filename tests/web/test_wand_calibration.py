@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A wand session that is started and ended in a real browser calibrates the cameras."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from calib.rig.recording import read_detections, save_wand_recording
+from calib.rig.rig import load_rig, save_rig
+from camera_node.config import dump_yaml
+from camera_node.errors import ConfigError
+from camera_node.protocol.messages import encode
+from camera_node.protocol.session import open_client
+from tests.calib.synthetic import assert_near, record, ring
+from tests.conftest import free_port
+from tests.waiting import wait_for
+from tests.web.arena import LiveArena
+from tests.web.browser import browsing, drawing
+from web.errors import WebError
+from web.subscription import Subscription
+from web.view import View
+from web.wand_calibration import CalibrationFiles, WandSessionPanel, calibrate_cameras, describe_calibration
+
+ARENA = ring(3)
+CALIBRATION_MS = 120_000  # on a busy machine: two processes start, and one calibrates
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> CalibrationFiles:
+    """A rig without extrinsics, and the wand."""
+    save_rig(ARENA.intrinsics, tmp_path / "rig.yaml")
+    (tmp_path / "wand.yaml").write_text(dump_yaml(ARENA.wand))
+    return CalibrationFiles(tmp_path / "rig.yaml", tmp_path / "wand.yaml")
+
+
+@pytest.fixture
+def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
+    """A view that draws, with the button."""
+    view = View(subscription.feed, port=free_port())
+    with drawing(view), closing(WandSessionPanel(view.server, subscription, files)):
+        yield view
+
+
+def test_a_wand_session_in_the_page_calibrates_the_cameras(
+    arena: LiveArena, view: View, files: CalibrationFiles
+):
+    """The rig and the recording are written, the view draws the cameras, and the page shows the grade."""
+    sent = record(ARENA, 8.0)  # no noise
+    with browsing(view) as page, open_client([arena.endpoint]) as session:
+        page.get_by_role("button", name="Start wand session").click()
+        page.get_by_text("waiting for cameras").wait_for(timeout=20_000)
+        for message in sent:
+            key = arena.keys.detections(message.camera)
+            session.put(key, encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
+        for name in ARENA.truth.cameras:
+            page.get_by_text(name).first.wait_for(timeout=20_000)
+        wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
+        page.get_by_role("button", name="End wand session").click()
+        page.get_by_text("; no server is running").wait_for(timeout=CALIBRATION_MS)
+        page.get_by_text("grade").first.wait_for(timeout=20_000)
+        page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
+    saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
+    assert saved <= {(m.camera, m.t_ns) for m in sent}
+    assert len(saved) > len(sent) / 2
+    rig = load_rig(files.rig)
+    assert_near(rig, ARENA.truth, 1e-3, 1e-3)
+    wait_for(lambda: (shown := view.feed.state().rig) and shown.cameras == rig.cameras)
+
+
+def test_a_failed_calibration_names_the_recording(tmp_path: Path, files: CalibrationFiles):
+    """With the reason; the rig file does not change."""
+    recording = tmp_path / "rig.wave.mcap"
+    save_wand_recording(recording, "test", record(ARENA, 2.0))
+    (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
+    before = files.rig.read_bytes()
+    with pytest.raises(WebError, match=r"symmetric.*rig\.wave\.mcap"):
+        calibrate_cameras(recording, files)
+    assert files.rig.read_bytes() == before
+
+
+def test_missing_files_are_found_before_the_page_opens(files: CalibrationFiles):
+    files.check()
+    files.wand.unlink()
+    with pytest.raises(ConfigError, match=r"wand\.yaml"):
+        files.check()
+
+
+def test_a_clock_jump_is_reported():
+    """In the form in which `calib wand` writes it; an empty calibration also has a text."""
+    jump = {"north": {"ms": -19.93, "sigma": 0.1, "at_s": 19.8}}
+    text = describe_calibration({"because": "grade D", "clock_jump": jump})
+    assert text.startswith("grade D")
+    assert "north jumped by -20 ms" in text
+    assert describe_calibration({})

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Defines a new robot from markers that the user selects in the page; `python -m fusion define` does so without one."""
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike
+
+from camera_node.arrays import Array
+from camera_node.config import is_name
+from camera_node.errors import RoundelError
+from fusion.client.define import describe
+from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
+from fusion.errors import FusionError
+from web.drawing import SELECTED
+from web.feed import ArenaState
+from web.panel import escape_markdown, set_content
+from web.subscription import Subscription
+
+MAX_ANGLE_RAD = 0.03  # between the ray of a click and the direction of the selected marker
+MARKERS_S = 1.0  # age up to which the latest markers can be selected
+MEASURE_S = 1.5  # for which the markers of the new robot are measured
+SAME_M = 0.05  # distance up to which a measured marker is the selected one
+SELECT, STOP = "Select markers", "Stop selecting"
+
+
+class MarkerPicker:
+    """The panel's folder "New robot" and the markers that are selected for it."""
+
+    def __init__(self, server: viser.ViserServer, subscription: Subscription) -> None:
+        self.selected: list[Array] = []  # positions (3,), world
+        self._subscription = subscription
+        self._unlabeled = np.empty((0, 3))  # current positions of unlabeled markers that several cameras see
+        self._active = False
+        with server.gui.add_folder("New robot"):
+            self._button = server.gui.add_button(SELECT)
+            self._name = server.gui.add_text("Name", "robot")
+            self._diameter = server.gui.add_number("Black disc, mm", 120.0, min=1.0, max=10_000.0, step=0.1)
+            self._motion = server.gui.add_dropdown("Motion", ("aerial", "ground"))
+            define = server.gui.add_button("Define robot")
+            self._answer = server.gui.add_markdown("")
+        self._cloud = server.scene.add_point_cloud(
+            "/selected",
+            np.zeros((1, 3), np.float32),
+            SELECTED,
+            point_size=0.06,
+            point_shape="circle",
+            visible=False,
+        )
+        self._button.on_click(lambda _: self._toggle())
+        define.on_click(lambda _: set_content(self._answer, escape_markdown(self.define())))
+        server.scene.on_click()(lambda click: self.select(click.ray_origin, click.ray_direction))
+
+    def update(self, state: ArenaState) -> None:
+        """Store the current unlabeled markers, and draw the selected ones."""
+        timed = state.markers
+        if timed is not None and state.age_s(timed) < MARKERS_S:
+            self._unlabeled = timed.message.positions()[timed.message.unlabeled()]
+        self._cloud.visible = bool(self.selected)
+        if self.selected:
+            self._cloud.points = np.array(self.selected, np.float32)
+
+    def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
+        """Select the marker nearest to a ray (world), or deselect it."""
+        ray = np.asarray(direction, float) / np.linalg.norm(direction)
+        to_marker = self._unlabeled - np.asarray(origin, float)
+        angle = np.linalg.norm(np.cross(to_marker, ray), axis=1) / np.maximum(to_marker @ ray, 1e-9)
+        if not self._active or not len(angle) or np.nanmin(angle) > MAX_ANGLE_RAD:
+            return
+        marker = self._unlabeled[np.nanargmin(angle)]
+        others = [point for point in self.selected if np.linalg.norm(point - marker) > SAME_M]
+        self.selected = others if len(others) < len(self.selected) else [*self.selected, marker]
+        self._answer_with(
+            f"{len(self.selected)} selected" if self.selected else "click the robot's grey markers"
+        )
+
+    def define(self) -> str:
+        """Measure the selected markers and have the server track the robot; return the outcome as text."""
+        name = self._name.value
+        try:
+            if not is_name(name):
+                raise FusionError(f"'{name}' is not a valid robot name; use letters, digits, - and _")
+            if not self.selected:
+                raise FusionError("no marker is selected")
+            measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
+            standing = _match_selected(measured, np.array(self.selected))
+            robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
+            self._subscription.define(name, robot)
+        except RoundelError as error:
+            return str(error)
+        self.selected = []
+        return describe(name, robot)
+
+    def _toggle(self) -> None:
+        self._active, self.selected = not self._active, []
+        self._button.label = STOP if self._active else SELECT
+        self._answer_with(
+            "click the robot's grey markers; its x axis points to the first" if self._active else ""
+        )
+
+    def _answer_with(self, text: str) -> None:
+        set_content(self._answer, escape_markdown(text))
+
+
+def _match_selected(measured: StationaryMarkers, selected: Array) -> StationaryMarkers:
+    """Return the measured markers at the selected positions (N, 3), in their order.
+
+    Raises:
+        FusionError: there is no measured marker within `SAME_M` of a selected position.
+    """
+    distance = np.linalg.norm(measured.position - selected[:, None], axis=2)  # selected x measured
+    missing = np.min(distance, axis=1, initial=np.inf) > SAME_M
+    if missing.any():
+        x, y, z = selected[np.argmax(missing)]
+        raise FusionError(
+            f"the marker at {x:.2f}, {y:.2f}, {z:.2f} m moves or is not visible; hold the robot still"
+        )
+    nearest = distance.argmin(1)
+    return StationaryMarkers(measured.position[nearest], measured.normal[nearest])

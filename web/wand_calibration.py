@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Calibrates the cameras from the page with a wand; `python -m calib wand --live` does so in a terminal."""
+
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from calib.live.collect import publish_rig
+from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
+from calib.rig.recording import save_wand_recording, wand_recording_path
+from calib.rig.rig import load_rig
+from camera_node.config import load_yaml
+from camera_node.errors import RoundelError
+from camera_node.geometry.body import Body
+from web.errors import WebError
+from web.panel import escape_markdown, set_content
+from web.subscription import Subscription
+from web.tables import HtmlTable, TableRow
+
+SOLVE_S = 600.0  # limit for `calib wand`
+CLOSE_S = 5.0  # for the recording to be saved when the page closes
+START, END = "Start wand session", "End wand session"
+
+
+@dataclass(frozen=True)
+class CalibrationFiles:
+    """The rig, whose intrinsics are read and whose extrinsics are written, and the wand."""
+
+    rig: Path
+    wand: Path
+
+    def check(self) -> None:
+        """Raise ConfigError or CalibrationError if a file is missing or invalid."""
+        load_rig(self.rig)
+        load_yaml(self.wand, Body)
+
+
+class WandSessionPanel:
+    """The panel's folder "Calibration": records a wand session, then calibrates the cameras from it."""
+
+    def __init__(
+        self, server: viser.ViserServer, subscription: Subscription, files: CalibrationFiles
+    ) -> None:
+        self._subscription, self._files = subscription, files
+        self._lock, self._end_requested = threading.Lock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        with server.gui.add_folder("Calibration"):
+            self._button = server.gui.add_button(START)
+            self._answer = server.gui.add_markdown("")
+            self._cameras = server.gui.add_html("")
+        self._button.on_click(lambda _: self.toggle())
+
+    def toggle(self) -> None:
+        """Start a wand session, or end the current one."""
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                self._end_requested.set()
+                return
+            self._end_requested.clear()
+            self._button.label = END
+            self._thread = threading.Thread(target=self._run, name="wand session", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """End the session and save its recording, without calibrating."""
+        with self._lock:
+            self._closed = True
+            self._end_requested.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        try:
+            self._answer_with(self._calibrate())
+        except RoundelError as error:
+            self._answer_with(str(error))
+        except Exception as error:  # the page must show any failure to the user
+            self._answer_with(f"the calibration failed: {error!r}")
+        finally:
+            self._button.label, self._button.disabled = START, False
+
+    def _calibrate(self) -> str:
+        session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
+        rig, wand = load_rig(files.rig), load_yaml(files.wand, Body)
+        settings = WandSession(rig=rig, wand=wand)
+        collected, reason = run_wand_session(session, arena, settings, self._show, self._end_requested)
+        self._button.disabled = True
+        recording = wand_recording_path(files.rig)
+        save_wand_recording(recording, arena, collected.messages)
+        if self._closed:
+            return ""
+        self._answer_with(f"wand session ended: {reason}; calibrating")
+        calibrate_cameras(recording, files)
+        rig = load_rig(files.rig)
+        publish_rig(session, arena, rig)
+        outcome = describe_calibration(rig.calibration)
+        if self._subscription.feed.state().server_alive:
+            return outcome
+        return f"{outcome}; no server is running: start it with {files.rig}"
+
+    def _show(self, progress: SessionProgress) -> None:
+        rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]
+        table = HtmlTable(("camera", "frames", "image", "shared part"), rows, "no roundel yet")
+        set_content(self._cameras, table.html())
+        self._answer_with(f"{progress.summary}: {progress.advice}")
+
+    def _answer_with(self, text: str) -> None:
+        set_content(self._answer, escape_markdown(text))
+
+
+def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
+    """Run `calib wand` on a recording, in its own process because GTSAM holds the GIL; it writes the rig file.
+
+    Raises:
+        WebError: it failed, with its error message.
+    """
+    options = ["--recording", recording, "--wand", files.wand, "--rig", files.rig, "--out", files.rig]
+    command = [sys.executable, "-m", "calib", "wand", *map(str, options)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=SOLVE_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise WebError(
+            f"the calibration did not end within {SOLVE_S:.0f} s; the recording is {recording}"
+        ) from None
+    if done.returncode:
+        error = done.stderr.strip().removeprefix("error: ") or f"calib wand ended with {done.returncode}"
+        raise WebError(f"{error}; the recording is {recording}")
+
+
+def describe_calibration(calibration: dict[str, Any]) -> str:
+    """Describe the quality of a calibration that `calib wand` wrote, with instructions for the user."""
+    text = calibration.get("because", "the cameras are calibrated")
+    if expected := calibration.get("expected_mm"):
+        text += f"; expected error {expected['median']:.1f} mm, at most {expected['worst']:.1f} mm"
+    for name, jump in calibration.get("clock_jump", {}).items():
+        text += (
+            f"; the clock of {name} jumped by {jump['ms']:.0f} ms: "
+            "make sure that no program sets it, and record a new wand session"
+        )
+    return text
