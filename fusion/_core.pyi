@@ -7,121 +7,108 @@ Index = NDArray[np.intp]
 CAUCHY: float
 NOMINAL_WEIGHT: float
 MIN_PARALLAX: float
+SLACK_PX: float
 
-class Poses:
-    """Every body in every frame, at the frame's own time."""
+class BodyStates:
+    """The states of B bodies."""
 
-    def __init__(
-        self, R: Array, p: Array, omega: Array, v: Array, R_cam_world: Array, centres: Array, tau: Array, /
-    ) -> None:
-        """B bodies, R (B, 3, 3) and the rest (B, 3); F frames, R_cam_world (F, 3, 3), centres (F, 3), tau (F,)."""
+    def __init__(self, R: Array, p: Array, omega: Array, v: Array, /) -> None:
+        """R (B, 3, 3); p, omega and v (B, 3), world frame."""
 
-    def view(self, frame: Index, body: Index, marker: Array, radius: Array, /) -> Array:
-        """(11, N): centre, normal and q, camera frame, and the outline's centre xy, NaN where it can't be seen."""
+class CameraExposures:
+    """The camera poses of F frames."""
 
-    def linearise(
-        self,
-        frame: Index,
-        body: Index,
-        marker: Array,
-        radius: Array,
-        xy: Array,
-        whiten: Array,
-        single: NDArray[np.bool_],
-        /,
+    def __init__(self, R_cam_world: Array, centres: Array, tau: Array, /) -> None:
+        """R_cam_world (F, 3, 3), centres (F, 3); tau (F,) seconds after the time of the body states."""
+
+class DiscColumns:
+    """N discs, each in one frame and on one body."""
+
+    def __init__(self, frame: Index, body: Index, position: Array, radius: Array, /) -> None:
+        """Frame, body and radius (N,); position (3, N) in the frame of the body."""
+
+class FramePoses:
+    """The poses of all bodies at the capture times of all frames."""
+
+    def __init__(self, bodies: BodyStates, exposures: CameraExposures, /) -> None: ...
+    def views(self, discs: DiscColumns, /) -> Array:
+        """(11, N): centre, normal and q, camera frame, and the outline's centre xy, NaN behind the camera."""
+
+    def linearize_centres(
+        self, discs: DiscColumns, xy: Array, whiten: Array, single: NDArray[np.bool_], /
     ) -> Array:
-        """(N, 2, 13) whitened equations A delta = b of the bodies' errors, each A and then b; zeros if unseen.
+        """(N, 2, 13) whitened equations A delta = b of body errors, as A and then b; zeros where not visible.
 
         xy (2, N), whiten (2, 2, N), single (B,).
         """
 
-    def linearise_outlines(
-        self,
-        frame: Index,
-        body: Index,
-        marker: Array,
-        radius: Array,
-        axes: Array,
-        angle: Array,
-        scale: Array,
-        sigma: Array,
-        /,
+    def linearize_outlines(
+        self, discs: DiscColumns, axes: Array, angle: Array, scale: Array, sigma: Array, /
     ) -> Array:
-        """(N, 2, 13) likewise of shears: axes (2, N), angle (N,), scale (2, 2, N), sigma (N,)."""
+        """(N, 2, 13) whitened equations of shears: axes (2, N), angle (N,), scale (2, 2, N), sigma (N,)."""
+
+class DetectionColumns:
+    """N detections sorted by frame."""
+
+    def __init__(self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, /) -> None:
+        """Frame and major (N,), xy (2, N), scale and cov (2, 2, N)."""
 
 class ExpectedMarkers:
-    """M markers of bodies that are followed, and how well their places are predicted."""
+    """M markers of tracked bodies, with the covariances of their positions."""
 
-    def __init__(self, R: Array, P: Array, body: Index, marker: Array, radius: Array, /) -> None:
-        """Bodies' R (B, 3, 3) and P (B, 12, 12); of each marker the body, the place (3, M) in it and the radius."""
+    def __init__(self, R: Array, P: Array, body: Index, position: Array, radius: Array, /) -> None:
+        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,) and position (3, M) by marker."""
 
     def covariances(self, tau: float, /) -> Array:
-        """(M, 3, 3) of places in the world, tau seconds after the instant."""
+        """(M, 3, 3) covariances of world positions, tau seconds after the time of the states."""
 
     def candidates(
-        self,
-        poses: Poses,
-        frame: Index,
-        xy: Array,
-        scale: Array,
-        cov: Array,
-        major: Array,
-        focal: Array,
-        /,
+        self, poses: FramePoses, detections: DetectionColumns, focal: Array, /
     ) -> tuple[Index, Array]:
-        """(2, K) markers and detections within each other's gates, and (K,) what each pair costs.
+        """(2, K) rows of markers and detections within each other's gates, and their costs (K,).
 
-        N detections in order of their frames: xy (2, N), scale and cov (2, 2, N), major (N,); focal (F,) by frame.
+        focal (F,) pixels, by frame.
         """
 
+class Viewpoints:
+    """The cameras of F frames."""
+
+    def __init__(self, camera: Index, centres: Array, moved: Array, /) -> None:
+        """Camera (F,), a row of the centres (C, 3); moved (F,) metres of the fastest marker until the frame."""
+
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
-    """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) the derivatives of pixels by these.
+    """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) Jacobians of pixels by coordinates.
 
     cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
     """
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
-    """(2, N) of measured ellipses, as discs should look with centre and normal (3, N)."""
+    """(2, N) shears of measured ellipses relative to discs with centre and normal (3, N), camera frame."""
 
 def predict(
-    R: Array,
-    p: Array,
-    omega: Array,
-    v: Array,
-    P: Array,
-    dt: Array,
-    densities: Array,
-    single: NDArray[np.bool_],
-    /,
+    bodies: BodyStates, P: Array, dt: Array, densities: Array, single: NDArray[np.bool_], /
 ) -> tuple[Array, Array, Array, Array]:
-    """R (N, 3, 3), p (N, 3) and P (N, 12, 12) after dt (N,) seconds, and T (N, 3, 3): turns' errors by rates'.
+    """R (N, 3, 3), p (N, 3) and P (N, 12, 12) after dt (N,) seconds, and the blocks T (N, 3, 3) of F.
 
-    densities (N, 2) and single (N,) as `fusion.model.states.predict` has them.
+    densities (N, 2) and single (N,): see `fusion.model.states.predict`.
     """
 
 def reweigh(
-    rows: Array, body: Index, information: Array, right: Array, weights: Array, /
+    equations: Array, body: Index, information: Array, right: Array, weights: Array, /
 ) -> tuple[Array, Array, Array]:
-    """Sums of K priors and N rows by robust weights: information (K, 12, 12), right (K, 12), weights (N,)."""
+    """Adds K priors and N robustly weighted equations: information (K, 12, 12), right (K, 12), weights (N,)."""
 
-def remainder(rows: Array, body: Index, steps: Array, /) -> Array:
-    """(2, N) whitened: what steps (K, 12) leave of the rows."""
+def residuals(equations: Array, body: Index, steps: Array, /) -> Array:
+    """(2, N) whitened residuals of the equations after steps (K, 12)."""
 
 def inverses(information: Array, /) -> Array:
-    """(K, 12, 12) of positive definite matrices; raises RuntimeError where one is not."""
+    """(K, 12, 12) inverses of positive definite matrices; raises RuntimeError for others."""
 
 def densest_ranges(
-    camera: Index,
-    centre: Array,
-    moved: Array,
-    frame: Index,
-    direction: Array,
-    reach: Array,
-    ranges: Array,
-    /,
+    frames: Viewpoints, frame: Index, direction: Array, reach: Array, ranges: Array, /
 ) -> Array:
-    """(N,) the range of each ray at which most rays of other cameras meet it; NaN where none does.
+    """(N,) range of each ray at which most rays of other cameras intersect it; NaN without intersections.
 
-    Of F frames the camera (F,), a row of the centres (C, 3), and how far a marker moves until then (F,); of N rays the
-    frame (N,), direction (N, 3), noise by metre of range (N,) and ranges (N, K, 2): see `native/meetings.hpp`.
+    By ray: frame (N,), direction (N, 3), reach (N,) in metres per metre, ranges (N, K, 2): see
+    `native/ray_intersections.hpp`.
     """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the cameras of a rig should see of discs in the world.
+"""Projects discs into all cameras of a rig.
 
-The equations stand in `native/disc_view.hpp`, their derivatives in `native/linearisation.cpp`. All of it happens in the
-undistorted plane x/z, y/z: `Frame.measure` takes detections there once, as they arrive. Arrays hold one row's N columns
-last, (3, N) for N vectors.
+`native/disc_view.hpp` states the projection, `native/linearization.cpp` its derivatives. All of it works in the
+undistorted image plane x/z, y/z; `CalibratedFrame.measure` undistorts each detection once, on arrival. Arrays store
+columns: (3, N) for N vectors.
 """
 
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from camera_node.arrays import Array, Index
-from fusion._core import Poses
+from fusion import _core
 from fusion.model.states import States
 from fusion.model.undistortion import table_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposures:
-    """F frames: the index of the camera (F,), and capture time less the states' time (F,), seconds."""
+    """F frames: the index of the camera (F,), and the capture time minus the time of the states (F,), seconds."""
 
     camera: Index
     tau: Array
@@ -29,40 +29,43 @@ class Exposures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Discs:
-    """N discs, each in one frame.
+    """N discs, each in one frame and on one body.
 
     Attributes:
-        frame: (N,) row in the exposures.
-        body: (N,) row in the states.
-        row: (N,) tells markers apart.
-        marker: (3, N) centre in the body's frame.
+        frame: (N,) row of the exposures.
+        body: (N,) row of the states.
+        marker: (N,) row of the marker table; identifies the marker.
+        position: (3, N) centre, body frame.
         radius: (N,) of the black disc, metres.
     """
 
     frame: Index
     body: Index
-    row: Index
-    marker: Array
+    marker: Index
+    position: Array
     radius: Array
 
     def __len__(self) -> int:
         return len(self.frame)
 
     @property
-    def columns(self) -> tuple[Index, Index, Array, Array]:
-        """As the core takes them: frame, body, marker and radius."""
-        return self.frame, self.body, self.marker, self.radius
+    def columns(self) -> _core.DiscColumns:
+        """The arrays for the native core."""
+        return _core.DiscColumns(self.frame, self.body, self.position, self.radius)
 
     def select(self, rows: NDArray) -> "Discs":
-        """The columns that a mask or an index array names."""
-        return Discs(*taken(rows, *(getattr(self, name) for name in self.__slots__)))
+        """The columns of a mask or an index array."""
+        return Discs(*take_columns(rows, *(getattr(self, name) for name in self.__slots__)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """What N discs look like, camera frame: centre and normal (3, N), the outline's centre q (3, N) and xy (2, N).
+    """N projected discs.
 
-    `xy` is NaN where a disc is not before its camera.
+    Attributes:
+        centre, normal: (3, N) of the disc, camera frame.
+        q: (3, N) point that projects to the centre of the outline, camera frame.
+        xy: (2, N) centre of the outline, undistorted; NaN where the disc is behind the camera.
     """
 
     centre: Array
@@ -70,59 +73,71 @@ class Views:
     q: Array
     xy: Array
 
-    def select(self, rows: NDArray) -> "Views":
-        """The columns that a mask or an index array names."""
-        return Views(*taken(rows, *(getattr(self, name) for name in self.__slots__)))
-
     @property
     def facing(self) -> Array:
-        """(N,) cosine between the normal and the direction to the camera: above 0 if the print is visible."""
+        """(N,) cosine between the normal and the direction to the camera: positive where the print is visible."""
         along = np.einsum("in,in->n", self.normal, self.centre)
         return -along / np.sqrt(np.einsum("in,in->n", self.centre, self.centre))
 
 
 class CameraArray:
-    """The placed cameras of a rig, by index in the order of `names`."""
+    """The placed cameras of a rig, by index in the order of `names`.
+
+    Attributes:
+        R_cam_world: (C, 3, 3).
+        centres: (C, 3) centres of projection, world frame.
+        focal: (C,) mean focal lengths, pixels.
+        revision: counts the changes of camera poses.
+    """
 
     def __init__(self, cameras: dict[str, Camera]) -> None:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
-        self.cameras = tuple(cameras.values())
-        for camera in self.cameras:
-            table_of(camera)  # before the first frame has to wait for it
-        self._set()
+        self._cameras = dict(cameras)
+        self.revision = 0
+        for camera in cameras.values():
+            table_of(camera)  # so that the first frame does not wait for it
+        self._update()
+
+    def __getitem__(self, name: str) -> Camera:
+        return self._cameras[name]
+
+    def as_dict(self) -> dict[str, Camera]:
+        """A copy of all cameras by name."""
+        return dict(self._cameras)
 
     def place(self, name: str, camera: Camera) -> None:
-        """A camera stands elsewhere."""
-        self.cameras = tuple(camera if k == self.index[name] else old for k, old in enumerate(self.cameras))
-        self._set()
+        """Replace the pose of a camera."""
+        self._cameras[name] = camera
+        self.revision += 1
+        self._update()
 
-    def _set(self) -> None:
-        T = np.array([camera.matrix() for camera in self.cameras]).reshape(-1, 4, 4)
+    def _update(self) -> None:
+        cameras = self._cameras.values()
+        T = np.array([camera.matrix() for camera in cameras]).reshape(-1, 4, 4)
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
-        self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in self.cameras])
+        self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
 
-    def pose(self, states: States, exposures: Exposures) -> Poses:
-        """Bodies at each frame's own time."""
-        bodies = states.R, states.p, states.omega, states.v
-        return Poses(
-            *bodies, self.R_cam_world[exposures.camera], self.centres[exposures.camera], exposures.tau
-        )
+    def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
+        """The poses of all bodies at the capture times of all frames."""
+        k = exposures.camera
+        cameras = _core.CameraExposures(self.R_cam_world[k], self.centres[k], exposures.tau)
+        return _core.FramePoses(states.bodies, cameras)
 
-    def view(self, poses: Poses, discs: Discs) -> Views:
-        """See `Views`."""
-        rows = poses.view(*discs.columns)
+    def views(self, states: States, exposures: Exposures, discs: Discs) -> Views:
+        """Project discs at the capture times of their frames."""
+        rows = self.frame_poses(states, exposures).views(discs.columns)
         return Views(rows[:3], rows[3:6], rows[6:9], rows[9:])
 
     def rays(self, camera: Index, xy: Array) -> Array:
-        """Unit viewing rays (N, 3) in the world of undistorted xy (2, N)."""
+        """Unit viewing rays (N, 3), world frame, of undistorted xy (2, N)."""
         rays = np.column_stack([*xy, np.ones(len(camera))])
         rays /= np.sqrt(np.einsum("ni,ni->n", rays, rays))[:, None]
         return np.einsum("nij,ni->nj", self.R_cam_world[camera], rays)
 
 
-def taken(rows: NDArray, *arrays: NDArray) -> Iterator[NDArray]:
-    """The columns that a mask or an index array names, left along memory, as indexing would not leave them."""
+def take_columns(rows: NDArray, *arrays: NDArray) -> Iterator[NDArray]:
+    """The columns of a mask or an index array, contiguous in memory."""
     rows = np.flatnonzero(rows) if rows.dtype == bool else rows
     return (A.take(rows, -1) for A in arrays)

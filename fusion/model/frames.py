@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Frames as fusion uses them: one camera's, and a set of all cameras'."""
+"""Frames of calibrated cameras, and frame sets."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,10 +14,14 @@ from fusion.model.undistortion import undistort
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedFrame:
-    """A camera's roundels at `t_ns`, its capture time with the calibrated offset; `sent_ns` and `received_ns` live.
+    """The roundels of one frame, undistorted. No later step uses the lens model.
 
-    `xy` (2, N) are their undistorted centres, NaN where the lens has no inverse, and `scale` (2, 2, N) the derivative
-    of raw pixels by `xy`: the lens is used here, and nowhere after.
+    Attributes:
+        t_ns: capture time including the calibrated offset of the camera.
+        xy: (2, N) undistorted centres; NaN where the lens has no inverse.
+        scale: (2, 2, N) Jacobians of raw pixels with respect to `xy`.
+        sent_ns, received_ns: times of the message; 0 offline.
+        exposure_us, detect_us: durations; 0 where unknown.
     """
 
     camera: str
@@ -32,7 +36,7 @@ class CalibratedFrame:
 
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
-        """The frame that a message of a calibrated camera tells of."""
+        """The frame of a message from a calibrated camera."""
         return cls.measure(
             message.camera,
             message.t_ns + round(camera.time_offset_ms * 1e6),
@@ -46,15 +50,15 @@ class CalibratedFrame:
 
     @classmethod
     def measure(
-        cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **arrival: Any
+        cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
-        """The frame of roundels that a lens saw, and what else is known of its way."""
-        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **arrival)
+        """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
+        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **timing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """The frames nearest to `t_ns`, each with a capture time of its own."""
+    """Frames of all cameras near `t_ns`, each with its own capture time."""
 
     t_ns: int
     frames: tuple[CalibratedFrame, ...]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The tables that fusion works on: an instant's detections, the robots' markers, and which is of which."""
+"""Tables of the detections of a frame set, of the markers of all robots, and of the assignments between them."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Index
-from fusion.model.camera_array import CameraArray, Discs, Exposures, taken
+from fusion import _core
+from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionTable:
-    """All N detections of an instant, columns last.
+    """All N detections of a frame set, by columns.
 
     Attributes:
-        exposures: the instant's frames.
-        frame: (N,) row in them.
-        uv, cov: (2, N) raw pixels and (2, 2, N) their noise.
-        axes_px, angle_rad: (2, N) and (N,) of the outline, NaN where unknown.
+        exposures: the frames of the set.
+        frame: (N,) row of the exposures.
+        uv, cov: (2, N) raw pixels and (2, 2, N) their covariances, pixels^2.
+        axes_px, angle_rad: (2, N) full axes and (N,) direction of the major axis of the outline, NaN where unknown.
         xy: (2, N) undistorted; NaN where the lens has no inverse.
-        scale: (2, 2, N) derivative of raw pixels by xy.
+        scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
     """
 
     exposures: Exposures
@@ -44,56 +45,67 @@ class DetectionTable:
 
     @property
     def tau(self) -> Array:
-        """(N,) capture time less the instant's, seconds."""
+        """(N,) capture time minus the time of the frame set, seconds."""
         return self.exposures.tau[self.frame]
 
+    @property
+    def columns(self) -> _core.DetectionColumns:
+        """The arrays for the native core."""
+        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0])
+
     def select(self, rows: NDArray) -> "DetectionTable":
-        """The columns that a mask or an index array names."""
-        of_each = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
-        return DetectionTable(self.exposures, *taken(rows, *of_each))
+        """The columns of a mask or an index array."""
+        arrays = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
+        return DetectionTable(self.exposures, *take_columns(rows, *arrays))
 
     @classmethod
-    def of(cls, instant: FrameSet, optics: CameraArray, floor_px: float) -> "DetectionTable":
-        """The detections of an instant; `floor_px` is added to what detectors say of their noise."""
-        frames = instant.frames
+    def of(cls, frame_set: FrameSet, cameras: CameraArray, floor_px: float) -> "DetectionTable":
+        """The detections of a frame set; `floor_px` is added in quadrature to the noise that detectors report."""
+        frames = frame_set.frames
         exposures = Exposures(
-            np.array([optics.index[frame.camera] for frame in frames], np.intp),
-            np.array([(frame.t_ns - instant.t_ns) * 1e-9 for frame in frames]),
+            np.array([cameras.index[frame.camera] for frame in frames], np.intp),
+            np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
         )
         row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
-        cov = _joined([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))
+        cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))
         cov[[0, 1], [0, 1]] += floor_px**2
         return cls(
             exposures,
             row,
-            _joined([f.roundels.uv.T for f in frames], (2, 0)),
+            _concatenate([f.roundels.uv.T for f in frames], (2, 0)),
             cov,
-            _joined([f.roundels.axes_px.T for f in frames], (2, 0)),
-            _joined([f.roundels.angle_rad for f in frames], (0,)),
-            _joined([f.xy for f in frames], (2, 0)),
-            _joined([f.scale for f in frames], (2, 2, 0)),
+            _concatenate([f.roundels.axes_px.T for f in frames], (2, 0)),
+            _concatenate([f.roundels.angle_rad for f in frames], (0,)),
+            _concatenate([f.xy for f in frames], (2, 0)),
+            _concatenate([f.scale for f in frames], (2, 2, 0)),
         )
 
 
-def _joined(columns: list[Array], empty: tuple[int, ...]) -> Array:
+def _concatenate(columns: list[Array], empty: tuple[int, ...]) -> Array:
     return np.concatenate([np.zeros(empty), *columns], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerTable:
-    """All K markers of all robots: robot (K,), number in the robot (K,), centre (3, K), radius (K,).
+    """All K markers of all robots.
 
-    `first` (R + 1,): robot r has the rows first[r] to first[r + 1].
+    Attributes:
+        robot: (K,) row of the robot.
+        number: (K,) index in the robot.
+        position: (3, K) centre, body frame.
+        radius: (K,) of the black disc, metres.
+        first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
 
     robot: Index
     number: Index
-    marker: Array
+    position: Array
     radius: Array
     first: Index
 
     @classmethod
     def of(cls, robots: list[Robot]) -> "MarkerTable":
+        """The markers of these robots, in order."""
         counts = [len(robot.markers) for robot in robots]
         return cls(
             np.repeat(np.arange(len(robots)), counts),
@@ -103,81 +115,81 @@ class MarkerTable:
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 
+    def __len__(self) -> int:
+        return len(self.robot)
+
     def discs(self, rows: Index, frame: Index) -> Discs:
-        """Markers `rows`, each in a frame."""
-        return Discs(frame, self.robot[rows], rows, self.marker.take(rows, 1), self.radius[rows])
+        """The markers `rows`, each in one frame."""
+        return Discs(frame, self.robot[rows], rows, self.position.take(rows, 1), self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignments:
-    """Rows of the sightings, the rows of the catalogue that they are of, and what remains of each, px^2."""
+    """Rows of the detection table, the rows of the marker table that they belong to, and squared residuals, px^2.
 
-    sighting: Index
-    disc: Index
+    The residuals are NaN before the estimate.
+    """
+
+    detection: Index
+    marker: Index
     squared_px: Array
 
     @classmethod
-    def of(cls, sighting: Index, disc: Index) -> "Assignments":
-        """Matches before any estimate."""
-        return cls(sighting, disc, np.full(len(disc), np.nan))
+    def of(cls, detection: Index, marker: Index) -> "Assignments":
+        """Assignments before the estimate."""
+        return cls(detection, marker, np.full(len(marker), np.nan))
 
     @classmethod
     def none(cls) -> "Assignments":
-        """No match."""
+        """No assignment."""
         return cls.of(np.empty(0, np.intp), np.empty(0, np.intp))
 
     def __len__(self) -> int:
-        return len(self.sighting)
+        return len(self.detection)
 
-    def remaining(self, error_px: Array) -> "Assignments":
-        """The same, with what remains of each (2, N)."""
-        return Assignments(self.sighting, self.disc, np.sum(error_px**2, 0))
+    def with_residuals(self, residuals_px: Array) -> "Assignments":
+        """The same with residuals (2, N)."""
+        return Assignments(self.detection, self.marker, np.sum(residuals_px**2, 0))
 
     def select(self, rows: NDArray) -> "Assignments":
-        """The rows that a mask or an index array names."""
-        return Assignments(self.sighting[rows], self.disc[rows], self.squared_px[rows])
+        """The rows of a mask or an index array."""
+        return Assignments(self.detection[rows], self.marker[rows], self.squared_px[rows])
 
-    def joined(self, other: "Assignments") -> "Assignments":
-        """Both."""
-        return Assignments(*(np.concatenate([getattr(self, k), getattr(other, k)]) for k in self.__slots__))
+    def joined(self, *others: "Assignments") -> "Assignments":
+        """These assignments, then the others."""
+        parts = (self, *others)
+        return Assignments(*(np.concatenate([getattr(part, k) for part in parts]) for k in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedObservations:
-    """N detections and the discs they are of. `whiten` (2, 2, N) takes errors in xy to a standard deviation of 1."""
+    """N detections and their discs. `whiten` (2, 2, N) scales errors in xy to unit covariance."""
 
     discs: Discs
-    seen: DetectionTable
+    detections: DetectionTable
     whiten: Array
 
     @classmethod
     def of(
-        cls, matches: Assignments, sightings: DetectionTable, catalogue: MarkerTable
+        cls, assignments: Assignments, detections: DetectionTable, marker_table: MarkerTable
     ) -> "MatchedObservations":
-        """The matched detections."""
-        return cls.seeing(
-            sightings.select(matches.sighting),
-            catalogue.discs(matches.disc, sightings.frame[matches.sighting]),
-        )
+        """The observations of assignments."""
+        discs = marker_table.discs(assignments.marker, detections.frame[assignments.detection])
+        return cls.of_discs(detections.select(assignments.detection), discs)
 
     @classmethod
-    def seeing(cls, seen: DetectionTable, discs: Discs) -> "MatchedObservations":
-        """Detections of known discs."""
-        return cls(discs, seen, _whiten(seen))
+    def of_discs(cls, detections: DetectionTable, discs: Discs) -> "MatchedObservations":
+        """Detections of known discs, row by row."""
+        return cls(discs, detections, _whiten(detections))
 
     def __len__(self) -> int:
         return len(self.discs)
 
-    def select(self, rows: NDArray) -> "MatchedObservations":
-        """The columns that a mask or an index array names."""
-        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        return MatchedObservations(self.discs.select(rows), self.seen.select(rows), *taken(rows, self.whiten))
 
-
-def _whiten(seen: DetectionTable) -> Array:
-    """L^-1 scale, where L L^T is the detection's covariance."""
-    a = np.sqrt(seen.cov[0, 0])
-    b = seen.cov[0, 1] / a
-    c = np.sqrt(seen.cov[1, 1] - b * b)
-    first = seen.scale[0] / a
-    return np.stack([first, (seen.scale[1] - b * first) / c])
+def _whiten(detections: DetectionTable) -> Array:
+    """L^-1 scale, where L L^T is the covariance of the detection."""
+    a = np.sqrt(detections.cov[0, 0])
+    b = detections.cov[0, 1] / a
+    c = np.sqrt(detections.cov[1, 1] - b * b)
+    first = detections.scale[0] / a
+    return np.stack([first, (detections.scale[1] - b * first) / c])

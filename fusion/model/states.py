@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where robots are and how they move: a batch of rigid bodies with covariance, and their motion model.
+"""States of rigid bodies with covariance, and their motion model.
 
-The error of a state is (delta theta, delta p, delta omega, delta v): R exp(delta theta) in the body's frame, the rest
-added in the world. White noise on acceleration (Bar-Shalom et al. 2001, section 6.2.2) drives it.
+The error of a state is (delta theta, delta p, delta omega, delta v). The rotation is R exp(delta theta), in the body
+frame; the other parts are added in the world frame. White noise on acceleration drives the motion (Bar-Shalom et al.
+2001, section 6.2.2); see docs/fusion_filter.md.
 """
 
 from dataclasses import dataclass
@@ -15,13 +16,13 @@ from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-UNKNOWN_TURN = np.pi**2  # variance of a turn about the normal that nothing tells, rad^2
-UNKNOWN_RATE = 10.0**2  # variance of a turning rate that nothing tells, rad^2/s^2
+UNKNOWN_ROTATION = np.pi**2  # variance of an unobservable rotation about the normal, rad^2
+UNKNOWN_RATE = 10.0**2  # variance of an unobservable angular velocity, rad^2/s^2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """N bodies: R (N, 3, 3) and p (N, 3) in the world, omega and v (N, 3) in the world, P (N, 12, 12)."""
+    """N bodies: R (N, 3, 3), p, omega and v (N, 3), all world frame; P (N, 12, 12)."""
 
     R: Array
     p: Array
@@ -31,7 +32,7 @@ class States:
 
     @classmethod
     def at_rest(cls, R: Array, p: Array, sigmas: tuple[float, float, float, float]) -> "States":
-        """Bodies at R, p and without motion, to the standard deviations of theta, p, omega and v."""
+        """Bodies at R, p with zero velocities, with these standard deviations of theta, p, omega and v."""
         n = len(p)
         P = np.tile(np.diag(np.repeat(np.square(sigmas), 3)), (n, 1, 1))
         return cls(R.copy(), p.copy(), np.zeros((n, 3)), np.zeros((n, 3)), P)
@@ -39,18 +40,27 @@ class States:
     def __len__(self) -> int:
         return len(self.p)
 
+    @property
+    def bodies(self) -> _core.BodyStates:
+        """Poses and velocities for the native core."""
+        return _core.BodyStates(self.R, self.p, self.omega, self.v)
+
     def select(self, rows: NDArray) -> "States":
-        """The rows that a mask or an index array names."""
+        """The rows of a mask or an index array."""
         return States(self.R[rows], self.p[rows], self.omega[rows], self.v[rows], self.P[rows])
 
+    def joined(self, other: "States") -> "States":
+        """These bodies, then the others."""
+        return States(*(np.concatenate([getattr(s, k) for s in (self, other)]) for k in self.__slots__))
+
     def with_rows(self, rows: NDArray, other: "States") -> "States":
-        """A copy in which `other` stands in these rows."""
+        """A copy in which `other` replaces these rows."""
         copies = [getattr(self, name).copy() for name in self.__slots__]
         for copy, name in zip(copies, self.__slots__, strict=True):
             copy[rows] = getattr(other, name)
         return States(*copies)
 
-    def moved(self, delta: Array) -> "States":
+    def retract(self, delta: Array) -> "States":
         """The states displaced by errors (N, 12)."""
         return States(
             self.R @ rotation_from_vector(delta[:, THETA]),
@@ -63,45 +73,49 @@ class States:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """How errors of N bodies move in `dt` (N,) seconds: F adds `turn` (N, 3, 3) of the rate's, dt of the speed's."""
+    """The transition matrices F of the errors of N bodies, by their off-diagonal blocks.
 
-    turn: Array
+    Attributes:
+        T: (N, 3, 3) derivative of the rotation by the angular velocity.
+        dt: (N,) derivative of the position by the velocity, seconds.
+    """
+
+    T: Array
     dt: Array
 
-    def carry(self, errors: Array) -> Array:
+    def multiply(self, errors: Array) -> Array:
         """F @ errors (N, 12, M)."""
         moved = errors.copy()
-        moved[:, THETA] += self.turn @ errors[:, OMEGA]
+        moved[:, THETA] += self.T @ errors[:, OMEGA]
         moved[:, POSITION] += self.dt[:, None, None] * errors[:, VELOCITY]
         return moved
 
     def select(self, rows: NDArray) -> "Transition":
-        """The rows that a mask or an index array names."""
-        return Transition(self.turn[rows], self.dt[rows])
+        """The rows of a mask or an index array."""
+        return Transition(self.T[rows], self.dt[rows])
 
 
 def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[States, Transition]:
-    """Where bodies are after `dt` (N,) seconds.
+    """Predict bodies with constant velocities and white noise on acceleration.
 
     Args:
         states: N bodies.
-        dt: seconds each.
+        dt: (N,) seconds.
         densities: (N, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
-        single: (N,) bodies of one marker: their normal wanders, and no turning rate is claimed.
+        single: (N,) bodies with one marker: their normals follow random walks without an angular velocity.
 
     Returns:
-        the predicted states, P = F P F^T + Q; how an error moves.
+        the predicted states with P = F P F^T + Q, and F.
     """
-    of_each = states.R, states.p, states.omega, states.v, states.P
-    R, p, P, turn = _core.predict(*of_each, dt, densities, single)
-    return States(R, p, states.omega, states.v, P), Transition(turn, dt)
+    R, p, P, T = _core.predict(states.bodies, states.P, dt, densities, single)
+    return States(R, p, states.omega, states.v, P), Transition(T, dt)
 
 
-def forget_turn(P: Array) -> Array:
-    """Covariances (N, 12, 12) of one-marker bodies, their turn about the normal and turning rate unknown again."""
+def reset_unobservable(P: Array) -> Array:
+    """Covariances (N, 12, 12) of single-marker bodies with unknown rotation about the normal and angular velocity."""
     P = P.copy()
     unknown = [2, 6, 7, 8]
     P[:, unknown, :] = 0
     P[:, :, unknown] = 0
-    P[:, unknown, unknown] = [UNKNOWN_TURN, UNKNOWN_RATE, UNKNOWN_RATE, UNKNOWN_RATE]
+    P[:, unknown, unknown] = [UNKNOWN_ROTATION, UNKNOWN_RATE, UNKNOWN_RATE, UNKNOWN_RATE]
     return P

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The inverse of a lens as a table: undistorting is exact but iterative, and every detection of every frame needs it.
+"""Undistorts detections with a table of the inverse lens model, which is iterative and slow.
 
-The image is cut into cells; in each, both undistorted coordinates are polynomials of the third degree in the pixel's
-place, fitted to the exact inverse. A cell where they miss it by `TOLERANCE_PX`, as near the edge of a fisheye, stays
-empty, and what falls in there, or outside the image, is done by the lens itself.
+The table divides the image into cells. In each cell both undistorted coordinates are cubic polynomials of the pixel
+coordinates, fitted to the exact inverse. Cells with errors above `TOLERANCE_PX` stay empty, for example at the edge of
+a fisheye image. Pixels in empty cells or outside the image use the lens model.
 """
 
 from functools import lru_cache
@@ -15,9 +15,9 @@ from camera_node.geometry.lens import Lens
 from fusion import _core
 
 CELL_PX, FINE_CELL_PX = 32, 16
-ENOUGH = 0.99  # share of the cells that must be near the lens; else they are made finer
-TOLERANCE_PX = 1e-3  # a hundredth of a good detection's noise
-TOLERANCE_SCALE = 1e-3  # of the derivative, relative
+ENOUGH = 0.99  # share of accurate cells; below it, the table uses the finer cells
+TOLERANCE_PX = 1e-3  # 1 % of the noise of a good detection
+TOLERANCE_SCALE = 1e-3  # relative, of the Jacobian
 POWERS = (
     (0, 0),
     (1, 0),
@@ -30,31 +30,31 @@ POWERS = (
     (1, 2),
     (0, 3),
 )  # of s and t, in a cell
-NODES = np.cos(np.pi * (np.arange(4) + 0.5) / 4)  # Chebyshev's, of a fit's four samples a side
-CHECKED = np.array([-1.0, 0.0, 1.0])  # where a cubic that was fitted at the nodes errs most
+NODES = np.cos(np.pi * (np.arange(4) + 0.5) / 4)  # Chebyshev nodes of the four samples per side
+CHECKED = np.array([-1.0, 0.0, 1.0])  # where a cubic fitted at the nodes has its largest errors
 
 
 def undistort(lens: Lens, uv: Array) -> tuple[Array, Array]:
-    """Undistorted coordinates of raw pixels, and how these move by them.
+    """Undistort raw pixels.
 
     Args:
-        lens: of the camera that saw them.
+        lens: lens model of the camera.
         uv: (N, 2) raw pixels.
 
     Returns:
         xy: (2, N), within `TOLERANCE_PX` of `Lens.normalise`; NaN where the lens has no inverse.
-        scale: (2, 2, N) the derivative of raw pixels by xy.
+        scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
     """
     xy, scale = table_of(lens).look_up(uv)
     left = np.isnan(xy[0])
     if left.any():
-        xy[:, left], scale[..., left] = _exactly(lens, uv[left])
+        xy[:, left], scale[..., left] = _undistort_exactly(lens, uv[left])
     return xy, scale
 
 
 @lru_cache(maxsize=256)
 def table_of(lens: Lens) -> "UndistortionTable":
-    """The lens's table, made once for all cameras and poses with these intrinsics: 30 to 150 ms."""
+    """The cached table of a lens, shared by cameras with these intrinsics. The first call takes 30 to 150 ms."""
     return _table_of(Lens(**{name: getattr(lens, name) for name in Lens.__struct_fields__}))
 
 
@@ -64,27 +64,29 @@ def _table_of(lens: Lens) -> "UndistortionTable":
 
 
 class UndistortionTable:
-    """A lens's cells, and a ring of empty ones around the image: `coefficients` (rows + 2, columns + 2, 20) of x and y.
+    """The cells of a lens, surrounded by a ring of empty cells.
 
-    They are NaN in empty cells.
+    Attributes:
+        coefficients: (rows + 2, columns + 2, 20) of x and y; NaN in empty cells.
+        cell_px: the side of a cell.
     """
 
     def __init__(self, lens: Lens) -> None:
         self.cell_px = CELL_PX
-        fitted, near = _fit(lens, self.cell_px)
-        if near < ENOUGH:
+        fitted, share = _fit(lens, self.cell_px)
+        if share < ENOUGH:
             self.cell_px = FINE_CELL_PX
-            fitted, near = _fit(lens, self.cell_px)
+            fitted, _ = _fit(lens, self.cell_px)
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
 
     def look_up(self, uv: Array) -> tuple[Array, Array]:
-        """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) pixels' derivatives by these; NaN if empty."""
+        """(2, N) undistorted coordinates of pixels (N, 2) and their (2, 2, N) Jacobians; NaN in empty cells."""
         return _core.look_up(self.coefficients, self.cell_px, np.ascontiguousarray(uv))
 
 
 def _monomials(st: Array) -> Array:
-    """(10, N) the monomials of `POWERS` at s and t (2, N)."""
+    """(10, N) monomials of `POWERS` at s and t (2, N)."""
     M = np.empty((len(POWERS), st.shape[1]))
     M[0], M[1:3] = 1.0, st
     np.multiply(M[1:3], st[0], out=M[3:5])
@@ -95,7 +97,7 @@ def _monomials(st: Array) -> Array:
 
 
 def _derivative(axis: int) -> Array:
-    """(10, 10) D: coefficients c of a polynomial are c @ D of its derivative by s (axis 0) or t."""
+    """(10, 10) D: the derivative of a polynomial c by s (axis 0) or t (axis 1) has the coefficients c @ D."""
     D = np.zeros((len(POWERS), len(POWERS)))
     for k, power in enumerate(POWERS):
         if power[axis]:
@@ -108,34 +110,34 @@ BY_S, BY_T = _derivative(0), _derivative(1)
 
 
 def _fit(lens: Lens, cell_px: int) -> tuple[Array, float]:
-    """(rows, columns, 2, 10) coefficients of x and y, NaN where they miss the lens; the share that does not."""
+    """(rows, columns, 2, 10) coefficients of x and y, NaN in inaccurate cells; and the share of accurate cells."""
     samples, known = _samples(lens, cell_px, NODES)
     fit = np.asarray(np.linalg.pinv(_monomials(_square(NODES)).T), float)
     fitted = np.einsum("cs,rqsk->rqkc", fit, samples[..., :2])
-    near = known & _is_near(fitted, lens, cell_px)
-    fitted[~near] = np.nan
-    return fitted, float(near.sum() / max(known.sum(), 1))
+    accurate = known & _is_accurate(fitted, lens, cell_px)
+    fitted[~accurate] = np.nan
+    return fitted, float(accurate.sum() / max(known.sum(), 1))
 
 
 def _square(side: Array) -> Array:
-    """(2, M * M) s and t of M by M points of a cell, from -1 to 1."""
+    """(2, M * M) s and t of an M x M grid in a cell, from -1 to 1."""
     return np.array(np.meshgrid(side, side)).reshape(2, -1)
 
 
 def _samples(lens: Lens, cell_px: int, side: Array) -> tuple[Array, Mask]:
-    """(rows, columns, M * M, 6) the exact xy and derivatives at points of all cells; which cells know all of them."""
+    """(rows, columns, M * M, 6) exact xy and Jacobians at grid points of all cells; and the cells with all of them."""
     rows, columns = -(-lens.height // cell_px), -(-lens.width // cell_px)
     s, t = _square(side)
     u = ((np.arange(columns)[:, None] + (s + 1) / 2) * cell_px - 0.5)[None]
     v = ((np.arange(rows)[:, None] + (t + 1) / 2) * cell_px - 0.5)[:, None]
     uv = np.stack(np.broadcast_arrays(u, v), -1)
-    xy, scale = _exactly(lens, uv.reshape(-1, 2))
+    xy, scale = _undistort_exactly(lens, uv.reshape(-1, 2))
     values = np.concatenate([xy, scale.reshape(4, -1)]).T.reshape(*uv.shape[:3], 6)
     return values, np.isfinite(values.sum((2, 3)))
 
 
-def _is_near(fitted: Array, lens: Lens, cell_px: int) -> Mask:
-    """(rows, columns) cells whose polynomials are within the tolerances at points that they were not fitted to."""
+def _is_accurate(fitted: Array, lens: Lens, cell_px: int) -> Mask:
+    """(rows, columns) cells whose polynomials are within the tolerances between the fitted points."""
     exact, known = _samples(lens, cell_px, CHECKED)
     at = _monomials(_square(CHECKED))
     xy, by_s, by_t = (np.einsum("rqkc,cs->rqsk", c, at) for c in (fitted, fitted @ BY_S, fitted @ BY_T))
@@ -146,8 +148,8 @@ def _is_near(fitted: Array, lens: Lens, cell_px: int) -> Mask:
     return known & near & (np.abs(off_scale).max((2, 3, 4)) < TOLERANCE_SCALE)
 
 
-def _exactly(lens: Lens, uv: Array) -> tuple[Array, Array]:
-    """(2, N) and (2, 2, N) of pixels (N, 2) by the lens itself."""
+def _undistort_exactly(lens: Lens, uv: Array) -> tuple[Array, Array]:
+    """(2, N) coordinates and (2, 2, N) Jacobians of pixels (N, 2), from the lens model."""
     xy = lens.normalise(uv)
     scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]
     return np.ascontiguousarray(xy.T), np.ascontiguousarray(scale.transpose(1, 2, 0))

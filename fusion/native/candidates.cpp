@@ -6,23 +6,22 @@
 namespace roundel::fusion {
 namespace {
 
-constexpr double kGate = 13.8;       // chi-square with 2 degrees: one detection in a thousand is lost to it
-constexpr double kSlackPx = 0.7;     // what a calibration may be off, added to the gate
-constexpr double kSizeRatio = 1.35;  // between the measured and the predicted major axis, at the most
-constexpr double kSizeSigma = 0.05;  // of the logarithm of that, where the distance is known
-constexpr double kGrazing = 0.1;     // cosine of sight and normal under which a print is not read
+constexpr double kGate = 13.8;  // chi-square with 2 degrees of freedom; rejects one true detection in 1000
+constexpr double kSizeRatio = 1.35;  // largest ratio of the measured and the predicted major axis
+constexpr double kSizeSigma = 0.05;  // of the logarithm of this ratio at a known distance
+constexpr double kGrazing = 0.1;     // smallest cosine of viewing direction and normal of a detectable print
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr double kTinyPx2 = 1e-6;  // squared half axis: what is nearer than its own radius has no outline
+constexpr double kTinyPx2 = 1e-6;  // lower bound of a squared half axis, for discs closer than their radius
 
 /// A symmetric 2 x 2 covariance in the undistorted plane.
-struct Spread {
+struct Covariance2 {
     double xx, xy, yy;
 };
 
-struct Placement {  // a detection, sorted by x
+struct Detection {
     double x, y;
-    Spread noise;
-    int64_t detection;
+    Covariance2 noise;
+    int64_t index;
 };
 
 Matrix block(const double* P, int row, int column) {
@@ -33,67 +32,73 @@ Matrix block(const double* P, int row, int column) {
     return {at(0), at(1), at(2)};
 }
 
-Matrix transposed(const Matrix& A) { return {A.column0(), A.column1(), A.column2()}; }
-
-/// -[w]x: how w x e moves by e, negated.
+/// -[w]x: the derivative of w x e by e, negated.
 Matrix minus_skew(const Vector& w) { return {{0, w.z, -w.y}, {-w.z, 0, w.x}, {w.y, -w.x, 0}}; }
 
-/// The covariance of A e_a + e_b and B e_c + e_d, where e are parts of the state's error.
-Matrix covary(const double* P, const Matrix& A, int a, int b, const Matrix& B, int c, int d) {
-    const Matrix B_T = transposed(B);
-    return (A * block(P, a, c) + block(P, b, c)) * B_T + A * block(P, a, d) + block(P, b, d);
+/// A displacement A e_a + e_b, where e_a and e_b are the parts of a state error at these rows.
+struct Displacement {
+    Matrix A;
+    int a, b;
+};
+
+Matrix cross_covariance(const double* P, const Displacement& u, const Displacement& v) {
+    const Matrix A_T = transposed(v.A);
+    return (u.A * block(P, u.a, v.a) + block(P, u.b, v.a)) * A_T + u.A * block(P, u.a, v.b) +
+           block(P, u.b, v.b);
 }
 
-/// A detection's noise with the calibration's, by the inverse of its scale.
-Spread noise_of(const Scale& s, double uu, double uv, double vv) {
-    const double p = uu + kSlackPx * kSlackPx, q = uv, r = vv + kSlackPx * kSlackPx;
+/// The covariance of detection `k` including the calibration error, in the undistorted plane.
+Covariance2 noise_of(const Detections& detections, size_t k) {
+    const Scale s = Scale::of(detections.scale, k);
+    const double p = detections.cov.at(0, k) + kSlackPx * kSlackPx, q = detections.cov.at(1, k),
+                 r = detections.cov.at(3, k) + kSlackPx * kSlackPx;
     const double det = s.ux * s.vy - s.uy * s.vx, per = 1 / (det * det);
     return {per * (s.vy * s.vy * p - 2 * s.vy * s.uy * q + s.uy * s.uy * r),
             per * ((s.ux * s.vy + s.uy * s.vx) * q - s.vx * s.vy * p - s.ux * s.uy * r),
             per * (s.vx * s.vx * p - 2 * s.vx * s.ux * q + s.ux * s.ux * r)};
 }
 
-/// One frame's detections, which a marker's gate is looked up in.
-class Field {
+/// The detections of one frame, sorted by x for range queries.
+class FrameDetections {
   public:
-    Field(const Detections& seen, size_t first, size_t last) {
+    FrameDetections(const Detections& detections, size_t first, size_t last) {
         for (size_t k = first; k < last; ++k) {
-            const Spread noise =
-                noise_of(Scale::of(seen.scale, k), seen.cov.at(0, k), seen.cov.at(1, k), seen.cov.at(3, k));
-            if (!std::isfinite(seen.xy.at(0, k) + noise.xx + noise.yy)) continue;
-            sorted_.push_back({seen.xy.at(0, k), seen.xy.at(1, k), noise, int64_t(k)});
-            worst_x_ = std::max(worst_x_, noise.xx);
-            worst_y_ = std::max(worst_y_, noise.yy);
+            const Covariance2 noise = noise_of(detections, k);
+            if (!std::isfinite(detections.xy.at(0, k) + noise.xx + noise.yy)) continue;
+            sorted_.push_back({detections.xy.at(0, k), detections.xy.at(1, k), noise, int64_t(k)});
+            max_xx_ = std::max(max_xx_, noise.xx);
+            max_yy_ = std::max(max_yy_, noise.yy);
         }
         std::sort(sorted_.begin(), sorted_.end(), [](const auto& a, const auto& b) { return a.x < b.x; });
     }
+    /// Calls `visit` for a superset of the detections within the gate of a point.
     template <class Visit>
-    void visit_near(double x, double y, const Spread& spread, const Visit& visit) const {
-        const double reach_x = std::sqrt(kGate * (spread.xx + worst_x_));
-        const double reach_y = std::sqrt(kGate * (spread.yy + worst_y_));
+    void visit_near(double x, double y, const Covariance2& covariance, const Visit& visit) const {
+        const double reach_x = std::sqrt(kGate * (covariance.xx + max_xx_));
+        const double reach_y = std::sqrt(kGate * (covariance.yy + max_yy_));
         auto at = std::lower_bound(sorted_.begin(), sorted_.end(), x - reach_x,
-                                   [](const Placement& p, double value) { return p.x < value; });
+                                   [](const Detection& d, double value) { return d.x < value; });
         for (; at != sorted_.end() && at->x < x + reach_x; ++at)
             if (std::abs(at->y - y) < reach_y) visit(*at);
     }
 
   private:
-    std::vector<Placement> sorted_;
-    double worst_x_ = 0, worst_y_ = 0;
+    std::vector<Detection> sorted_;
+    double max_xx_ = 0, max_yy_ = 0;
 };
 
 double square(double x) { return x * x; }
 
-/// A marker as it should look in a frame, and how well that is known; the size by its logarithm.
-struct Expectation {
-    View at;
+/// The predicted view of a marker in one frame, and its covariance.
+struct ExpectedView {
+    DiscView at;
     double radius;
-    Spread spread;
-    double size_variance;
+    Covariance2 covariance;
+    double log_size_variance;
 };
 
-Expectation expect(const ExpectedMarker& marker, const Placed& body, const Exposure& exposure) {
-    const View at = view(body, marker.marker, marker.radius);
+ExpectedView expect(const ExpectedMarker& marker, const BodyInCamera& body, const Exposure& exposure) {
+    const DiscView at = view_disc(body, marker.position, marker.radius);
     const Matrix C = marker.covariance(exposure.tau), &R = exposure.R_cam_world;
     const Vector gx = (1 / at.centre.z) * (R.r0 - at.x * R.r2), gy = (1 / at.centre.z) * (R.r1 - at.y * R.r2);
     const double depth_variance = dot(R.r2 * C, R.r2) / square(at.centre.z);
@@ -103,56 +108,57 @@ Expectation expect(const ExpectedMarker& marker, const Placed& body, const Expos
             square(kSizeSigma) + depth_variance};
 }
 
-double major_of(const View& marker, double radius, const Scale& scale) {
-    const Shape s = outline(marker.centre, marker.normal, radius, scale);
-    const double largest = (s.xx + s.yy + std::hypot(s.xx - s.yy, 2 * s.xy)) / 2;  // eigenvalue
-    return 2 * std::sqrt(std::max(largest, kTinyPx2));
+double major_axis(const DiscView& view, double radius, const Scale& scale) {
+    const Shape s = outline(view.centre, view.normal, radius, scale);
+    const double eigenvalue = (s.xx + s.yy + std::hypot(s.xx - s.yy, 2 * s.xy)) / 2;
+    return 2 * std::sqrt(std::max(eigenvalue, kTinyPx2));
 }
 
-/// What a pair costs, infinity beyond the gates.
-double cost(const Expectation& expected, const Placement& seen, double major, const Scale& scale,
-            double focal) {
-    const double u = seen.x - expected.at.x, v = seen.y - expected.at.y;
-    const double xx = expected.spread.xx + seen.noise.xx, xy = expected.spread.xy + seen.noise.xy,
-                 yy = expected.spread.yy + seen.noise.yy, det = xx * yy - xy * xy;
+/// The cost of a pair; infinity outside the gates.
+double cost(const ExpectedView& expected, const Detection& detection, const Detections& all, double focal) {
+    const double u = detection.x - expected.at.x, v = detection.y - expected.at.y;
+    const Covariance2 &P = expected.covariance, &N = detection.noise;
+    const double xx = P.xx + N.xx, xy = P.xy + N.xy, yy = P.yy + N.yy, det = xx * yy - xy * xy;
     const double d2 = (yy * u * u - 2 * xy * u * v + xx * v * v) / det;
     if (!(d2 < kGate)) return kInfinity;
-    const double off = std::log(major / major_of(expected.at, expected.radius, scale));
-    if (std::abs(off) > std::log(kSizeRatio)) return kInfinity;
-    const double unlike = std::isfinite(off) ? square(off) / expected.size_variance : 0;  // NaN: unknown
-    return d2 + unlike + std::log(det * square(square(focal)) * expected.size_variance);
+    const size_t k = detection.index;
+    const double predicted = major_axis(expected.at, expected.radius, Scale::of(all.scale, k));
+    const double log_ratio = std::log(all.major[k] / predicted);  // NaN where the size is unknown
+    if (std::abs(log_ratio) > std::log(kSizeRatio)) return kInfinity;
+    const double size_cost = std::isfinite(log_ratio) ? square(log_ratio) / expected.log_size_variance : 0;
+    return d2 + size_cost + std::log(det * square(square(focal)) * expected.log_size_variance);
 }
 
 }  // namespace
 
-ExpectedMarker ExpectedMarker::of(int64_t body, const Vector& marker, double radius, const Matrix& R,
+ExpectedMarker ExpectedMarker::of(int64_t body, const Vector& position, double radius, const Matrix& R,
                                   const double* P) {
     constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
-    const Matrix by_turn = R * minus_skew(marker), by_rate = minus_skew(R * marker);
-    const Matrix both = covary(P, by_turn, kTheta, kPosition, by_rate, kOmega, kVelocity);
+    const Displacement by_pose{R * minus_skew(position), kTheta, kPosition};
+    const Displacement by_rates{minus_skew(R * position), kOmega, kVelocity};
+    const Matrix both = cross_covariance(P, by_pose, by_rates);
     return {body,
-            marker,
+            position,
             radius,
-            covary(P, by_turn, kTheta, kPosition, by_turn, kTheta, kPosition),
+            cross_covariance(P, by_pose, by_pose),
             both + transposed(both),
-            covary(P, by_rate, kOmega, kVelocity, by_rate, kOmega, kVelocity)};
+            cross_covariance(P, by_rates, by_rates)};
 }
 
-std::vector<Candidate> find_candidates(const Poses& poses, const std::vector<ExpectedMarker>& markers,
-                                       const Detections& seen, const double* focal) {
+std::vector<Candidate> find_candidates(const FramePoses& poses, const std::vector<ExpectedMarker>& markers,
+                                       const Detections& detections, const double* focal) {
     std::vector<Candidate> found;
     size_t first = 0, last = 0;
     for (size_t f = 0; f < poses.exposures().size(); ++f, first = last) {
-        while (last < seen.size() && size_t(seen.frame[last]) == f) ++last;
-        const Field field(seen, first, last);
+        while (last < detections.size() && size_t(detections.frame[last]) == f) ++last;
+        const FrameDetections of_frame(detections, first, last);
         for (size_t m = 0; m < markers.size(); ++m) {
-            const Expectation expected =
+            const ExpectedView expected =
                 expect(markers[m], poses.at(f, markers[m].body), poses.exposures()[f]);
             if (!(expected.at.facing() > kGrazing) || !std::isfinite(expected.at.x)) continue;
-            field.visit_near(expected.at.x, expected.at.y, expected.spread, [&](const Placement& p) {
-                const int64_t k = p.detection;
-                const double costs = cost(expected, p, seen.major[k], Scale::of(seen.scale, k), focal[f]);
-                if (std::isfinite(costs)) found.push_back({int64_t(m), k, costs});
+            of_frame.visit_near(expected.at.x, expected.at.y, expected.covariance, [&](const Detection& d) {
+                const double value = cost(expected, d, detections, focal[f]);
+                if (std::isfinite(value)) found.push_back({int64_t(m), d.index, value});
             });
         }
     }

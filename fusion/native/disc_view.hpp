@@ -5,71 +5,72 @@
 
 #include "columns.hpp"
 
-/// What a camera should see of a disc, in the undistorted plane x/z, y/z.
+/// Projects discs into cameras, in the undistorted image plane x/z, y/z.
 ///
 /// The outline of a disc with centre c, unit normal n (camera frame) and radius r has the dual conic
-/// C* = c c^T - r^2 (I - n n^T) (Hartley and Zisserman 2004, section 8.3; a disc is a flattened quadric). The
-/// outline's centre is C* e_z: the projection of q = c + r^2 / c_z (n_z n - e_z), not the disc's own centre.
+/// C* = c c^T - r^2 (I - n n^T): a disc is a flattened quadric (Hartley and Zisserman 2004, section 8.3).
+/// The centre of the outline is C* e_z, the projection of q = c + r^2 / c_z (n_z n - e_z). It differs from
+/// the projection of c.
 namespace roundel::fusion {
 
-constexpr double kNearM = 1e-3;  // what is nearer than this to the lens's plane, or behind it, is not seen
+constexpr double kNearM = 1e-3;  // discs with a smaller depth are not visible
 
-/// A camera at a capture time `tau` seconds after the states'.
+/// The pose of a camera at one capture time.
 struct Exposure {
     Matrix R_cam_world;
-    Vector centre;  // of the camera, in the world
-    double tau;
+    Vector centre;  // of projection, world frame
+    double tau;     // capture time minus the time of the body states, seconds
 };
 
-/// A moving body: R and p in the world at the states' time, turning rate and velocity in the world.
+/// The state of a moving body, world frame.
 struct Body {
     Matrix R;
     Vector p, omega, v;
 };
 
-/// A body in an exposure: x_cam = R_cam x_body + t_cam at the exposure's own time; R_world the body's turn
-/// then.
-struct Placed {
+/// A body at the capture time of an exposure: x_cam = R_cam x_body + t_cam.
+struct BodyInCamera {
     Matrix R_cam, R_world;
     Vector t_cam;
 };
-Placed place(const Body& body, const Exposure& exposure);
+BodyInCamera transform(const Body& body, const Exposure& exposure);
 
-/// See above; `x` and `y` are NaN where the disc is not before its camera.
-struct View {
+/// A projected disc; see above. `x` and `y` are the centre of the outline, NaN where the disc is behind the
+/// camera.
+struct DiscView {
     Vector centre, normal, q;
     double x, y;
 
-    /// Cosine between the normal and the direction to the camera: above 0 if the print is visible.
+    /// Cosine between the normal and the direction to the camera: positive where the print is visible.
     double facing() const { return -dot(normal, centre) / std::sqrt(dot(centre, centre)); }
 };
-View view(const Placed& body, const Vector& marker, double radius);
+DiscView view_disc(const BodyInCamera& body, const Vector& position, double radius);
 
-/// Every body in every exposure.
-class Poses {
+/// The poses of all bodies at the capture times of all exposures.
+class FramePoses {
   public:
-    Poses(std::vector<Body> bodies, std::vector<Exposure> exposures);
+    FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures);
 
     size_t n_bodies() const { return n_bodies_; }
     const std::vector<Exposure>& exposures() const { return exposures_; }
-    const Placed& at(size_t frame, size_t body) const { return placed_[frame * n_bodies_ + body]; }
+    const BodyInCamera& at(size_t frame, size_t body) const { return poses_[frame * n_bodies_ + body]; }
 
   private:
     size_t n_bodies_;
     std::vector<Exposure> exposures_;
-    std::vector<Placed> placed_;
+    std::vector<BodyInCamera> poses_;
 };
 
-/// N discs, each in one frame and of one body, at `marker` in the body's frame.
+/// N discs, each in one frame and on one body. `position` is in the frame of the body.
 struct Discs {
     const int64_t *frame, *body;
-    Columns<3> marker;
+    Columns<3> position;
     const double* radius;
 
-    size_t size() const { return marker.n; }
+    size_t size() const { return position.n; }
 };
 
-/// What discs look like: 11 rows of N columns, centre, normal, q, x and y.
-void view_all(const Poses& poses, const Discs& discs, double* to);
+/// Writes 11 rows of N columns: centre, normal, q, x and y of each disc.
+void view_discs(const FramePoses& poses, const Discs& discs, double* to);
 
 }  // namespace roundel::fusion

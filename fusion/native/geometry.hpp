@@ -16,7 +16,7 @@ inline Vector cross(const Vector& a, const Vector& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-/// By its rows.
+/// A 3 x 3 matrix, stored by rows.
 struct Matrix {
     Vector r0, r1, r2;
 
@@ -33,10 +33,11 @@ inline Vector operator*(const Vector& a, const Matrix& B) { return a.x * B.r0 + 
 inline Matrix operator*(const Matrix& A, const Matrix& B) { return {A.r0 * B, A.r1 * B, A.r2 * B}; }
 inline Matrix operator+(const Matrix& A, const Matrix& B) { return {A.r0 + B.r0, A.r1 + B.r1, A.r2 + B.r2}; }
 inline Matrix operator*(double s, const Matrix& A) { return {s * A.r0, s * A.r1, s * A.r2}; }
+inline Matrix transposed(const Matrix& A) { return {A.column0(), A.column1(), A.column2()}; }
 
-/// The rotation by a vector, by Rodrigues' formula: cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T, a =
-/// |w|.
-inline Matrix turn(const Vector& w) {
+/// The rotation matrix of a rotation vector w by Rodrigues' formula, with the angle a = |w|:
+/// cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T.
+inline Matrix rotation_from_vector(const Vector& w) {
     const double a = std::fmax(std::sqrt(dot(w, w)), 1e-12), c = std::cos(a), half = std::sin(a / 2) / a;
     const Vector s = (std::sin(a) / a) * w, k = (2 * half * half) * w;
     return {{k.x * w.x + c, k.x * w.y - s.z, k.x * w.z + s.y},

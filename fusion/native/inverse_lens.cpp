@@ -18,7 +18,7 @@ Polynomial evaluate(const double* c, double s, double t) {
 }  // namespace
 
 const double* InverseLens::cell(double column, double row) const {
-    const auto within = [](double place, int64_t n) {  // what is no number lies outside, too
+    const auto within = [](double place, int64_t n) {  // NaN lies outside
         return int64_t(std::fmax(-1, std::fmin(place, double(n)))) + 1;
     };
     const int64_t x = within(column, columns), y = within(row, rows);

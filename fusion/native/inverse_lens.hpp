@@ -4,10 +4,11 @@
 
 namespace roundel::fusion {
 
-/// A lens's inverse: an image of `columns` x `rows` square cells, and a ring of empty ones around it. In a
-/// cell both undistorted coordinates are polynomials of the third degree in s and t, which run from -1 to 1
-/// across it: ten coefficients each, of 1, s, t, s^2, st, t^2, s^3, s^2 t, st^2, t^3. They are NaN where the
-/// cell is empty.
+/// The table of an inverse lens model: `columns` x `rows` square cells, surrounded by one ring of empty
+/// cells.
+///
+/// In a cell both undistorted coordinates are cubic polynomials of s and t, which run from -1 to 1 across the
+/// cell. Each has ten coefficients, of 1, s, t, s^2, st, t^2, s^3, s^2 t, st^2, t^3; NaN in empty cells.
 struct InverseLens {
     const double* coefficients;
     int64_t columns, rows;
@@ -16,8 +17,8 @@ struct InverseLens {
     const double* cell(double column, double row) const;
 };
 
-/// Of N pixels (u, v side by side): 2 x N undistorted coordinates, and 4 x N the derivative of raw pixels by
-/// these.
+/// Undistorts N pixels (pairs u, v): writes 2 x N coordinates, and 4 x N Jacobians of raw pixels with respect
+/// to them.
 void look_up(const InverseLens& lens, const double* uv, size_t n, double* xy, double* scale);
 
 }  // namespace roundel::fusion

@@ -4,7 +4,7 @@
 namespace roundel::fusion {
 
 Shape outline(const Vector& c, const Vector& n, double radius, const Scale& s) {
-    // The conic's points are (m + shape) about its centre m = C*_z / C*_zz: shape = m m^T - C*_xy / C*_zz.
+    // With the centre m = C*_z / C*_zz of the conic: shape = m m^T - C*_xy / C*_zz.
     const double r2 = radius * radius, zz = c.z * c.z - r2 * (1 - n.z * n.z);
     const double mx = (c.x * c.z + r2 * n.x * n.z) / zz, my = (c.y * c.z + r2 * n.y * n.z) / zz;
     const double xx = mx * mx - (c.x * c.x - r2 * (1 - n.x * n.x)) / zz;
@@ -21,7 +21,7 @@ Shape measured_outline(double major, double minor, double angle) {
 }
 
 Shear shear(const Shape& measured, const Shape& expected) {
-    // L^-1 M L^-T with L L^T = the expected.
+    // L^-1 M L^-T, where L L^T is the expected shape.
     const double l00 = std::sqrt(expected.xx), l10 = expected.xy / l00,
                  l11 = std::sqrt(expected.yy - l10 * l10);
     const double a = measured.xx / expected.xx, b = (measured.xy / l00 - l10 * a) / l11;

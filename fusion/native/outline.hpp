@@ -4,12 +4,13 @@
 
 namespace roundel::fusion {
 
-/// A symmetric matrix [xx xy; xy yy]. As the shape of an outline, a circle of radius a has a^2 I.
+/// A symmetric matrix [xx xy; xy yy]. The shape matrix of a circle of radius a is a^2 I.
 struct Shape {
     double xx, xy, yy;
 };
 
-/// The derivative of raw pixels by undistorted coordinates: the lens is taken as affine over an outline.
+/// The Jacobian of raw pixels with respect to undistorted coordinates. The lens is taken as affine over an
+/// outline.
 struct Scale {
     double ux, uy, vx, vy;
 
@@ -18,17 +19,17 @@ struct Scale {
     }
 };
 
-/// Of a disc's outline, in raw pixels: the shape that its dual conic has.
+/// The shape matrix of the outline of a disc, raw pixels, from its dual conic.
 Shape outline(const Vector& centre, const Vector& normal, double radius, const Scale& scale);
-/// Of an ellipse with full axes and its major one's direction.
+/// The shape matrix of an ellipse with the given full axes; `angle` is the direction of the major axis.
 Shape measured_outline(double major, double minor, double angle);
 
-/// The two parts of a difference between shapes that change no area, divided by the size.
+/// The two components of the difference of two shapes that do not change the area, divided by the size.
 struct Shear {
     double along, across;
 };
-/// An outline seen in the frame in which the expected one is a unit circle: 0 if they are similar. Each part
-/// has a variance of 4 (sigma_axis / axis)^2.
+/// Compares a measured shape with an expected one, in coordinates in which the expected one is a unit
+/// circle. Similar shapes give 0. Each component has the variance 4 (sigma_axis / axis)^2.
 Shear shear(const Shape& measured, const Shape& expected);
 
 }  // namespace roundel::fusion

@@ -12,7 +12,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Keys, encode
 from fusion.model.robots import Robot, load_robots
 from fusion.recordings.record import ArenaRecording
-from fusion.tracking.result import Fused
+from fusion.tracking.result import TrackingResult
 
 
 def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[str, Camera]:
@@ -39,7 +39,7 @@ def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dic
     return load_robots(robots) if robots else recording.robots
 
 
-def write_recording(source: Path, out: Path, fused: Iterable[Fused]) -> None:
+def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) -> None:
     """Copy a recording with other poses and markers, which are logged at the times of their frame sets."""
     entries = [e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers"))]
     arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]

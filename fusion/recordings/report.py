@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.config import write_atomically
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotPose
-from fusion.tracking.result import Fused, Move
+from fusion.tracking.result import TrackingResult
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 STATES = ("tracked", "coasting", "lost")
@@ -31,7 +32,7 @@ class Summary:
     faults: Counter[str] = field(default_factory=Counter)
     moves: list[str] = field(default_factory=list)
 
-    def add(self, fused: Fused) -> None:
+    def add(self, fused: TrackingResult) -> None:
         """Count a fused frame set."""
         self.frame_sets += 1
         self.states.update((pose.robot, pose.state) for pose in fused.poses)
@@ -41,13 +42,13 @@ class Summary:
             self.unused[name] += use.unused
             self.squared_px[name] = self.squared_px.get(name, 0.0) + use.squared_px
 
-    def add_move(self, move: Move, t_ns: int) -> None:
+    def add_correction(self, correction: ExtrinsicsCorrection, t_ns: int) -> None:
         """Note that a camera was moved, or recalibrated after a move."""
-        if move.camera is None:
+        if correction.camera is None:
             event = f"seen at t_ns {t_ns}; its detections are excluded from then on"
         else:
             event = f"recalibrated at t_ns {t_ns} and used again; the rig file is unchanged"
-        self.moves.append(f"moved: camera '{move.name}', {event}")
+        self.moves.append(f"moved: camera '{correction.name}', {event}")
 
     def lines(self, robots: Iterable[str]) -> Iterator[str]:
         """The summary, one line a subject."""
@@ -65,7 +66,7 @@ class Summary:
         yield from self.moves
 
 
-def write_poses(path: Path, fused: Iterable[Fused]) -> None:
+def write_poses(path: Path, fused: Iterable[TrackingResult]) -> None:
     """Write all poses as CSV with `COLUMNS`, atomically.
 
     Raises:

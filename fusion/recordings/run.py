@@ -11,12 +11,13 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.recordings.report import Summary
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.result import Fused
+from fusion.tracking.result import TrackingResult
 from fusion.tracking.smoothing import Smoother
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class OfflineArena:
 
 def fuse_recording(
     messages: Iterable[tuple[int, Detections]], arena: OfflineArena, summary: Summary | None = None
-) -> Iterator[Fused]:
+) -> Iterator[TrackingResult]:
     """Fuse recorded detections.
 
     Args:
@@ -57,16 +58,16 @@ def fuse_recording(
     """
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
-    smoother = Smoother(tracker) if arena.smooth else None
+    smoother = Smoother(tracker.table.names) if arena.smooth else None
     for frame_set in _synchronize(messages, arena, summary.faults):
-        fused = tracker.fuse(frame_set)
+        fused = tracker.track(frame_set)
         summary.add(fused)
         if smoother is None:
             yield fused
         else:
             smoother.add(fused)
-        for move in tracker.inspect():
-            summary.add_move(move, frame_set.t_ns)
+        for correction in tracker.check_extrinsics(frame_set, fused):
+            summary.add_correction(correction, frame_set.t_ns)
     if smoother is not None:
         yield from smoother.smooth()
 

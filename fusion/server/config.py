@@ -7,7 +7,7 @@ import msgspec
 
 from camera_node.config import is_name, load_yaml
 from camera_node.errors import ConfigError
-from fusion.tracking.tracker import Limits
+from fusion.model.limits import Limits
 
 
 class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

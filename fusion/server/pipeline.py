@@ -7,14 +7,14 @@ from pathlib import Path
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.persistence import PersistedFile
-from fusion.tracking.result import Move
-from fusion.tracking.tracker import Tracker
+from fusion.tracking.tracker import AssociatedFrames, Tracker
 
 log = logging.getLogger("fusion")
 
@@ -42,6 +42,7 @@ class TrackingPipeline:
         self.robots = load_robots(Path(config.robots)) if saved is None else saved
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
+        self.early: AssociatedFrames | None = None  # of the open frame set
         self.restart()
 
     @property
@@ -64,12 +65,11 @@ class TrackingPipeline:
             self.restart()
             return
         self.tracker.place(changed_camera, rig.cameras[changed_camera])
-        self.tracker.watch.trust(changed_camera)
 
-    def correct_rig(self, move: Move) -> None:
+    def correct_rig(self, correction: ExtrinsicsCorrection) -> None:
         """Update the active rig by a camera that the tracker recalibrated."""
-        if move.camera is not None:
-            self.active_rig.correct(move.name, move.camera)
+        if correction.camera is not None:
+            self.active_rig.correct(correction.name, correction.camera)
 
     def undo_correction(self) -> str:
         """Restore the camera of the last correction; it is no longer monitored until another rig is published.
@@ -82,8 +82,7 @@ class TrackingPipeline:
         """
         name, camera = self.active_rig.undo()
         if self.tracker is not None:
-            self.tracker.place(name, camera)
-            self.tracker.watch.hold(name)
+            self.tracker.place(name, camera, pinned=True)
         return name
 
     def change_robots(self, request: RobotsRequest) -> set[str]:
@@ -109,18 +108,18 @@ class TrackingPipeline:
     def add_shard_poses(self, poses: ShardPoses) -> None:
         """Use the robots of another shard: their detections are not available to the robots of this one."""
         if self.tracker is not None:
-            self.tracker.follow(poses)
+            self.tracker.table.receive(poses)
 
     def associate_early(self) -> None:
         """Associate the frames of the open frame set while the last ones are missing."""
         frame_set, n_missing = self.synchronizer.open()
         if self.tracker is not None and frame_set is not None:
-            self.tracker.anticipate(frame_set, n_missing)
+            self.early = self.tracker.associate_early(frame_set, n_missing, self.early)
 
     def excluded_cameras(self) -> set[str]:
         """Cameras that were moved, whose detections are excluded."""
-        return set(self.tracker.watch.bumped) if self.tracker else set()
+        return set(self.tracker.extrinsics.excluded) if self.tracker else set()
 
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""
-        return self.tracker.shapes.misfits() if self.tracker else {}
+        return self.tracker.geometry.misfits() if self.tracker else {}

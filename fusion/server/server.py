@@ -20,6 +20,7 @@ from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of
 from camera_node.protocol.session import listening_endpoints
 from fusion.model.frames import FrameSet
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import (
     Robots,
     RobotsRequest,
@@ -36,7 +37,7 @@ from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.server.transport import Transport, open_session
-from fusion.tracking.result import Move, latency_of
+from fusion.tracking.result import latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -150,29 +151,32 @@ class Server:
     def _track_and_publish(self, tracker: Tracker, frame_set: FrameSet) -> None:
         """Publish the poses that acquisition can't change first, then everything else."""
         start_ns = time.time_ns()
-        first = tracker.advance(frame_set)
+        predicted = tracker.predict(frame_set.t_ns, self.pipeline.early)
+        update = tracker.update(tracker.associate(predicted, frame_set), frame_set)
         latency = latency_of(frame_set, start_ns, time.time_ns())
-        self._publisher.publish_poses(first, latency)
+        self._publisher.publish_poses(update.poses.values(), latency)
         if self.shard.count > 1:
-            self._publisher.publish_shard(tracker.tell())
-        fused = tracker.complete()
-        published = {pose.robot for pose in first}
-        self._publisher.publish_poses([p for p in fused.poses if p.robot not in published], latency)
-        self._publisher.publish_markers(fused.markers)
-        for move in tracker.inspect():
-            self._report_move(move)
-        states: dict[str, TrackingState] = {pose.robot: pose.state for pose in fused.poses}
-        self.statistics.count_frame_set(fused.cameras, states, latency.total_ms if latency else None)
+            self._publisher.publish_shard(tracker.table.shard_poses())
+        result = tracker.finish(update)
+        published = {pose.robot for pose in update.poses.values()}
+        self._publisher.publish_poses([p for p in result.poses if p.robot not in published], latency)
+        self._publisher.publish_markers(result.markers)
+        for correction in tracker.check_extrinsics(frame_set, result):
+            self._report_correction(correction)
+        states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
+        self.statistics.count_frame_set(result.cameras, states, latency.total_ms if latency else None)
 
-    def _report_move(self, move: Move) -> None:
+    def _report_correction(self, correction: ExtrinsicsCorrection) -> None:
         """Log a moved camera; publish the rig once the camera is recalibrated, by the leading shard."""
-        if move.camera is None:
-            log.warning("camera %s was moved: excluded until robots show its new pose", move.name)
+        if correction.camera is None:
+            log.warning("camera %s was moved: excluded until robots show its new pose", correction.name)
             return
-        self.pipeline.correct_rig(move)
+        self.pipeline.correct_rig(correction)
         self._publisher.publish_rig(self.pipeline.active_rig.message())
         undo = undo_key(self.keys.arena)
-        log.warning("camera %s is recalibrated and used again; a query on %s undoes that", move.name, undo)
+        log.warning(
+            "camera %s is recalibrated and used again; a query on %s undoes that", correction.name, undo
+        )
 
     def _report_status(self, now_ns: int) -> bool:
         """Publish the status once a second; return whether it was due."""

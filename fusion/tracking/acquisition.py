@@ -1,229 +1,266 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robots that are not followed, looked for among the detections that nothing claims.
+"""Acquires untracked robots from unassigned detections.
 
-Constellations by the distances between their markers, and by where they were last; then robots of one marker, by size
-and reach. What fits two robots alike stays nobody's.
+Constellations are identified by the distances between their markers and by their last positions; then robots with a
+single marker, by size and reach. A marker that fits two robots equally well stays unlabeled.
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.arrays import Array, Index
 from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
-from fusion.model.robots import Robot
+from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.states import POSITION, States
-from fusion.protocol.messages import TrackingState
-from fusion.protocol.shards import Shard
-from fusion.tracking.constellation import Fit, fits_size, identify
-from fusion.tracking.estimator import Estimator, mean_of_bodies, misfit
-from fusion.tracking.multiview import Marker, group
-from fusion.tracking.normals import find_normal, rotation_to
+from fusion.tracking.constellation import Criteria, Fit, fits_size, identify
+from fusion.tracking.estimator import Estimator
+from fusion.tracking.gating import (
+    MAX_CHI2,
+    POSITION_GATE,
+    START_S,
+    START_SIGMAS,
+    START_SIGMAS_SINGLE,
+    mean_by_body,
+    misfit,
+)
+from fusion.tracking.multiview import Marker, find_markers
+from fusion.tracking.normals import start_rotation
+from fusion.tracking.track_table import TrackTable
 
-BIRTH = (0.2, 0.05, 4.0, 1.5)  # sigmas of a robot just found: rad, m, rad/s, m/s
-BIRTH_SINGLE = (0.3, 0.05, 10.0, 1.5)
-BIRTH_S = 1e-3  # the motion model needs a time to act over, however short
-BIRTH_SMALL = 1e-3
-MAX_CHI2 = 8.0  # mean squared Mahalanobis error of a robot's markers, with SLACK_PX for the calibration
-SLACK_PX = 0.7
-HINT_SIGMA_M = 0.1  # of `start_m`
-REACH = 16.3  # chi-square with 3 degrees, one in a thousand: where a lost single marker may be found again
-FAR = 50.0  # chi-square of a constellation that is nowhere near where it was: it may have been carried
-FLOOD = 600  # free detections of a frame: one with more shows a texture, or is a fault, and is not searched
-BODIES = 12  # constellations that are looked for in one instant; the others' turn is next
-
-
-class Followed(Protocol):
-    """What a search needs of a tracker."""
-
-    optics: CameraArray
-    catalogue: MarkerTable
-    robots: list[Robot]
-    estimator: Estimator
-    states: States
-    status: list[TrackingState | None]
-    owned: Mask
-    shard: Shard
-
-    def adopt(self, rows: Index, states: States) -> None: ...
+SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
+START_M = 0.1  # standard deviation of `start_m`
+FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
+MAX_DETECTIONS = 600  # unassigned, of one frame; more come from a texture or a fault, and are not searched
+MAX_BODIES = 12  # constellations searched for in one frame set; the others follow in the next ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Birth:
-    """A robot that seems to stand at R, p, by these matches."""
+class Acquired:
+    """The result of an acquisition.
+
+    Attributes:
+        rows, states: acquired robots and where they are.
+        displaced: single-marker robots whose detections belong to an acquired constellation.
+        assignments: of all robots, including the acquired ones.
+        markers: triangulated markers that stay unlabeled.
+    """
+
+    rows: Index
+    states: States
+    displaced: Index
+    assignments: Assignments
+    markers: list[Marker]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """A robot at R, p with the assignments that support it."""
 
     robot: int
     R: Array
     p: Array
-    matches: Assignments
+    assignments: Assignments
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """Births refined, row by row: where they are then, and of each observation the match and the squared misfit."""
+class _Refined:
+    """N starts after an update.
+
+    Attributes:
+        states: of the starts.
+        body: (K,) the start of each observation.
+        misfit: (K,) squared residuals in standard deviations.
+        assignments: of the observations.
+    """
 
     states: States
-    observations: MatchedObservations
-    matches: Assignments
+    body: Index
     misfit: Array
+    assignments: Assignments
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Accepted:
+    """The starts that their observations confirm."""
+
+    rows: Index
+    states: States
+    assignments: Assignments
 
 
 class Acquisition:
-    """Looks for a tracker's missing robots."""
+    """Acquires robots of a track table.
 
-    def __init__(self, tracker: Followed) -> None:
-        self.tracker = tracker
-        self._turn = 0
+    Args:
+        cameras: cameras of the rig.
+        estimator: of all robots.
+        leads: whether this shard reports the unlabeled markers, and so needs them in every frame set.
+    """
 
-    def find(
-        self, missing: Index, sightings: DetectionTable, matches: Assignments
-    ) -> tuple[Assignments, list[Marker]]:
-        """The matches with those of the robots found, and the markers that stay nobody's: these tells the leader."""
-        if not len(missing) and not self.tracker.shard.leads:
-            return matches, []
-        single = self.tracker.estimator.single
-        bodies, singles = missing[~single[missing]], missing[single[missing]]
+    def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
+        self._cameras, self._estimator, self._leads = cameras, estimator, leads
+        self._turn = 0  # rotates through more than MAX_BODIES missing constellations
+
+    def acquire(
+        self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
+    ) -> Acquired:
+        """Acquire robots.
+
+        Args:
+            table: robots, states and status.
+            missing: rows of the untracked robots.
+            detections: of a frame set.
+            assignments: of the tracked robots.
+        """
+        none = _Accepted(missing[:0], table.states.select(missing[:0]), Assignments.none())
+        if not len(missing) and not self._leads:
+            return Acquired(none.rows, none.states, missing, assignments, [])
+        bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
+        found, displaced = none, missing[:0]
         if len(bodies):
-            matches = self._find_bodies(bodies, sightings, matches)
-        markers = self._group(sightings, matches)
+            found, displaced, assignments = self._acquire_bodies(table, bodies, detections, assignments)
+        markers = self._find_markers(table, detections, assignments)
         if len(singles):
-            matches, markers = self._find_singles(singles, markers, sightings, matches)
-        return matches, markers
+            more = self._acquire_singles(table, singles, markers, detections)
+            assignments = assignments.joined(more.assignments)
+            taken = set(more.assignments.detection.tolist())
+            markers = [m for m in markers if not taken.intersection(m.detections.tolist())]
+            found = replace(
+                found,
+                rows=np.concatenate([found.rows, more.rows]),
+                states=found.states.joined(more.states),
+            )
+        return Acquired(found.rows, found.states, displaced, assignments, markers)
 
-    def _find_bodies(self, missing: Index, sightings: DetectionTable, matches: Assignments) -> Assignments:
-        """The matches with those of the constellations found, whose markers may have passed for single ones."""
-        matches, aside = self._without_singles(matches)
-        markers = self._group(sightings, matches)
-        tracker = self.tracker
-        turn = np.roll(missing, -self._turn)[:BODIES]
-        self._turn = (self._turn + BODIES) % len(missing) if len(missing) > BODIES else 0
+    def _acquire_bodies(
+        self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
+    ) -> tuple[_Accepted, Index, Assignments]:
+        """The constellations found, the single-marker robots that they displace, and all assignments.
 
-        def born(fit: Fit) -> _Birth:
-            claimed = self._claim(fit.robot, fit.numbers, [markers[p] for p in fit.points])
-            return _Birth(fit.robot, fit.R, fit.t, claimed)
+        A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
+        """
+        is_single = table.single[table.markers.robot[assignments.marker]]
+        of_singles, assignments = assignments.select(is_single), assignments.select(~is_single)
+        markers = self._find_markers(table, detections, assignments)
+        turn = np.roll(missing, -self._turn)[:MAX_BODIES]
+        self._turn = (self._turn + MAX_BODIES) % len(missing) if len(missing) > MAX_BODIES else 0
+        fits = identify(
+            {int(k): table.robots[k] for k in turn}, markers, self._criteria(table, markers, detections)
+        )
+        starts = [_start_of(fit, markers, table) for fit in fits if table.owned[fit.robot]]
+        found = self._confirm(table, starts, detections, START_SIGMAS)
+        assignments = assignments.joined(found.assignments)
+        taken = np.isin(of_singles.detection, assignments.detection)
+        displaced = np.unique(of_singles.marker[taken])
+        remaining = of_singles.select(~np.isin(of_singles.marker, displaced))
+        return found, table.markers.robot[displaced], assignments.joined(remaining)
+
+    def _criteria(self, table: TrackTable, markers: list[Marker], detections: DetectionTable) -> Criteria:
+        def faces(marker: Marker, normal: Array) -> bool:
+            to = self._cameras.centres[marker.cameras] - marker.position
+            return bool((to @ normal > 0).all())
+
+        def history(k: int, p: Array) -> float:
+            return min(_history_chi2(table, k, p, np.zeros((3, 3))), FAR_CHI2)
 
         def judge(fits: list[Fit]) -> Array:
-            births = [born(fit) for fit in fits]
-            trial = self._refine(births, sightings, BIRTH)
-            return np.bincount(trial.observations.discs.body, trial.misfit, len(births)).astype(float)
+            starts = [_start_of(fit, markers, table) for fit in fits]
+            refined = self._refine(table, starts, detections, START_SIGMAS)
+            return np.bincount(refined.body, refined.misfit, len(starts)).astype(float)
 
-        bodies = {int(k): tracker.robots[k] for k in turn}
-        fits = identify(bodies, markers, self._faces, self._history, judge)
-        births = [born(fit) for fit in fits if tracker.owned[fit.robot]]
-        return self._with_singles(matches.joined(self._bear(births, sightings, BIRTH)), aside)
+        return Criteria(faces, history, judge)
 
-    def _find_singles(
-        self, missing: Index, markers: list[Marker], sightings: DetectionTable, matches: Assignments
-    ) -> tuple[Assignments, list[Marker]]:
-        births = []
-        pairs = self._pair_singles(missing.tolist(), markers)
-        for robot, marker in pairs:
-            normal = find_normal(
-                self.tracker.optics, sightings, marker, self.tracker.robots[robot].diameter_m / 2
-            )
-            R = rotation_to(self._towards(marker) if normal is None else normal)
-            births.append(_Birth(robot, R, marker.position, self._claim(robot, (0,), [marker])))
-        born = self._bear(births, sightings, BIRTH_SINGLE)
-        taken = set(born.sighting.tolist())
-        return matches.joined(born), [m for m in markers if not taken.intersection(m.sightings.tolist())]
+    def _acquire_singles(
+        self, table: TrackTable, missing: Index, markers: list[Marker], detections: DetectionTable
+    ) -> _Accepted:
+        starts = []
+        for robot, marker in _pair_singles(table, missing.tolist(), markers):
+            R, _ = start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)
+            assignments = _assignments_of(table, robot, (0,), [marker])
+            starts.append(_Start(robot, R, marker.position, assignments))
+        return self._confirm(table, starts, detections, START_SIGMAS_SINGLE)
 
-    def _group(self, sightings: DetectionTable, matches: Assignments) -> list[Marker]:
-        """Markers out of the detections that nothing claims."""
-        free = np.ones(len(sightings), bool)
-        free[matches.sighting] = False
-        count = np.bincount(sightings.frame[free], minlength=len(sightings.exposures.camera))
-        free &= (count <= FLOOD)[sightings.frame]
-        sizes = np.unique(2 * self.tracker.catalogue.radius)
-        return (
-            group(self.tracker.optics, sightings, np.flatnonzero(free), sizes)
-            if free.any() and len(sizes)
-            else []
-        )
+    def _find_markers(
+        self, table: TrackTable, detections: DetectionTable, assignments: Assignments
+    ) -> list[Marker]:
+        """Triangulate markers from unassigned detections."""
+        free = np.ones(len(detections), bool)
+        free[assignments.detection] = False
+        count = np.bincount(detections.frame[free], minlength=len(detections.exposures.camera))
+        free &= (count <= MAX_DETECTIONS)[detections.frame]
+        diameters = np.unique(2 * table.markers.radius)
+        if not free.any() or not len(diameters):
+            return []
+        return find_markers(self._cameras, detections, np.flatnonzero(free), diameters)
 
-    def _claim(self, robot: int, numbers: tuple[int, ...], markers: list[Marker]) -> Assignments:
-        """These markers' sightings are of the robot's markers `numbers`."""
-        discs = self.tracker.catalogue.first[robot] + np.array(numbers, np.intp)
-        counts = [len(marker.sightings) for marker in markers]
-        return Assignments.of(np.concatenate([m.sightings for m in markers]), np.repeat(discs, counts))
+    def _confirm(
+        self, table: TrackTable, starts: list[_Start], detections: DetectionTable, sigmas: tuple
+    ) -> _Accepted:
+        """Refine starts by their observations; returns those that fit."""
+        if not starts:
+            none = np.empty(0, np.intp)
+            return _Accepted(none, table.states.select(none), Assignments.none())
+        refined = self._refine(table, starts, detections, sigmas)
+        good = mean_by_body(refined.misfit, refined.body, len(starts)) < MAX_CHI2
+        rows = np.array([start.robot for start in starts])[good]
+        return _Accepted(rows, refined.states.select(good), refined.assignments.select(good[refined.body]))
 
-    def _without_singles(self, matches: Assignments) -> tuple[Assignments, Assignments]:
-        single = self.tracker.estimator.single[self.tracker.catalogue.robot[matches.disc]]
-        return matches.select(~single), matches.select(single)
-
-    def _with_singles(self, matches: Assignments, aside: Assignments) -> Assignments:
-        """Give back what robots of one marker had, except what a constellation proved to be its own."""
-        stolen = np.isin(aside.sighting, matches.sighting)
-        robbed = np.unique(aside.disc[stolen])
-        for disc in robbed:
-            self.tracker.status[self.tracker.catalogue.robot[disc]] = "lost"
-        return matches.joined(aside.select(~np.isin(aside.disc, robbed)))
-
-    def _pair_singles(self, lost: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
-        """Robots of one marker and theirs, where within reach there is one robot to one marker; else none."""
-        within = np.array([[self._reaches(k, marker) for marker in markers] for k in lost], bool)
-        within = within.reshape(len(lost), len(markers))
-        owned = self.tracker.owned
-        return [
-            (k, markers[int(np.argmax(row))])
-            for k, row in zip(lost, within, strict=True)
-            if owned[k] and row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
-        ]
-
-    def _reaches(self, k: int, marker: Marker) -> bool:
-        """Whether a lost robot of one marker can be this one: by size, and by where it was or starts."""
-        if not fits_size(marker, self.tracker.robots[k]):
-            return False
-        return self._distance(k, marker.position, marker.covariance) < REACH
-
-    def _history(self, k: int, p: Array) -> float:
-        """Chi-square of robot k's standing at p; one that is far away may have been carried there."""
-        return min(self._distance(k, p, np.zeros((3, 3))), FAR)
-
-    def _distance(self, k: int, p: Array, covariance: Array) -> float:
-        """Squared Mahalanobis distance of p from where robot k was or, before it was ever found, starts."""
-        place, own = self.tracker.states.p[k], self.tracker.states.P[k, POSITION, POSITION]
-        if self.tracker.status[k] is None:
-            start = self.tracker.robots[k].start_m
-            if start is None:
-                return 0.0
-            place, own = np.array(start), HINT_SIGMA_M**2 * np.eye(3)
-        error = p - place
-        return float(error @ np.linalg.solve(own + covariance, error))
-
-    def _bear(self, births: list[_Birth], sightings: DetectionTable, sigmas: tuple) -> Assignments:
-        """Start robots at these poses, refined by their observations; the matches of those that agree."""
-        if not births:
-            return Assignments.none()
-        trial = self._refine(births, sightings, sigmas)
-        body = trial.observations.discs.body
-        good = mean_of_bodies(trial.misfit, body, len(births)) < MAX_CHI2
-        self.tracker.adopt(np.array([birth.robot for birth in births])[good], trial.states.select(good))
-        return trial.matches.select(good[body])
-
-    def _refine(self, births: list[_Birth], sightings: DetectionTable, sigmas: tuple) -> "_Trial":
-        """Each birth by itself, its robot's body and speed by its observations."""
-        at = States.at_rest(np.array([b.R for b in births]), np.array([b.p for b in births]), sigmas)
-        parts = [birth.matches for birth in births]
-        matches = Assignments(
-            *(np.concatenate([getattr(m, k) for m in parts]) for k in Assignments.__slots__)
-        )
-        observations = MatchedObservations.of(matches, sightings, self.tracker.catalogue)
-        body = np.repeat(np.arange(len(births)), [len(part) for part in parts])
+    def _refine(
+        self, table: TrackTable, starts: list[_Start], detections: DetectionTable, sigmas: tuple
+    ) -> _Refined:
+        """Update each start independently with its observations, from these standard deviations."""
+        at = States.at_rest(np.array([s.R for s in starts]), np.array([s.p for s in starts]), sigmas)
+        assignments = Assignments.none().joined(*(start.assignments for start in starts))
+        observations = MatchedObservations.of(assignments, detections, table.markers)
+        body = np.repeat(np.arange(len(starts)), [len(start.assignments) for start in starts])
         observations = replace(observations, discs=replace(observations.discs, body=body))
-        estimator = self.tracker.estimator.select(np.array([birth.robot for birth in births]))
-        prediction = estimator.predict(at, np.full(len(births), BIRTH_S))
-        found, remainder = estimator.update(prediction, observations, BIRTH_SMALL)
-        d2 = misfit(observations, remainder, SLACK_PX)
-        return _Trial(found, observations, matches.remaining(remainder), d2)
+        estimator = self._estimator.select(np.array([start.robot for start in starts]))
+        prediction = estimator.predict(at, np.full(len(starts), START_S))
+        states, residuals = estimator.update(prediction, observations, SMALL)
+        d2 = misfit(observations, residuals)
+        return _Refined(states, body, d2, assignments.with_residuals(residuals))
 
-    def _faces(self, marker: Marker, normal: Array) -> bool:
-        """Whether a marker with this normal shows its print to the cameras that saw it."""
-        return bool(((self.tracker.optics.centres[marker.cameras] - marker.position) @ normal > 0).all())
 
-    def _towards(self, marker: Marker) -> Array:
-        """The mean direction of the cameras that saw a marker."""
-        to = self.tracker.optics.centres[np.unique(marker.cameras)] - marker.position
-        mean = (to / np.linalg.norm(to, axis=1, keepdims=True)).sum(0)
-        return mean / np.linalg.norm(mean)
+def _start_of(fit: Fit, markers: list[Marker], table: TrackTable) -> _Start:
+    assignments = _assignments_of(table, fit.robot, fit.numbers, [markers[p] for p in fit.points])
+    return _Start(fit.robot, fit.R, fit.t, assignments)
+
+
+def _assignments_of(
+    table: TrackTable, robot: int, numbers: tuple[int, ...], markers: list[Marker]
+) -> Assignments:
+    """The detections of triangulated markers, assigned to the robot's markers `numbers`."""
+    rows = table.markers.first[robot] + np.array(numbers, np.intp)
+    counts = [len(marker.detections) for marker in markers]
+    return Assignments.of(np.concatenate([m.detections for m in markers]), np.repeat(rows, counts))
+
+
+def _pair_singles(table: TrackTable, missing: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
+    """Pairs of an owned single-marker robot and a marker, each the only one within reach of the other."""
+    within = np.array([[_reaches(table, k, marker) for marker in markers] for k in missing], bool)
+    within = within.reshape(len(missing), len(markers))
+    return [
+        (k, markers[int(np.argmax(row))])
+        for k, row in zip(missing, within, strict=True)
+        if table.owned[k] and row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
+    ]
+
+
+def _reaches(table: TrackTable, k: int, marker: Marker) -> bool:
+    """Whether the size and the history of single-marker robot k allow this marker."""
+    if not fits_size(marker, table.robots[k]):
+        return False
+    return _history_chi2(table, k, marker.position, marker.covariance) < POSITION_GATE
+
+
+def _history_chi2(table: TrackTable, k: int, p: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of p from the last position of robot k, or from its start if never acquired."""
+    position, own = table.states.p[k], table.states.P[k, POSITION, POSITION]
+    if table.status[k] is None:
+        start = table.robots[k].start_m
+        if start is None:
+            return 0.0
+        position, own = np.array(start), START_M**2 * np.eye(3)
+    error = p - position
+    return float(error @ np.linalg.solve(own + covariance, error))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which detection is of which marker, while robots are tracked.
+"""Associates detections with the markers of tracked robots.
 
-Each marker is predicted into each frame at the frame's own time; within a gate of its covariance and apparent size,
-detections are assigned globally, frame by frame: no detection is of two markers. The cost of a pair is its negative
-log-likelihood (Bar-Shalom et al. 2001, section 6.4), so that a vague prediction does not take what an exact one fits:
-`native/candidates.cpp` finds the pairs and their costs.
+Each marker is predicted into each frame at the capture time of the frame. Within a gate of its covariance and apparent
+size, detections are assigned frame by frame: each detection to one marker at most, at the lowest total cost. The cost
+of a pair is its negative log-likelihood (Bar-Shalom et al. 2001, section 6.4), so a vague prediction does not take a
+detection that fits an exact one. `native/candidates.cpp` finds the pairs and their costs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,129 +20,148 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
 
-UNMATCHED = 1e4  # the cost of leaving a marker unseen: more than any sum of costs within gates
-MOST = 1 << 32  # detections: more than any frame has
-TOGETHER = 150  # contested pairs that are assigned in one go, frames and all
+UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
+MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
+MAX_JOINT = 150  # contested pairs that one assignment solves for all frames together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """Frames that were matched at once: of each match the row of its frame, that of the detection there, the disc."""
+class _AssignedFrames:
+    """Frames that were assigned together: for each assignment the frame, the detection in it, and the marker."""
 
     frames: tuple[CalibratedFrame, ...]
     frame: Index
-    row: Index
-    disc: Index
+    detection: Index
+    marker: Index
 
     def rows(self, first: dict[int, int]) -> Index:
-        """The detections' rows in an instant whose frames begin at `first`, by id(); below 0 of frames not in it."""
-        begin = np.array([first.get(id(frame), -MOST) for frame in self.frames], np.intp)
-        return begin[self.frame] + self.row
+        """Rows of the detections in a frame set, where a frame starts at `first[id(frame)]`; negative if absent."""
+        start = np.array([first.get(id(frame), -MAX_DETECTIONS) for frame in self.frames], np.intp)
+        return start[self.frame] + self.detection
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """An instant's detections matched to robots, as many frames at a time as there are.
+    """The assignments of some frames of one frame set; a value, which `extended` leaves unchanged.
 
-    Args:
-        optics: the cameras.
-        catalogue: the robots' markers.
-        states: the robots as predicted at `t_ns`.
-        active: (N,) those whose markers are looked for.
-        t_ns: the instant.
+    Attributes:
+        cameras: cameras of the rig; `revision` is theirs at the prediction.
+        marker_table: markers of all robots.
+        states: robots predicted at `t_ns`.
+        markers: (M,) rows of the marker table: the markers of the tracked robots.
+        expected: the same with the covariances of their positions.
+        t_ns: time of the frame set.
         floor_px: see `DetectionTable.of`.
+        parts: the frames assigned so far.
     """
 
-    def __init__(
-        self,
-        optics: CameraArray,
-        catalogue: MarkerTable,
+    cameras: CameraArray
+    revision: int
+    marker_table: MarkerTable
+    states: States
+    markers: Index
+    expected: _core.ExpectedMarkers
+    t_ns: int
+    floor_px: float
+    parts: tuple[_AssignedFrames, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        cameras: CameraArray,
+        marker_table: MarkerTable,
         states: States,
-        active: Mask,
+        tracked: Mask,
         t_ns: int,
         floor_px: float,
-    ) -> None:
-        self._optics, self._catalogue, self._states = optics, catalogue, states
-        self._markers = np.flatnonzero(active[catalogue.robot])
-        discs = catalogue.robot[self._markers], catalogue.marker.take(self._markers, 1)
-        self._expected = _core.ExpectedMarkers(states.R, states.P, *discs, catalogue.radius[self._markers])
-        self._t_ns, self._floor_px = t_ns, floor_px
-        self._parts: list[_Part] = []
-        self._done: set[int] = set()  # the frames' id(): what is in a part lives on
+    ) -> "Association":
+        """No assignments yet.
 
-    def missing(self, frames: Sequence[CalibratedFrame]) -> tuple[CalibratedFrame, ...]:
-        """Those of the frames that are not matched yet."""
-        return tuple(frame for frame in frames if id(frame) not in self._done)
+        Args:
+            cameras: cameras of the rig.
+            marker_table: markers of all robots.
+            states: robots predicted at `t_ns`.
+            tracked: (N,) robots whose markers are expected.
+            t_ns: time of the frame set.
+            floor_px: see `DetectionTable.of`.
+        """
+        rows = np.flatnonzero(tracked[marker_table.robot])
+        bodies, positions = marker_table.robot[rows], marker_table.position.take(rows, 1)
+        expected = _core.ExpectedMarkers(states.R, states.P, bodies, positions, marker_table.radius[rows])
+        return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns, floor_px)
 
-    def add(self, frames: Sequence[CalibratedFrame]) -> None:
-        """Match those of the frames that are not matched yet, all at once."""
-        new = self.missing(frames)
-        if new:
-            sightings = DetectionTable.of(FrameSet(self._t_ns, new), self._optics, self._floor_px)
-            sighting, disc = self._match(sightings)
-            frame = sightings.frame[sighting]
-            self._parts.append(_Part(new, frame, sighting - _first_rows(new)[frame], disc))
-            self._done.update(map(id, new))
+    def pending(self, frames: Sequence[CalibratedFrame]) -> tuple[CalibratedFrame, ...]:
+        """The frames that are not assigned yet."""
+        assigned = {id(frame) for part in self.parts for frame in part.frames}
+        return tuple(frame for frame in frames if id(frame) not in assigned)
 
-    def whole(self, instant: FrameSet) -> tuple[DetectionTable, Assignments]:
-        """All detections of the instant, and what they are matched to, in order of the detections."""
-        self.add(instant.frames)
-        sightings = DetectionTable.of(instant, self._optics, self._floor_px)
-        first = dict(zip(map(id, instant.frames), _first_rows(instant.frames).tolist(), strict=True))
-        rows = [part.rows(first) for part in self._parts]
-        sighting = np.concatenate([np.empty(0, np.intp), *rows])
-        disc = np.concatenate([np.empty(0, np.intp), *(part.disc for part in self._parts)])
-        order = np.argsort(sighting)[np.count_nonzero(sighting < 0) :]
-        return sightings, Assignments.of(sighting[order], disc[order])
+    def extended(self, frames: Sequence[CalibratedFrame]) -> "Association":
+        """With the pending frames assigned."""
+        new = self.pending(frames)
+        if not new:
+            return self
+        detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras, self.floor_px)
+        detection, marker = self._assign(detections)
+        frame = detections.frame[detection]
+        part = _AssignedFrames(new, frame, detection - _first_rows(new)[frame], marker)
+        return replace(self, parts=(*self.parts, part))
 
-    def _match(self, sightings: DetectionTable) -> tuple[Index, Index]:
-        """Rows of the sightings and of the catalogue."""
-        exposures = sightings.exposures
-        pairs, cost = self._expected.candidates(
-            self._optics.pose(self._states, exposures),
-            sightings.frame,
-            sightings.xy,
-            sightings.scale,
-            sightings.cov,
-            sightings.axes_px[0],
-            self._optics.focal[exposures.camera],
-        )
-        marker, sighting = pairs[:, assign(pairs, cost, sightings.frame)]
-        return sighting, self._markers[marker]
+    def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments]:
+        """All detections of the frame set, and its assignments in the order of the detections."""
+        detections = DetectionTable.of(frame_set, self.cameras, self.floor_px)
+        first = dict(zip(map(id, frame_set.frames), _first_rows(frame_set.frames).tolist(), strict=True))
+        rows = [part.rows(first) for part in self.parts]
+        detection = np.concatenate([np.empty(0, np.intp), *rows])
+        marker = np.concatenate([np.empty(0, np.intp), *(part.marker for part in self.parts)])
+        order = np.argsort(detection)[np.count_nonzero(detection < 0) :]
+        return detections, Assignments.of(detection[order], marker[order])
+
+    def _assign(self, detections: DetectionTable) -> tuple[Index, Index]:
+        """Rows of the detections and of the marker table."""
+        exposures = detections.exposures
+        poses = self.cameras.frame_poses(self.states, exposures)
+        focal = self.cameras.focal[exposures.camera]
+        pairs, cost = self.expected.candidates(poses, detections.columns, focal)
+        marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
+        return detection, self.markers[marker]
 
 
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:
-    """Where each frame's detections begin, of all of them one after the other."""
+    """The row of each frame's first detection in a detection table."""
     return np.cumsum([0, *(len(frame.roundels) for frame in frames)])[:-1]
 
 
 def assign(pairs: Index, cost: Array, frame: Index) -> Index:
-    """The rows of the cheapest pairs, as many as there can be in each frame; what has no rival needs no search.
+    """Choose as many pairs as possible in each frame at the lowest total cost.
 
     Args:
-        pairs: (2, K) markers and sightings.
-        cost: (K,), each less than `UNMATCHED`.
-        frame: (N,) of the sightings.
+        pairs: (2, K) rows of markers and detections.
+        cost: (K,), each below `UNASSIGNED_COST`.
+        frame: (N,) of the detections.
+
+    Returns:
+        the chosen columns of `pairs`; pairs without a rival are chosen directly.
     """
-    marker, sighting = pairs
-    place = frame[sighting] * (np.max(marker, initial=0) + 1) + marker  # of a marker in a frame
-    rivals = np.maximum(np.bincount(place)[place], np.bincount(sighting)[sighting])
+    marker, detection = pairs
+    view = frame[detection] * (np.max(marker, initial=0) + 1) + marker  # of a marker in a frame
+    rivals = np.maximum(np.bincount(view)[view], np.bincount(detection)[detection])
     alone, contested = np.flatnonzero(rivals == 1), np.flatnonzero(rivals > 1)
-    at = frame[sighting[contested]]
-    parts = [contested] if len(contested) < TOGETHER else [contested[at == k] for k in set(at.tolist())]
-    chosen = [rows[_assign_rivals(place[rows], sighting[rows], cost[rows])] for rows in parts]
+    at = frame[detection[contested]]
+    groups = [contested] if len(contested) < MAX_JOINT else [contested[at == k] for k in set(at.tolist())]
+    chosen = [rows[_solve_assignment(view[rows], detection[rows], cost[rows])] for rows in groups]
     return np.concatenate([alone, *chosen])
 
 
-def _assign_rivals(place: Index, sighting: Index, cost: Array) -> Index:
-    i, n = _renumber(place)
-    j, m = _renumber(sighting)
-    costs, number = np.full((n, m), UNMATCHED), np.full((n, m), -1)
+def _solve_assignment(view: Index, detection: Index, cost: Array) -> Index:
+    i, n = _renumber(view)
+    j, m = _renumber(detection)
+    costs, number = np.full((n, m), UNASSIGNED_COST), np.full((n, m), -1)
     costs[i, j], number[i, j] = cost, np.arange(len(cost))
     chosen = number[linear_sum_assignment(costs)]
     return chosen[chosen >= 0]
 
 
 def _renumber(rows: Index) -> tuple[Index, int]:
-    """Rows counted from 0 without gaps, and how many there are."""
+    """Rows renumbered from 0 without gaps, and their count."""
     new = np.cumsum(np.bincount(rows) > 0)
     return new[rows] - 1, int(new[-1]) if len(new) else 0

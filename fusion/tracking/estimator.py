@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The estimator: a factor graph an instant, eliminated by GTSAM (a lag-1 filter).
+"""Estimates robot states with one factor graph for each frame set, eliminated by GTSAM (a lag-1 filter).
 
-    posterior of the last instant -- white-noise-on-acceleration motion -- observations of this instant
+    posterior of the last frame set -- white-noise-on-acceleration motion -- observations of this frame set
 
-All robots are one graph, of which each is a part of its own. What the last posterior and the motion say together is one
-HessianFactor a robot, what its observations say another; those, each at its own capture time, are linearised and
-weighed one by one (Cauchy) by `native/linearisation.cpp` and `native/normal_equations.cpp`.
+The graph has one component for each robot, with two HessianFactors: the predicted posterior, and the observations.
+`native/linearization.cpp` linearizes each observation at its own capture time, `native/normal_equations.cpp` weighs
+them (Cauchy). See docs/fusion_filter.md.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import gtsam
 import numpy as np
@@ -19,165 +18,177 @@ from camera_node.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import MatchedObservations
-from fusion.model.states import States, Transition, forget_turn, predict
+from fusion.model.states import States, Transition, predict, reset_unobservable
+from fusion.tracking.gating import AXIS_SIGMA_PX
 
-ITERATIONS = 8  # at the most
-SMALL = 0.03  # rad and m of a correction that leaves less than a detection's noise of second order
-STEADY_S = 0.02  # for which a velocity is taken as constant: half a period of a slow camera
-AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold move it by more than noise does
+MAX_ITERATIONS = 8
+SMALL = 0.03  # rad and m; the second-order error of a smaller correction is below the noise of a detection
+STEADY_S = 0.02  # during which velocities count as constant: half the period of a slow camera
+MIN_SHAPED = 3  # visible markers from which a body does not need the shapes of outlines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """N bodies at this instant before its observations, and how errors moved since the last.
+    """N bodies at the time of a frame set before its observations, and the transition since the last one.
 
-    `information` (N, 12, 12) is the inverse of the states' covariance: made here, before the last detection is there.
+    `information` (N, 12, 12) is the inverse of the covariance, computed before the last detection arrives.
     """
 
     states: States
     information: Array
     motion: Transition
 
+    @classmethod
+    def without_motion(cls, states: States) -> "Prediction":
+        """States at the time of the frame set."""
+        n = len(states)
+        return cls(states, _core.inverses(states.P), Transition(np.zeros((n, 3, 3)), np.zeros(n)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """The observations of a frame set, and the priors of the K visible bodies.
+
+    Attributes:
+        observations: N observations.
+        shaped: (S,) rows whose outlines are observed too.
+        bodies: (K,) rows of the states.
+        prior: (K, 12, 12) information.
+    """
+
+    observations: MatchedObservations
+    shaped: Index
+    bodies: Index
+    prior: Array
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """Errors `delta` (N, 12) of all bodies; of the K seen the last step (K, 12), information and weights.
+    """The result of one iteration.
 
-    `remainder` (2, N) is whitened, in the order of the rows.
+    Attributes:
+        delta: (B, 12) errors of all bodies relative to the prediction.
+        step: (K, 12) last step of the visible bodies.
+        information: (K, 12, 12) of the visible bodies.
+        weights: (N + S,) of the equations.
+        residuals: (2, N + S) whitened.
     """
 
     delta: Array
     step: Array
     information: Array
     weights: Array
-    remainder: Array
+    residuals: Array
 
 
 class Estimator:
-    """Predicts and updates robots.
+    """Predicts and updates bodies.
 
     Args:
-        optics: the rig's cameras.
-        densities: (N, 2) of each robot's white acceleration.
-        single: (N,) robots of one marker.
+        cameras: cameras of the rig.
+        densities: (N, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+        single: (N,) bodies with a single marker.
     """
 
-    def __init__(self, optics: CameraArray, densities: Array, single: Mask) -> None:
-        self.optics = optics
+    def __init__(self, cameras: CameraArray, densities: Array, single: Mask) -> None:
+        self.cameras = cameras
         self.densities = densities
         self.single = single
 
     def predict(self, states: States, dt: Array) -> Prediction:
-        """All robots, `dt` (N,) seconds later."""
-        moved, motion = predict(states, dt, self.densities, self.single)
+        """Predict all bodies by `dt` (N,) seconds."""
+        predicted, motion = predict(states, dt, self.densities, self.single)
         if self.single.any():
-            moved.P[self.single] = forget_turn(moved.P[self.single])
-        return Prediction(moved, _core.inverses(moved.P), motion)
+            predicted.P[self.single] = reset_unobservable(predicted.P[self.single])
+        return Prediction(predicted, _core.inverses(predicted.P), motion)
 
     def update(
         self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL
     ) -> tuple[States, Array]:
-        """Fuse an instant's observations; robots without any stay as predicted.
+        """Fuse the observations of a frame set; bodies without observations stay as predicted.
 
         Args:
-            prediction: the robots before.
-            observations: of this instant.
-            small: rad and m; after a larger correction everything is linearised anew.
+            prediction: the bodies before the update.
+            observations: of this frame set.
+            small: rad and m; a larger correction is followed by another linearization.
 
         Returns:
-            the states, and what remains of each observation (2, N), pixels; NaN where it can't be seen.
+            the states, and the residuals (2, N) in pixels, NaN where the disc is not visible.
+
+        Raises:
+            RuntimeError: the system of a body is singular (from GTSAM or the native core).
         """
         states, n = prediction.states, len(prediction.states)
-        seen = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
-        if not len(seen):
+        bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
+        if not len(bodies):
             return states, np.empty((2, 0))
-        observations = self._loosened(states, observations)
-        prior = prediction.information[seen]
-        solve = partial(self._solve, observations, _shaped(observations), seen, prior)
-        solution = solve(states, np.zeros((n, 12)), None)
-        for _ in range(ITERATIONS - 1):
+        observations = self._inflate_late(states, observations)
+        problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
+        solution = self._solve(problem, states, np.zeros((n, 12)))
+        for _ in range(MAX_ITERATIONS - 1):
             if np.max(np.abs(solution.step[:, :6])) < small:
                 break
-            solution = solve(states.moved(solution.delta), solution.delta, solution.weights)
+            at = states.retract(solution.delta)
+            solution = self._solve(problem, at, solution.delta, solution.weights)
         P = states.P.copy()
-        P[seen] = _core.inverses(solution.information)
+        P[bodies] = _core.inverses(solution.information)
         if self.single.any():
-            P[self.single] = forget_turn(P[self.single])
-        return replace(states.moved(solution.delta), P=P), _in_pixels(observations, solution.remainder)
-
-    def _solve(
-        self,
-        observations: MatchedObservations,
-        shaped: Index,
-        seen: Index,
-        prior: Array,
-        at: States,
-        delta: Array,
-        weights: Array | None,
-    ) -> "_Solution":
-        """Linearise once about the states `at`, which are displaced by `delta` (N, 12), weigh and eliminate."""
-        row = np.cumsum(np.bincount(seen, minlength=len(at))) - 1
-        body = row[np.concatenate([observations.discs.body, observations.discs.body[shaped]])]
-        rows = self._linearise(at, observations, shaped)
-        displaced = (prior @ delta[seen, :, None])[:, :, 0]
-        weights = np.ones(len(rows)) if weights is None else weights
-        information, right, weights = _core.reweigh(rows, body, prior, -displaced, weights)
-        step = _eliminate(information, right)
-        delta = delta.copy()
-        delta[seen] += step
-        return _Solution(delta, step, information, weights, _core.remainder(rows, body, step))
+            P[self.single] = reset_unobservable(P[self.single])
+        return replace(states.retract(solution.delta), P=P), _in_pixels(observations, solution.residuals)
 
     def select(self, rows: NDArray) -> "Estimator":
-        """The estimator of some of the robots."""
-        return Estimator(self.optics, self.densities[rows], self.single[rows])
+        """The estimator of some of the bodies."""
+        return Estimator(self.cameras, self.densities[rows], self.single[rows])
 
-    def _loosened(self, states: States, observations: MatchedObservations) -> MatchedObservations:
-        """Late detections, their noise grown by what the body may have done since.
+    def _solve(
+        self, problem: _Problem, at: States, delta: Array, weights: Array | None = None
+    ) -> "_Solution":
+        """Linearize once about `at`, which is displaced from the prediction by `delta`; weigh and eliminate."""
+        row = np.cumsum(np.bincount(problem.bodies, minlength=len(at))) - 1
+        of_disc = problem.observations.discs.body
+        body = row[np.concatenate([of_disc, of_disc[problem.shaped]])]
+        equations = self._linearize(at, problem)
+        right = -(problem.prior @ delta[problem.bodies, :, None])[:, :, 0]
+        weights = np.ones(len(equations)) if weights is None else weights
+        information, right, weights = _core.reweigh(equations, body, problem.prior, right, weights)
+        step = _eliminate(information, right)
+        delta = delta.copy()
+        delta[problem.bodies] += step
+        return _Solution(delta, step, information, weights, _core.residuals(equations, body, step))
 
-        Within `STEADY_S` of the instant a velocity is taken as constant; over longer times white acceleration of
-        density q moves a marker by q tau^3 / 3.
+    def _linearize(self, states: States, problem: _Problem) -> Array:
+        """(N + S, 2, 13) equations of the centres, then of the outlines; see `_core.FramePoses`."""
+        seen, discs = problem.observations.detections, problem.observations.discs
+        poses = self.cameras.frame_poses(states, seen.exposures)
+        equations = poses.linearize_centres(discs.columns, seen.xy, problem.observations.whiten, self.single)
+        if not len(problem.shaped):
+            return equations
+        discs, seen = discs.select(problem.shaped), seen.select(problem.shaped)
+        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+        outlines = poses.linearize_outlines(discs.columns, seen.axes_px, seen.angle_rad, seen.scale, sigma)
+        return np.concatenate([equations, outlines])
+
+    def _inflate_late(self, states: States, observations: MatchedObservations) -> MatchedObservations:
+        """Add to the noise of late detections the motion that the constant velocities do not predict.
+
+        Velocities count as constant within `STEADY_S` of the frame set. Over a longer time tau, white acceleration of
+        density q moves a marker with the variance q tau^3 / 3.
         """
-        tau = np.abs(observations.seen.tau)
+        detections, discs = observations.detections, observations.discs
+        tau = np.abs(detections.tau)
         if not (tau > STEADY_S).any():
             return observations
         late = np.maximum(tau - STEADY_S, 0)
-        q_turn, q = self.densities[observations.discs.body].T
-        arm2 = np.einsum("in,in->n", observations.discs.marker, observations.discs.marker)
-        poses = self.optics.pose(states, observations.seen.exposures)
-        z = self.optics.view(poses, observations.discs).centre[2]
-        scale = observations.seen.scale
-        moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_turn * arm2) * late**3 / 3 / z**2)
-        seen = replace(observations.seen, cov=observations.seen.cov + moved)
-        return MatchedObservations.seeing(seen, observations.discs)
-
-    def _linearise(self, states: States, observations: MatchedObservations, shaped: Index) -> Array:
-        """(N + S, 2, 13) rows of the observations, then of the S outlines `shaped`; see `_core.Poses.linearise`."""
-        seen = observations.seen
-        poses = self.optics.pose(states, seen.exposures)
-        of_centre = seen.xy, observations.whiten, self.single
-        rows = poses.linearise(*observations.discs.columns, *of_centre)
-        if not len(shaped):
-            return rows
-        discs, seen = observations.discs.select(shaped), seen.select(shaped)
-        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-        of_outline = seen.axes_px, seen.angle_rad, seen.scale, sigma
-        return np.concatenate([rows, poses.linearise_outlines(*discs.columns, *of_outline)])
-
-
-def misfit(observations: MatchedObservations, remainder: Array, slack_px: float) -> Array:
-    """(N,) squared errors of observations in standard deviations, to which `slack_px` is added; inf if unseen."""
-    cov = observations.seen.cov
-    d2 = np.sum(remainder**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + slack_px**2)
-    return np.nan_to_num(d2, nan=np.inf)
-
-
-def mean_of_bodies(values: NDArray, body: Index, n_bodies: int) -> Array:
-    """(B,) means of values (N,) of bodies (N,); 0 where a body has none."""
-    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
+        q_angular, q = self.densities[discs.body].T
+        arm2 = np.einsum("in,in->n", discs.position, discs.position)
+        z = self.cameras.views(states, detections.exposures, discs).centre[2]
+        scale = detections.scale
+        moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_angular * arm2) * late**3 / 3 / z**2)
+        return MatchedObservations.of_discs(replace(detections, cov=detections.cov + moved), discs)
 
 
 def _eliminate(information: Array, right: Array) -> Array:
-    """(K, 12) corrections of K robots, by one elimination of all."""
+    """(K, 12) corrections of K bodies by one elimination."""
     graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
     for k, (H, g) in enumerate(zip(information, right, strict=True)):
         graph.push_back(gtsam.HessianFactor(k, H, g, 0.0))
@@ -186,19 +197,21 @@ def _eliminate(information: Array, right: Array) -> Array:
 
 
 def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:
-    """(2, N) of whitened remainders of the observations, which come first (2, N...)."""
+    """(2, N) residuals in pixels of the N centres, which come first in `whitened`."""
     x, y = whitened[:, : len(observations)]
-    cov = observations.seen.cov
-    u = np.sqrt(cov[0, 0])  # whitened is L^-1 of pixels, L L^T the covariance
+    cov = observations.detections.cov
+    u = np.sqrt(cov[0, 0])  # whitened = L^-1 pixels, where L L^T is the covariance
     v = cov[0, 1] / u
     error = np.stack([u * x, v * x + np.sqrt(cov[1, 1] - v * v) * y])
     return np.where(np.isfinite(observations.whiten[0, 0]), error, np.nan)
 
 
 def _shaped(observations: MatchedObservations) -> Index:
-    """Rows of outlines of bodies of which fewer than three markers are seen: their shapes are needed."""
+    """Rows with known outlines of bodies with fewer than `MIN_SHAPED` visible markers."""
     discs = observations.discs
-    body = np.full(np.max(discs.row, initial=0) + 1, -1)
-    body[discs.row] = discs.body
-    kinds = np.bincount(body[body >= 0], minlength=1)
-    return np.flatnonzero((kinds[discs.body] < 3) & np.isfinite(observations.seen.axes_px[1]))
+    body = np.full(np.max(discs.marker, initial=0) + 1, -1)
+    body[discs.marker] = discs.body
+    n_markers = np.bincount(body[body >= 0], minlength=1)
+    return np.flatnonzero(
+        (n_markers[discs.body] < MIN_SHAPED) & np.isfinite(observations.detections.axes_px[1])
+    )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Markers of nobody that one camera alone sees: where their size says, and the two ways that they may face.
+"""Locates unlabeled markers that only one camera sees: range from the apparent size, and two possible normals.
 
-A view by itself tells a range as well as a size is measured, and two normals as likely as each other. Errors of a size
-last (blur, threshold), so nothing is gained by averaging: each instant speaks for itself. What has just appeared may be
-a false detection, and is told after `CONFIRMED` instants.
+One view determines a range with the accuracy of the size, and two equally probable normals. Errors of a size persist
+(blur, threshold), so averaging over frame sets would gain nothing: each frame set is evaluated by itself. A detection
+that just appeared may be false; a marker is reported after `CONFIRMED` frame sets.
 """
 
 from dataclasses import dataclass
@@ -14,22 +14,19 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index, Mask
 from camera_node.detection.disc_pose import decompose
 from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable
-from fusion.tracking.estimator import AXIS_SIGMA_PX
-from fusion.tracking.multiview import SPEED_M_S, Marker
-from fusion.tracking.result import Told, followed_places
+from fusion.model.observations import DetectionTable
+from fusion.tracking.gating import AXIS_SIGMA_PX, FORGET_NS, MAX_SPEED_M_S, POSITION_GATE
+from fusion.tracking.multiview import Marker
 from fusion.tracking.unlabeled import UnlabeledMarkers
 
-CONFIRMED = 3  # instants in which a camera saw it near where it was
-FORGOTTEN_NS = 300_000_000  # without being seen
-NOISE_PX = 2.0  # of a place, from instant to instant
-REACH = 16.3  # chi-square with 3 degrees, one in a thousand: within it two markers may be the same
-CROWD = 100  # free detections of an instant: where there are more, a texture is seen, or grouping has failed
+CONFIRMED = 3  # frame sets with a detection near its last position
+NOISE_PX = 2.0  # of an image position between frame sets
+MAX_UNASSIGNED = 100  # detections of a frame set; more come from a texture or a failed grouping
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spots:
-    """Where cameras saw something free: camera (N,), xy (2, N), time (N,) ns, and in how many instants (N,) so far."""
+    """N unassigned detections: camera (N,), undistorted xy (2, N), time (N,) ns, and number of frame sets (N,)."""
 
     camera: Index
     xy: Array
@@ -38,67 +35,57 @@ class _Spots:
 
 
 class SingleViewTracker:
-    """Follows what single cameras see.
+    """Tracks what single cameras see.
 
     Args:
-        optics: the cameras.
-        radii: (R,) of the markers in use; one that may be of several sizes is as far as each of them says.
+        cameras: cameras of the rig.
+        radii: (R,) of the markers in use; with several radii the range covers all of them.
     """
 
-    def __init__(self, optics: CameraArray, radii: Array) -> None:
-        self._optics, self._radii = optics, np.unique(radii)
+    def __init__(self, cameras: CameraArray, radii: Array) -> None:
+        self._cameras, self._radii = cameras, np.unique(radii)
         self._spots = _Spots(
             np.empty(0, np.intp), np.empty((2, 0)), np.empty(0, np.int64), np.empty(0, np.intp)
         )
 
-    def complete(
-        self,
-        tracker: Told,
-        t_ns: int,
-        sightings: DetectionTable,
-        matches: Assignments,
-        free: UnlabeledMarkers,
-    ) -> UnlabeledMarkers:
-        """The markers of nobody that several cameras see, and then these; for the leading shard, which tells them."""
-        if not tracker.shard.leads:
-            return free
-        untold = np.isfinite(sightings.xy[0]) & np.isfinite(sightings.axes_px[1])
-        untold[np.concatenate([matches.sighting, *(marker.sightings for marker in free.markers)])] = False
-        rows = np.flatnonzero(untold) if len(self._radii) else np.empty(0, np.intp)
-        rows = rows if len(rows) <= CROWD else rows[:0]
-        rows = rows[self._follow(t_ns, sightings.select(rows)) >= CONFIRMED]
-        return free.joined(self._tell(tracker, sightings, rows, free)) if len(rows) else free
+    def confirm(self, t_ns: int, detections: DetectionTable, used: Index) -> Index:
+        """Rows of detections outside `used` that a camera has seen in `CONFIRMED` frame sets."""
+        usable = np.isfinite(detections.xy[0]) & np.isfinite(detections.axes_px[1])
+        usable[used] = False
+        rows = np.flatnonzero(usable) if len(self._radii) else np.empty(0, np.intp)
+        rows = rows if len(rows) <= MAX_UNASSIGNED else rows[:0]
+        return rows[self._count(t_ns, detections.select(rows)) >= CONFIRMED]
 
-    def _tell(
-        self, tracker: Told, sightings: DetectionTable, rows: Index, free: UnlabeledMarkers
-    ) -> UnlabeledMarkers:
-        """Those of the detections `rows` that can't be of another marker that is told, or of a robot's."""
-        seen = sightings.select(rows)
-        place, spread, normals = self._locate(seen)
-        of_robots = followed_places(tracker)
-        others = (
-            np.concatenate([of_robots[0], free.position]),
-            np.concatenate([of_robots[1], free.covariance]),
-        )
-        kept = np.flatnonzero(~_may_be(place, spread, *others).any(1))
-        kept = kept[_best(place[kept], spread[kept], seen.camera[kept])]
-        markers = [Marker(place[k], spread[k], rows[[k]], seen.camera[[k]], np.nan) for k in kept.tolist()]
-        unknown = np.full((len(kept), 3), np.nan)
-        return UnlabeledMarkers(markers, place[kept], spread[kept], unknown, unknown, normals[kept])
+    def locate(self, detections: DetectionTable, rows: Index, known: tuple[Array, Array]) -> UnlabeledMarkers:
+        """The markers of detections `rows` that are none of the known markers.
 
-    def _follow(self, t_ns: int, seen: DetectionTable) -> Index:
-        """(N,) in how many instants each was there, this one included."""
+        Args:
+            detections: of a frame set.
+            rows: confirmed detections.
+            known: positions (K, 3) and covariances (K, 3, 3) of the markers that are reported already.
+        """
+        seen = detections.select(rows)
+        position, covariance, normals = self._decompose(seen)
+        new = np.flatnonzero(~_may_coincide(position, covariance, *known).any(1))
+        new = new[_best_known(position[new], covariance[new], seen.camera[new])]
+        markers = [
+            Marker(position[k], covariance[k], rows[[k]], seen.camera[[k]], np.nan) for k in new.tolist()
+        ]
+        unknown = np.full((len(new), 3), np.nan)
+        return UnlabeledMarkers(markers, position[new], covariance[new], unknown, unknown, normals[new])
+
+    def _count(self, t_ns: int, seen: DetectionTable) -> Index:
+        """(N,) in how many frame sets each detection was seen, including this one."""
         last, now = self._spots, t_ns + np.rint(seen.tau * 1e9).astype(np.int64)
-        focal = self._optics.focal[seen.camera]
-        slowness = (
-            seen.axes_px[0] / focal / (2 * self._radii[0]) if len(seen) else focal
-        )  # one over its range
+        focal = self._cameras.focal[seen.camera]
+        # The image speed of the fastest marker is MAX_SPEED_M_S over the range.
+        per_range = seen.axes_px[0] / focal / (2 * self._radii[0]) if len(seen) else focal
         age_s = np.abs(now[:, None] - last.t_ns) * 1e-9
-        reach = SPEED_M_S * slowness[:, None] * age_s + NOISE_PX / focal[:, None]
-        off = np.linalg.norm(seen.xy[:, :, None] - last.xy[:, None], axis=0)
-        same = (seen.camera[:, None] == last.camera) & (off < reach)
+        reach = MAX_SPEED_M_S * per_range[:, None] * age_s + NOISE_PX / focal[:, None]
+        distance = np.linalg.norm(seen.xy[:, :, None] - last.xy[:, None], axis=0)
+        same = (seen.camera[:, None] == last.camera) & (distance < reach)
         count = 1 + np.max(np.where(same, last.count, 0), axis=1, initial=0)
-        old = ~np.isin(last.camera, seen.exposures.camera) & (t_ns - last.t_ns < FORGOTTEN_NS)
+        old = ~np.isin(last.camera, seen.exposures.camera) & (t_ns - last.t_ns < FORGET_NS)
         self._spots = _Spots(
             np.concatenate([last.camera[old], seen.camera]),
             np.concatenate([last.xy[:, old], seen.xy], axis=1),
@@ -107,26 +94,26 @@ class SingleViewTracker:
         )
         return count
 
-    def _locate(self, seen: DetectionTable) -> tuple[Array, Array, Array]:
-        """Positions (N, 3), covariances (N, 3, 3) and both normals (N, 2, 3), in the world."""
-        R = self._optics.R_cam_world[seen.camera].transpose(0, 2, 1)
+    def _decompose(self, seen: DetectionTable) -> tuple[Array, Array, Array]:
+        """Positions (N, 3), covariances (N, 3, 3) and both normals (N, 2, 3), world frame."""
+        R = self._cameras.R_cam_world[seen.camera].transpose(0, 2, 1)
         c, n = decompose(_conics(seen), 1.0)  # of a disc of radius 1
-        places = np.einsum("nij,nkj->nki", R, c)[:, None] * self._radii[:, None, None]
-        places = places.reshape(len(seen), -1, 3)  # by every radius, twice each
-        mean = places.mean(1)
-        off = places - mean[:, None]
+        positions = np.einsum("nij,nkj->nki", R, c)[:, None] * self._radii[:, None, None]
+        positions = positions.reshape(len(seen), -1, 3)  # two for each radius, relative to the camera
+        mean = positions.mean(1)
+        off = positions - mean[:, None]
         ray = mean / np.linalg.norm(mean, axis=1, keepdims=True)
         range2 = np.einsum("ni,ni->n", mean, mean)
         along = range2 * (AXIS_SIGMA_PX / seen.axes_px[0]) ** 2
-        across = range2 * (seen.cov[0, 0] + seen.cov[1, 1]) / 2 / self._optics.focal[seen.camera] ** 2
+        across = range2 * (seen.cov[0, 0] + seen.cov[1, 1]) / 2 / self._cameras.focal[seen.camera] ** 2
         rays = ray[:, :, None] * ray[:, None]
         noise = along[:, None, None] * rays + across[:, None, None] * (np.eye(3) - rays)
-        spread = noise + np.einsum("nki,nkj->nij", off, off) / places.shape[1]
-        return self._optics.centres[seen.camera] + mean, spread, np.einsum("nij,nkj->nki", R, n)
+        covariance = noise + np.einsum("nki,nkj->nij", off, off) / positions.shape[1]
+        return self._cameras.centres[seen.camera] + mean, covariance, np.einsum("nij,nkj->nki", R, n)
 
 
 def _conics(seen: DetectionTable) -> Array:
-    """(N, 3, 3) Q with p^T Q p = 0 for outlines' points p = (x, y, 1), undistorted: the lens taken as affine there."""
+    """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); the lens is affine over an outline."""
     c, s = np.cos(seen.angle_rad), np.sin(seen.angle_rad)
     axes = np.array([[c, -s], [s, c]]) * seen.axes_px / 2  # half axes, pixels
     half = np.linalg.solve(seen.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
@@ -137,20 +124,20 @@ def _conics(seen: DetectionTable) -> Array:
     return -np.asarray(np.linalg.inv(dual), float)
 
 
-def _may_be(place: Array, spread: Array, position: Array, covariance: Array) -> Mask:
-    """(N, K) whether places and positions are the same, by their covariances."""
-    off = place[:, None] - position
-    near = np.einsum("nki,nki->nk", off, off) < REACH * (
-        np.einsum("nii->n", spread)[:, None] + np.einsum("kii->k", covariance)
+def _may_coincide(a: Array, cov_a: Array, b: Array, cov_b: Array) -> Mask:
+    """(N, K) whether positions a (N, 3) and b (K, 3) can be the same, by their covariances."""
+    off = a[:, None] - b
+    near = np.einsum("nki,nki->nk", off, off) < POSITION_GATE * (
+        np.einsum("nii->n", cov_a)[:, None] + np.einsum("kii->k", cov_b)
     )
     n, k = np.nonzero(near)
-    S, e = spread[n] + covariance[k], off[n, k]
-    near[n, k] = np.einsum("pi,pi->p", e, np.linalg.solve(S, e[:, :, None])[:, :, 0]) < REACH
+    S, e = cov_a[n] + cov_b[k], off[n, k]
+    near[n, k] = np.einsum("pi,pi->p", e, np.linalg.solve(S, e[:, :, None])[:, :, 0]) < POSITION_GATE
     return near
 
 
-def _best(place: Array, spread: Array, camera: Index) -> Index:
-    """Rows of which none may be another's that is known better, seen by another camera."""
-    size = np.einsum("nii->n", spread)
+def _best_known(position: Array, covariance: Array, camera: Index) -> Index:
+    """Rows that do not coincide with a marker of smaller covariance from another camera."""
+    size = np.einsum("nii->n", covariance)
     better = (size[:, None] > size) & (camera[:, None] != camera)
-    return np.flatnonzero(~(better & _may_be(place, spread, place, spread)).any(1))
+    return np.flatnonzero(~(better & _may_coincide(position, covariance, position, covariance)).any(1))

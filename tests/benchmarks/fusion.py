@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Fusion against its goals: `python -m tests.benchmarks.fusion [--thorough]`, one core, processor time.
+"""Fusion compared with its goals: `python -m tests.benchmarks.fusion [--thorough]`, one core, processor time.
 
-Times are of this machine as busy as it is; compare figures of one run. Goals stand beside the figures.
+Times depend on the machine and its load; compare figures of one run only.
 """
 
 from collections.abc import Iterator
@@ -63,13 +63,13 @@ def _accuracies(thorough: bool) -> Iterator[Row]:
             _verdict(free.tracker_mm < 1.15 * free.bound_mm),
         )
         yield (
-            f"{what}: by told association",
-            f"{free.tracker_mm / free.told_mm:.3f} times",
+            f"{what}: relative to known associations",
+            f"{free.tracker_mm / free.known_mm:.3f} times",
             "1.15 times",
-            _verdict(free.tracker_mm < 1.15 * free.told_mm),
+            _verdict(free.tracker_mm < 1.15 * free.known_mm),
         )
-        # Cameras at other times than the instant's see a place that a velocity, itself uncertain, has moved: the bound
-        # of free-running cameras is higher, and what exceeds the bounds' ratio is lost by the tracker.
+        # Free-running cameras see positions that an uncertain velocity has displaced, so their bound is higher. Only
+        # the excess over the ratio of the bounds is a loss of the tracker.
         yield (
             f"{what}: by synchronised cameras; and the bounds' ratio",
             f"{free.tracker_mm / together.tracker_mm:.2f}, {free.bound_mm / together.bound_mm:.2f} times",
@@ -94,7 +94,7 @@ def _capacities(thorough: bool) -> Iterator[Row]:
         name += f", {shards} shards" if shards > 1 else ""
         goal = "5, 15 ms" if load is FULL else ""
         yield (
-            f"{name}: last detection in to poses out, p50 and p99",
+            f"{name}: from the last detection to the poses, p50 and p99",
             f"{got.p50_ms:.1f}, {got.p99_ms:.1f} ms",
             goal,
             _verdict(got.p50_ms < 5 and got.p99_ms < 15) if goal else "",
@@ -131,15 +131,16 @@ def _identities(thorough: bool) -> Iterator[Row]:
 
 
 def _growth(seconds: float) -> Table:
-    """What an instant costs, one factor changed at a time; all loads take turns within one run.
+    """The cost of a frame set with one factor changed at a time; all loads alternate within one run.
 
-    A share of robots beside a cost says that the others are being searched for, in every instant, which costs more.
+    A share of tracked robots beside a cost marks loads in which the others are searched for in every frame set.
     """
     table = Table(
         "factor",
         *("",) * 3,
-        title=f"processor time of an instant that one in twenty does not exceed, and its growth from column to column"
-        f"\n{MIDDLE.robots} robots x {MIDDLE.markers} markers x {MIDDLE.cameras} cameras at {MIDDLE.hz:g} Hz but for",
+        title="5th percentile of the processor time of a frame set, and its growth from column to column"
+        f"\n{MIDDLE.robots} robots x {MIDDLE.markers} markers x {MIDDLE.cameras} cameras at {MIDDLE.hz:g} Hz, "
+        "except for the factor",
     )
     rows = {name: [replace(MIDDLE, **{name: value}) for value in values] for name, values in FACTORS.items()}
     loads = list({load: None for row in rows.values() for load in row})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Accuracy against the truth, and against the same filter when it is told which detection is of which marker."""
+"""Accuracy relative to the truth, and to the same filter with known associations."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,92 +7,93 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion.model.frames import FrameSet
+from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
 
 LIMITS = Limits(sigma_floor_px=1e-3)
-START = 20  # instants in which robots are found and their speeds are learnt
+START = 20  # frame sets for acquisition and for the velocities to converge
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """RMS position errors in mm: of the tracker, of the told filter, and as that filter's covariance predicts.
+    """RMS position errors in mm: of the tracker, of a filter with known associations, and from its covariance.
 
     `honesty` is the mean squared Mahalanobis error of the tracker's poses over their 6 degrees of freedom.
     """
 
     tracker_mm: float
-    told_mm: float
+    known_mm: float
     bound_mm: float
     honesty: float
     tracked: float
 
 
 def accuracy(load: Load, seconds: float) -> Accuracy:
-    """Of all robots at all instants after the start."""
+    """Of all robots in all frame sets after the start."""
     tracker = Tracker(load.rig, load.bodies, LIMITS)
-    told = _Told(load)
+    known = _KnownFilter(load)
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
-    for k, instant in enumerate(instants(load, seconds)):
-        tracker.fuse(instant)
-        told.fuse(instant)
+    for k, frame_set in enumerate(frame_sets(load, seconds)):
+        tracker.track(frame_set)
+        known.update(frame_set)
         if k < START:
             continue
-        truth = load.paths.at((instant.t_ns - START_NS) * 1e-9)
-        alive = np.array([status == "tracked" for status in tracker.status])
+        truth = load.paths.at((frame_set.t_ns - START_NS) * 1e-9)
+        alive = tracker.table.tracked
         tracked.append(alive.mean())
-        error = tracker.states.p - truth.p
+        error = tracker.table.states.p - truth.p
         mine.append(np.sum(error[alive] ** 2, 1))
-        theirs.append(np.sum((told.states.p - truth.p) ** 2, 1))
-        variance.append(np.einsum("nii->n", told.states.P[:, 3:6, 3:6]))
-        honesty.append(_mahalanobis(tracker.states.R, truth.R, error, tracker.states.P)[alive])
+        theirs.append(np.sum((known.states.p - truth.p) ** 2, 1))
+        variance.append(np.einsum("nii->n", known.states.P[:, 3:6, 3:6]))
+        honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.states.P)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
     return Accuracy(
         rms[0], rms[1], rms[2], float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked))
     )
 
 
-def instants(load: Load, seconds: float) -> Iterator[FrameSet]:
-    """A load's whole instants, in order."""
-    gathered, first = FrameSynchronizer(round(1e9 / load.hz)), True
+def frame_sets(load: Load, seconds: float) -> Iterator[FrameSet]:
+    """The complete frame sets of a load, in order."""
+    synchronizer, first = FrameSynchronizer(round(1e9 / load.hz)), True
     for frame in load.frames(seconds):
-        gathered.add(frame)
-        for instant in gathered.take(frame.t_ns):
+        synchronizer.add(frame)
+        for frame_set in synchronizer.take(frame.t_ns):
             if not first:
-                yield instant
+                yield frame_set
             first = False
 
 
-class _Told:
-    """The tracker's filter, started at the truth and told by each detection's `id` what it is of."""
+class _KnownFilter:
+    """The tracker's filter, started at the truth, with associations from the `id` of each detection."""
 
     def __init__(self, load: Load) -> None:
         tracker = Tracker(load.rig, load.bodies, LIMITS)
         self._tracker, self._load = tracker, load
         self._t_ns: int | None = None
-        self.states = tracker.states
+        self.states = tracker.table.states
 
-    def fuse(self, instant: FrameSet) -> None:
+    def update(self, frame_set: FrameSet) -> None:
         """Predict and update."""
         tracker = self._tracker
         if self._t_ns is None:
-            truth = self._load.paths.at((instant.t_ns - START_NS) * 1e-9)
-            self.states = type(truth)(truth.R, truth.p, truth.omega, truth.v, tracker.states.P)
-        dt = 1e-3 if self._t_ns is None else (instant.t_ns - self._t_ns) * 1e-9
-        self._t_ns = instant.t_ns
+            truth = self._load.paths.at((frame_set.t_ns - START_NS) * 1e-9)
+            self.states = type(truth)(truth.R, truth.p, truth.omega, truth.v, tracker.table.states.P)
+        dt = 1e-3 if self._t_ns is None else (frame_set.t_ns - self._t_ns) * 1e-9
+        self._t_ns = frame_set.t_ns
         prediction = tracker.estimator.predict(self.states, np.full(len(self.states), dt))
-        sightings = DetectionTable.of(instant, tracker.optics, LIMITS.sigma_floor_px)
-        number = np.concatenate([frame.roundels.id for frame in instant.frames])
+        detections = DetectionTable.of(frame_set, tracker.cameras, LIMITS.sigma_floor_px)
+        number = np.concatenate([frame.roundels.id for frame in frame_set.frames])
         rows = np.flatnonzero(number >= 0)
-        matches = Assignments.of(rows, number[rows].astype(np.intp))
-        observations = MatchedObservations.of(matches, sightings, tracker.catalogue)
+        assignments = Assignments.of(rows, number[rows].astype(np.intp))
+        observations = MatchedObservations.of(assignments, detections, tracker.table.markers)
         self.states, _ = tracker.estimator.update(prediction, observations)
 
 
 def _mahalanobis(R: np.ndarray, truth: np.ndarray, error: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """(N,) squared errors of pose in standard deviations."""
+    """(N,) squared pose errors in standard deviations."""
     E = truth.transpose(0, 2, 1) @ R
     turn = np.stack([E[:, 2, 1] - E[:, 1, 2], E[:, 0, 2] - E[:, 2, 0], E[:, 1, 0] - E[:, 0, 1]], 1) / 2
     e = np.concatenate([turn, error], 1)

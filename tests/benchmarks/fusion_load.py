@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A load on fusion: what free-running cameras would detect of many robots, as their messages and as the truth."""
+"""Synthetic loads: the detections of many robots as messages, and the truth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ FACING = 0.2  # cosine under which a print is not detected
 
 @dataclass(frozen=True)
 class Load:
-    """Robots on Lissajous figures through each other, at heights of their own, with false and missing detections."""
+    """Robots on Lissajous figures at different heights, with false and missing detections."""
 
     robots: int = 50
     markers: int = 4
@@ -37,16 +37,16 @@ class Load:
     hz: float = 60.0
     speed_m_s: float = 1.0
     missing: float = 0.1
-    false: float = 1.0  # detections a frame
-    clutter: int = 0  # roundels on the walls that are nobody's
+    false: float = 1.0  # detections per frame
+    clutter: int = 0  # roundels on the walls that belong to no robot
     synchronised: bool = False
     sigma_px: float = 0.1
-    crossing: bool = False  # through the whole arena, rather than each about a place of its own
+    crossing: bool = False  # through the whole arena, instead of each around its own point
     seed: int = 1
 
     @cached_property
     def rig(self) -> dict[str, Camera]:
-        """Cameras around the arena, looking at its middle."""
+        """Cameras around the arena, directed at its centre."""
         a = 0.3 + 2 * np.pi * np.arange(self.cameras) / self.cameras
         at = np.column_stack([4.0 * np.cos(a), 3.0 * np.sin(a), 3.0 + 0.3 * np.cos(3 * a)])
         poses = [look_at(p, [0.0, 0.0, 0.2]) for p in at]
@@ -57,7 +57,7 @@ class Load:
 
     @cached_property
     def bodies(self) -> dict[str, Robot]:
-        """Robots that nothing but their distances tells apart; those of one marker nothing at all."""
+        """Robots that only the distances of their markers distinguish; nothing distinguishes single markers."""
         rng = np.random.default_rng(self.seed)
         bodies: dict[str, Robot] = {}
         while len(bodies) < self.robots:
@@ -82,7 +82,7 @@ class Load:
         return Paths(centre, size, rate, rng.uniform(0, 6.28, (n, 2)), turn, rng.uniform(0, 6.28, n), height)
 
     def phases(self) -> np.ndarray:
-        """Of the cameras, as shares of a period."""
+        """Time offsets of the cameras in periods."""
         n = self.cameras
         return (
             np.zeros(n)
@@ -91,7 +91,7 @@ class Load:
         )
 
     def messages(self, seconds: float) -> Iterator[Detections]:
-        """All cameras' detections in order of time; `id` is the row of the catalogue, -1 for a false one."""
+        """Detections of all cameras in order of time; `id` is the row of the marker table, -1 for false ones."""
         rng = np.random.default_rng(self.seed + 2)
         scene = _Scene(self)
         stamps = (np.arange(round(seconds * self.hz))[:, None] + self.phases()) / self.hz
@@ -101,13 +101,13 @@ class Load:
             yield scene.detect(camera, seq, t_s, rng)
 
     def frames(self, seconds: float) -> Iterator[CalibratedFrame]:
-        """The same, received."""
+        """The same as calibrated frames."""
         return (CalibratedFrame.of(message, self.rig[message.camera]) for message in self.messages(seconds))
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Where robots are, and how they move."""
+    """Positions and motions of the robots."""
 
     centre: np.ndarray
     size: np.ndarray
@@ -118,12 +118,12 @@ class Paths:
     height: np.ndarray
 
     def place(self, p: np.ndarray) -> None:
-        """Stand still at p (N, 3)."""
+        """Place the robots at rest at p (N, 3)."""
         self.centre[:], self.size[:], self.rate[:], self.turn[:] = p[:, :2], 0, 0, 0
         self.height[:] = p[:, 2]
 
     def at(self, t_s: float) -> States:
-        """The robots as they truly are at a time, with covariances of nothing."""
+        """The true states at a time, with zero covariances."""
         n, angle = len(self.turn), self.rate * t_s + self.phase
         p = np.column_stack([self.centre + self.size * np.sin(angle), self.height])
         v = np.column_stack([self.size * self.rate * np.cos(angle), np.zeros(n)])
@@ -133,11 +133,11 @@ class Paths:
 
 
 class _Scene:
-    """Renders detections of a load."""
+    """Renders the detections of a load."""
 
     def __init__(self, load: Load) -> None:
-        self.load, self.optics = load, CameraArray(load.rig)
-        self.catalogue = MarkerTable.of(list(load.bodies.values()))
+        self.load, self.cameras = load, CameraArray(load.rig)
+        self.marker_table = MarkerTable.of(list(load.bodies.values()))
         rng = np.random.default_rng(load.seed + 3)
         self.clutter = np.column_stack(
             [
@@ -149,19 +149,21 @@ class _Scene:
 
     def detect(self, camera: int, seq: int, t_s: float, rng: np.random.Generator) -> Detections:
         """One frame's message."""
-        name, t_ns = self.optics.names[camera], START_NS + round(t_s * 1e9)
+        name, t_ns = self.cameras.names[camera], START_NS + round(t_s * 1e9)
         states = self.load.paths.at((t_ns - START_NS) * 1e-9)
-        poses = self.optics.pose(states, Exposures(np.array([camera]), np.zeros(1)))
-        n = len(self.catalogue.robot)
-        views = self.optics.view(poses, self.catalogue.discs(np.arange(n), np.zeros(n, np.intp)))
-        R, at = self.optics.R_cam_world[camera], self.optics.centres[camera]
+        exposures = Exposures(np.array([camera]), np.zeros(1))
+        n = len(self.marker_table)
+        views = self.cameras.views(
+            states, exposures, self.marker_table.discs(np.arange(n), np.zeros(n, np.intp))
+        )
+        R, at = self.cameras.R_cam_world[camera], self.cameras.centres[camera]
         c = np.column_stack([views.centre, R @ (self.clutter - at).T])
         normal = np.column_stack([views.normal, np.tile(R[:, 2:], len(self.clutter))])
         q = np.column_stack([views.q, c[:, n:]])
         row = np.concatenate([np.arange(n), np.full(len(self.clutter), -1)])
-        kept = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (q[2] > 0.1)
-        kept &= rng.random(len(kept)) >= self.load.missing
-        return self._message(name, seq, t_ns, c[:, kept], normal[:, kept], q[:, kept], row[kept], rng)
+        seen = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (q[2] > 0.1)
+        seen &= rng.random(len(seen)) >= self.load.missing
+        return self._message(name, seq, t_ns, c[:, seen], normal[:, seen], q[:, seen], row[seen], rng)
 
     def _message(self, name, seq, t_ns, c, normal, q, row, rng: np.random.Generator) -> Detections:
         lens, sigma = self.load.rig[name], self.load.sigma_px

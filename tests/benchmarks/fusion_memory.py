@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Whether memory stays flat at full load: `python -m tests.benchmarks.fusion_memory [--seconds 600]`.
+"""Memory growth at full load: `python -m tests.benchmarks.fusion_memory [--seconds 600]`.
 
-Of simulated seconds, at whatever pace the machine has; takes about a core for 15 minutes. What grew at first is what
-any program fills once (caches, the allocator's arenas); what still grows in the last part would go on.
+Simulates the seconds as fast as the machine allows; takes about a core for 15 minutes. Caches and the arenas of the
+allocator fill at first; growth in the last part would continue.
 """
 
 import gc
@@ -18,15 +18,15 @@ from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series
 from tests.benchmarks.fusion_load import START_NS, Load
 
 EVERY_S = 10.0
-SETTLED = 0.2  # share of the time that is left out of the slope
+STARTUP = 0.2  # share of the time that the slope excludes
 
 
 def main(seconds: float = 600.0, robots: int = 50) -> None:
-    """Print resident memory and Python's allocated blocks every ten simulated seconds, and what grows a minute.
+    """Print resident memory and allocated Python blocks every ten simulated seconds, and their growth per minute.
 
     Args:
         seconds: simulated.
-        robots: of 4 markers each, before 8 free-running cameras at 60 Hz.
+        robots: with 4 markers each, seen by 8 free-running cameras at 60 Hz.
     """
     load, room = Load(robots=robots), round(seconds / EVERY_S) + 1
     times_s, memory, blocks = Series(room), Series(room), Series(room)
@@ -48,13 +48,13 @@ def main(seconds: float = 600.0, robots: int = 50) -> None:
                 )
     slope, per_min = grown(times_s, memory), grown(times_s, blocks)
     print(
-        f"{slope:.3f} MB and {per_min:.0f} blocks a minute, the first {SETTLED:.0%} left out; goal: flat, 0.1 MB"
+        f"{slope:.3f} MB and {per_min:.0f} blocks per minute, without the first {STARTUP:.0%}; goal: 0.1 MB"
     )
 
 
 def grown(times_s: Series, values: Series) -> float:
-    """A minute: the slope of a line through what came after the start."""
-    t, y = (series.numbers[round(SETTLED * len(times_s)) :] for series in (times_s, values))
+    """Growth per minute: the slope of a line through the values after the start."""
+    t, y = (series.numbers[round(STARTUP * len(times_s)) :] for series in (times_s, values))
     return 60 * float(np.polyfit(t, y, 1)[0])
 
 

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Who is who: robots that cross, and what is said of them while they do."""
+"""Identity errors of crossing robots."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from fusion.tracking.tracker import Tracker
-from tests.benchmarks.fusion_accuracy import instants
+from tests.benchmarks.fusion_accuracy import frame_sets
 from tests.benchmarks.fusion_load import START_NS, Load
 
-WRONG_M = 0.05  # a tracked robot that is further from where it truly is, is another one, or nonsense
+WRONG_M = 0.05  # position error above which a tracked robot has the wrong identity
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Poses told as tracked that are wrong, changes from right to wrong, and the share of robots tracked."""
+    """Wrong tracked poses, changes from correct to wrong, and the share of tracked robots."""
 
     wrong: int
     swaps: int
@@ -22,14 +22,14 @@ class Identity:
 
 
 def identity(load: Load, seconds: float) -> Identity:
-    """Of a load's robots over its whole time."""
+    """Of the robots of a load."""
     tracker = Tracker(load.rig, load.bodies)
     was_wrong, wrong_poses, swaps, tracked = np.zeros(load.robots, bool), 0, 0, []
-    for instant in instants(load, seconds):
-        tracker.fuse(instant)
-        truth = load.paths.at((instant.t_ns - START_NS) * 1e-9)
-        alive = np.array([status == "tracked" for status in tracker.status])
-        wrong = alive & (np.linalg.norm(tracker.states.p - truth.p, axis=1) > WRONG_M)
+    for frame_set in frame_sets(load, seconds):
+        tracker.track(frame_set)
+        truth = load.paths.at((frame_set.t_ns - START_NS) * 1e-9)
+        alive = tracker.table.tracked
+        wrong = alive & (np.linalg.norm(tracker.table.states.p - truth.p, axis=1) > WRONG_M)
         swaps += int((wrong & ~was_wrong).sum())
         wrong_poses += int(wrong.sum())
         was_wrong = wrong

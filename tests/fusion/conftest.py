@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Running frames through the tracker."""
+"""Runs frames through the tracker."""
 
 import sys
 from collections.abc import Callable
@@ -11,30 +11,31 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from fusion.model.frames import CalibratedFrame
+from fusion.model.limits import Limits
 from fusion.protocol.messages import RobotPose
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.result import Fused
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.result import TrackingResult
+from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import Arena
 
 
-def fuse(arena: Arena, frames: list[CalibratedFrame], limits: Limits | None = None) -> list[Fused]:
-    """All instants of the frames."""
-    tracker, instants = Tracker(arena.cameras, arena.robots, limits), FrameSynchronizer(33_333_333)
+def track(arena: Arena, frames: list[CalibratedFrame], limits: Limits | None = None) -> list[TrackingResult]:
+    """The results of all frame sets."""
+    tracker, synchronizer = Tracker(arena.cameras, arena.robots, limits), FrameSynchronizer(33_333_333)
     closed = []
     for frame in frames:
-        instants.add(frame)
-        closed += instants.take(frame.t_ns)
-    return [tracker.fuse(instant) for instant in (*closed, *instants.finish())]
+        synchronizer.add(frame)
+        closed += synchronizer.take(frame.t_ns)
+    return [tracker.track(frame_set) for frame_set in (*closed, *synchronizer.finish())]
 
 
-def poses_of(fused: list[Fused], robot: str) -> list[RobotPose]:
-    """The robot's poses, whatever their state."""
-    return [pose for instant in fused for pose in instant.poses if pose.robot == robot]
+def poses_of(results: list[TrackingResult], robot: str) -> list[RobotPose]:
+    """The poses of a robot in every state."""
+    return [pose for result in results for pose in result.poses if pose.robot == robot]
 
 
 def errors(arena: Arena, poses: list[RobotPose]) -> np.ndarray:
-    """(N, 6) rotation (body) and position errors of poses."""
+    """(N, 6) errors of rotation (body frame) and position."""
     from camera_node.geometry.pose import rotation_from_wxyz
 
     rows = []
@@ -46,11 +47,11 @@ def errors(arena: Arena, poses: list[RobotPose]) -> np.ndarray:
 
 
 @pytest.fixture
-def run_arena() -> Callable[..., tuple[list[Fused], Callable[[str], list[RobotPose]]]]:
-    """`run_arena(arena, n)`: the fused instants of n frames a camera, and a function robot -> its poses."""
+def run_arena() -> Callable[..., tuple[list[TrackingResult], Callable[[str], list[RobotPose]]]]:
+    """`run_arena(arena, n)`: the results of n frames per camera, and a function from a robot to its poses."""
 
     def run(arena: Arena, n: int = 30, limits: Limits | None = None):
-        fused = fuse(arena, arena.frames(n), limits)
-        return fused, lambda robot: poses_of(fused, robot)
+        results = track(arena, arena.frames(n), limits)
+        return results, lambda robot: poses_of(results, robot)
 
     return run

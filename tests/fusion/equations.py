@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The observation model a second time, in NumPy, a few columns of linear algebra at a time: the core's oracle.
+"""The observation model in NumPy, as the oracle of the native core.
 
-Arrays hold one row's N columns last, (3, N) for N vectors. See `fusion/native/disc_view.hpp` for the equations' source.
+Arrays store columns: (3, N) for N vectors. `fusion/native/disc_view.hpp` names the source of the equations.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ from fusion.model.states import (
 )
 
 NEAR_M = 1e-3
-CAUCHY, NOMINAL_WEIGHT, SETTLED = 4.0, 0.8983, 0.1
+CAUCHY, NOMINAL_WEIGHT, CONVERGED = 4.0, 0.8983, 0.1
 STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Every body in every frame, column f * n_bodies + b: rotation and translation to the camera, and to the world.
+    """Every body in every frame, column f * n_bodies + b: its pose in the camera frame, and its rotation in the world.
 
     `R_cam` and `R_world` (3, 3, K), `t_cam` (3, K).
     """
@@ -41,21 +41,21 @@ class Poses:
     R_world: Array
 
     def columns(self, discs: Discs) -> Index:
-        """(N,) which column is a disc's."""
+        """(N,) the column of each disc."""
         return discs.frame * self.n_bodies + discs.body
 
 
-def pose(optics: CameraArray, states: States, exposures: Exposures) -> Poses:
-    """Bodies at each frame's own time."""
-    tau, R_cw, B = exposures.tau[:, None], optics.R_cam_world[exposures.camera], len(states)
+def pose(cameras: CameraArray, states: States, exposures: Exposures) -> Poses:
+    """Bodies at the capture time of each frame."""
+    tau, R_cw, B = exposures.tau[:, None], cameras.R_cam_world[exposures.camera], len(states)
     R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
     vectors = np.moveaxis(omega[:, None] * tau, 0, -1)
     turn = np.moveaxis(rotation_from_vector(vectors), (-2, -1), (0, 1))  # (3, 3, F, B)
     R_world = (
         turn[:, 0, None] * R[0, :, None] + turn[:, 1, None] * R[1, :, None] + turn[:, 2, None] * R[2, :, None]
     )
-    to = states.p.T[:, None] + v[:, None] * tau - optics.centres[exposures.camera].T[:, :, None]
-    # The cameras' rotations by one product each: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
+    to = states.p.T[:, None] + v[:, None] * tau - cameras.centres[exposures.camera].T[:, :, None]
+    # One product for each camera: (F, 3, 3) of (F, 3, 3 B) and (F, 3, B).
     R_cam = R_cw @ R_world.transpose(2, 0, 1, 3).reshape(-1, 3, 3 * B)
     t_cam = R_cw @ to.transpose(1, 0, 2)
     return Poses(
@@ -70,7 +70,7 @@ def view(poses: Poses, discs: Discs) -> Views:
     """See `Views`."""
     at = poses.columns(discs)
     R = _take(poses.R_cam, at)
-    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.marker), R[:, 2]
+    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.position), R[:, 2]
     q = n * (n[2] * discs.radius**2 / c[2])
     q[2] -= discs.radius**2 / c[2]
     q += c
@@ -79,24 +79,24 @@ def view(poses: Poses, discs: Discs) -> Views:
 
 
 def derive(
-    optics: CameraArray, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
+    cameras: CameraArray, poses: Poses, exposures: Exposures, discs: Discs, views: Views, whiten: Array
 ) -> Array:
-    """(2, 12, N) of the outline's centre, times `whiten` (2, 2, N), by the error of the disc's body.
+    """(2, 12, N) derivatives of the outline's centre, times `whiten` (2, 2, N), by the error of the body.
 
-    What moves by velocity in tau seconds moves tau times as by pose.
+    The derivatives by the velocities are tau times those by the pose.
     """
     at, tau = poses.columns(discs), exposures.tau[discs.frame]
     by_centre, by_normal = _by_disc(views, discs.radius, whiten)
     R = _take(poses.R_cam, at)
     h, k = np.einsum("ain,ijn->ajn", by_centre, R), np.einsum("ain,ijn->ajn", by_normal, R)
     J = np.empty((2, 12, len(at)))
-    x, y, z = discs.marker
+    x, y, z = discs.position
     J[:, 0] = y * h[:, 2] - z * h[:, 1]  # h (w x m) = (m x h) w
     J[:, 1] = z * h[:, 0] - x * h[:, 2]
     J[:, 2] = x * h[:, 1] - y * h[:, 0]
     J[:, 0] -= k[:, 1]
     J[:, 1] += k[:, 0]
-    R_cw = _take(_rotations(optics.R_cam_world), exposures.camera[discs.frame])
+    R_cw = _take(_rotations(cameras.R_cam_world), exposures.camera[discs.frame])
     J[:, POSITION] = np.einsum("ain,ijn->ajn", by_centre, R_cw)
     J[:, OMEGA] = tau * np.einsum("ain,jin->ajn", J[:, THETA], _take(poses.R_world, at))
     J[:, VELOCITY] = tau * J[:, POSITION]
@@ -122,8 +122,8 @@ def _by_disc(views: Views, radius: Array, whiten: Array) -> tuple[Array, Array]:
 def outlines(centre: Array, normal: Array, radius: Array, scale: Array) -> Array:
     """(N, 2, 2) shape matrices of discs' outlines in raw pixels; a circle of radius a has a^2 I.
 
-    `centre` and `normal` (3, N) are in the camera's frame; `scale` (2, 2, N) is the derivative of raw pixels by xy at
-    the disc: the lens is taken as affine over it.
+    `centre` and `normal` (3, N) are in the camera frame; `scale` (2, 2, N) is the Jacobian of raw pixels by xy at the
+    disc. The lens is taken as affine over the disc.
     """
     dual = centre[:, None] * centre - radius**2 * (np.eye(3)[:, :, None] - normal[:, None] * normal)
     dual = dual / dual[2, 2]
@@ -132,18 +132,18 @@ def outlines(centre: Array, normal: Array, radius: Array, scale: Array) -> Array
 
 
 def measured_outlines(axes_px: Array, angle_rad: Array) -> Array:
-    """(N, 2, 2) shape matrices of ellipses with full axes (2, N) and the major one's direction (N,)."""
+    """(N, 2, 2) shape matrices of ellipses with full axes (2, N) and the direction of the major axis (N,)."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     U = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
     return U @ (U.transpose(0, 2, 1) * (axes_px.T[:, :, None] / 2) ** 2)
 
 
 def shears(measured: Array, expected: Array) -> Array:
-    """(2, N) of outlines (N, 2, 2) seen in the frame in which the expected one is a unit circle: 0 if similar.
+    """(2, N) shears of outlines (N, 2, 2), where the expected ones are unit circles; 0 for similar outlines.
 
-    The two parts that change no area, divided by the size, each with a variance of 4 (sigma_axis / axis)^2.
+    The two components that do not change the area, divided by the size. Each has the variance 4 (sigma_axis / axis)^2.
     """
-    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T by L L^T = the expected, written out: called for thousands
+    l00 = np.sqrt(expected[:, 0, 0])  # L^-1 M L^-T, where L L^T is the expected shape
     l10 = expected[:, 1, 0] / l00
     l11 = np.sqrt(expected[:, 1, 1] - l10**2)
     a = measured[:, 0, 0] / l00**2
@@ -164,8 +164,8 @@ def _take(A: Array, columns: Index) -> Array:
 def shape_rows(
     poses: Poses, discs: Discs, views: Views, observations: MatchedObservations, sigma: Array
 ) -> Array:
-    """(N, 2, 13) equations of outlines, by difference quotients of their shears."""
-    seen = observations.seen
+    """(N, 2, 13) equations of outlines, from difference quotients of their shears."""
+    seen = observations.detections
     R = poses.R_cam[..., poses.columns(discs)]
     measured = measured_outlines(seen.axes_px, seen.angle_rad)
     turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
@@ -180,13 +180,13 @@ def shape_rows(
 def reweigh(
     rows: Array, body: Index, information: Array, right: Array, weights: Array
 ) -> tuple[Array, Array, Array]:
-    """Sums of priors and rows by Cauchy's weights, these renewed until a body's settle, four times at the most."""
+    """Sums of priors and equations with Cauchy weights, updated until those of a body converge, four times at most."""
     A, b, weights = rows[:, :, :12], rows[:, :, 12], weights.copy()
     information, right = information.copy(), right.copy()
     for k in range(len(information)):
         mine = body == k
         sums = partial(_sums, A[mine], b[mine], information[k], right[k])
-        weights[mine] = _settled(A[mine], b[mine], sums, weights[mine])
+        weights[mine] = _converge(A[mine], b[mine], sums, weights[mine])
         information[k], right[k] = sums(weights[mine])
     return information, right, weights
 
@@ -195,24 +195,24 @@ def _sums(A: Array, b: Array, H: Array, g: Array, weights: Array) -> tuple[Array
     return H + np.einsum("n,nai,naj->ij", weights, A, A), g + np.einsum("n,nai,na->i", weights, A, b)
 
 
-def _settled(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], weights: Array) -> Array:
+def _converge(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], weights: Array) -> Array:
     for _ in range(4 if len(A) else 0):
         rest = b - A @ np.linalg.solve(*sums(weights))
         before, weights = weights, 1 / (NOMINAL_WEIGHT * (1 + np.sum(rest**2, 1) / CAUCHY**2))
-        if np.abs(weights - before).max() < SETTLED:
+        if np.abs(weights - before).max() < CONVERGED:
             break
     return weights
 
 
 def candidates(
-    optics: CameraArray, states: States, seen: DetectionTable, discs: Discs, covariance: Array
+    cameras: CameraArray, states: States, seen: DetectionTable, discs: Discs, covariance: Array
 ) -> dict[tuple[int, int], float]:
-    """Costs by disc and sighting of one frame, within the gates; `covariance` (N, 3, 3) of the discs' places."""
-    views = view(pose(optics, states, seen.exposures), discs)
+    """Costs by disc and detection of one frame, within the gates; `covariance` (N, 3, 3) of the discs' positions."""
+    views = view(pose(cameras, states, seen.exposures), discs)
     found = {}
     for i in np.flatnonzero((views.facing > 0.1) & np.isfinite(views.xy[0])):
         camera = seen.exposures.camera[discs.frame[i]]
-        R, z = optics.R_cam_world[camera], views.centre[2, i]
+        R, z = cameras.R_cam_world[camera], views.centre[2, i]
         J = (R[:2] - views.xy[:, i, None] * R[2]) / z
         depth = 0.05**2 + R[2] @ covariance[i] @ R[2] / z**2
         for j in np.flatnonzero(seen.frame == discs.frame[i]):
@@ -225,7 +225,7 @@ def candidates(
             shape = outlines(views.centre[:, [i]], views.normal[:, [i]], discs.radius[[i]], scale[..., None])
             size = np.log(seen.axes_px[0, j] / 2 / np.sqrt(np.linalg.eigvalsh(shape[0])[1]))
             if d2 < 13.8 and abs(size) <= np.log(1.35):
-                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * optics.focal[camera] ** 4 * depth)
+                cost = d2 + size**2 / depth + np.log(np.linalg.det(C) * cameras.focal[camera] ** 4 * depth)
                 found[int(i), int(j)] = cost
     return found
 
@@ -234,9 +234,9 @@ def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[
     """See `fusion.model.states.predict`."""
     half = rotation_from_vector(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
-    turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
-    motion = Transition(turn, dt)
-    P = motion.carry(motion.carry(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
+    T = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
+    motion = Transition(T, dt)
+    P = motion.multiply(motion.multiply(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
     moved = States(half @ R_half, states.p + states.v * dt[:, None], states.omega, states.v, P)
     return moved, motion
 

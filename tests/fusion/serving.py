@@ -14,9 +14,9 @@ import msgspec
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
+from fusion.model.limits import Limits
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
-from fusion.tracking.tracker import Limits
 from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
 
 T = TypeVar("T")

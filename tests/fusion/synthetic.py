@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A synthetic arena: what free-running cameras would detect of robots whose motion is known exactly."""
+"""A synthetic arena: detections by free-running cameras of robots with known motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ SINGLE = Robot(diameter_m=0.12)
 
 
 def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0)) -> dict[str, Camera]:
-    """`n` cameras around the arena, 3 m up, looking at its middle."""
+    """`n` cameras around the arena at a height of 3 m, directed at its centre."""
     angles = 0.3 + 2 * np.pi * np.arange(n) / n
     poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), 3.0], [0.0, 0.0, 0.2]) for a in angles]
     lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
@@ -39,7 +39,7 @@ def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.000
 def line(
     start: tuple, velocity: tuple = (0, 0, 0), turn: tuple = (0, 0, 0), tilt: tuple = (0, 0, 0)
 ) -> Motion:
-    """Uniform motion and turning: R and p at t seconds."""
+    """Uniform linear and angular motion: R and p at t seconds."""
 
     def at(t: float) -> tuple[np.ndarray, np.ndarray]:
         R = rotation_from_vector(np.multiply(turn, t)) @ rotation_from_vector(tilt)
@@ -52,7 +52,7 @@ def line(
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
 
-    `phases` are the cameras' offsets as shares of a period; `hidden(robot, marker, t)` hides markers.
+    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers.
     """
 
     robots: dict[str, Robot]
@@ -80,7 +80,7 @@ class Arena:
         ]
 
     def messages(self, n: int) -> list[Detections]:
-        """The same as the cameras' messages."""
+        """The same as messages of the cameras."""
         return [
             Detections.pack(f.roundels, camera=f.camera, seq=k, t_ns=f.t_ns, width=800, height=600)
             for k, f in enumerate(self.frames(n))
@@ -96,24 +96,23 @@ class Arena:
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
 
     def _detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
-        optics = CameraArray({name: self.cameras[name]})
-        catalogue = MarkerTable.of(list(self.robots.values()))
+        cameras = CameraArray({name: self.cameras[name]})
+        marker_table = MarkerTable.of(list(self.robots.values()))
         seen = [
             k
-            for k, (r, m) in enumerate(zip(catalogue.robot, catalogue.number, strict=True))
+            for k, (r, m) in enumerate(zip(marker_table.robot, marker_table.number, strict=True))
             if not self.hidden(list(self.robots)[r], int(m), t)
         ]
         poses = [self.motions[robot](t) for robot in self.robots]
-        R = np.array([pose[0] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3, 3)
-        p = np.array([pose[1] for pose in poses])[catalogue.robot[seen]].reshape(-1, 3)
-        centre = p + np.einsum("nij,jn->ni", R, catalogue.marker[:, seen])
-        return self._roundels(optics, centre, R[:, :, 2], catalogue.radius[seen], rng)
+        R = np.array([pose[0] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3, 3)
+        p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
+        centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
+        return self._roundels(cameras, centre, R[:, :, 2], marker_table.radius[seen], rng)
 
-    def _roundels(self, optics: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
-        """Outlines from sampled circles, an ellipse fitted by moments of its undistorted conic: independent of
-        the model under test in its centre."""
-        camera = optics.cameras[0]
-        facing = np.einsum("ni,ni->n", normal, optics.centres[0] - centre) > 0.0
+    def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
+        """Outlines of discs. The centres come from sampled circles, independently of the model under test."""
+        camera = cameras[cameras.names[0]]
+        facing = np.einsum("ni,ni->n", normal, cameras.centres[0] - centre) > 0.0
         centre, normal, radius = centre[facing], normal[facing], radius[facing]
         uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
         uv = uv.reshape(-1, 2)
@@ -143,7 +142,7 @@ class Arena:
 
 
 def outline_centre(camera: Camera, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
-    """The centre of a disc's outline, from projected points of its rim: a conic through them, undistorted."""
+    """The centre of a disc's outline: that of a conic through projected points of the rim, undistorted."""
     u = np.linalg.svd(normal[None])[2][1:]
     phi = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     rim = centre + radius * (np.cos(phi)[:, None] * u[0] + np.sin(phi)[:, None] * u[1])

@@ -13,7 +13,7 @@ from fusion.errors import FusionError
 from fusion.model.robots import distances, load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import ROOT, free_port
-from tests.fusion.conftest import fuse
+from tests.fusion.conftest import track
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
@@ -23,7 +23,7 @@ UNKNOWN = np.full((3, 3), np.nan)
 def markers_of(arena: Arena, n: int = 30) -> list[Markers]:
     """The markers of a tracker that knows only the triangle, which is not there."""
     known = Arena({"a": TRIANGLE}, {"a": line((0, 0, 0))}, arena.cameras)
-    return [fused.markers for fused in fuse(known, arena.frames(n))]
+    return [fused.markers for fused in track(known, arena.frames(n))]
 
 
 def test_the_measured_robot_has_the_true_distances():
@@ -46,7 +46,7 @@ def test_a_measured_robot_is_tracked_at_its_true_pose():
     """The position is the markers' mean and z their normal, within 1 mm and 1 mm / 0.2 m."""
     arena = Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)
     measured = {"b": robot_from_markers(find_stationary_markers(markers_of(arena)), WIDE.diameter_m)}
-    pose = fuse(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
+    pose = track(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
     R, p = WIDE_MOTION(0.0)
     assert pose.state == "tracked"
     assert np.linalg.norm(pose.position - (p + R @ WIDE.points.mean(0))) < 1e-3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The table of a lens's inverse against the lens itself."""
+"""The table of an inverse lens model compared with the lens model."""
 
 import numpy as np
 import pytest
@@ -21,13 +21,13 @@ LENSES = {
 
 
 def pixels(lens: Lens, n: int = 4000) -> np.ndarray:
-    """All over the image and some way beyond its edges."""
+    """Random pixels in the image and up to 40 px outside."""
     return np.random.default_rng(4).uniform([-40, -40], [lens.width + 40, lens.height + 40], (n, 2))
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_the_table_is_the_lens(lens):
-    """Cells are accepted by 9 points each, so that between these some error may be twice as large."""
+def test_the_table_equals_the_lens_model(lens):
+    """Nine points decide about a cell; between them the error can be twice as large."""
     uv = pixels(lens)
     xy, scale = undistort(lens, uv)
     exact = lens.normalise(uv)
@@ -42,8 +42,8 @@ def test_the_table_is_the_lens(lens):
 
 
 @pytest.mark.parametrize("name", ["none", "usual", "wide", "rational"])
-def test_in_the_image_of_a_usual_lens_hardly_anything_is_left_to_iterate(name):
-    """At most a corner's cell that juts out to where the lens has no inverse."""
+def test_the_table_covers_the_image_of_a_usual_lens(name):
+    """Except for a cell at a corner where the lens has no inverse."""
     lens = LENSES[name]
     inside = pixels(lens)
     inside = inside[((inside > -0.5) & (inside < [lens.width - 0.5, lens.height - 0.5])).all(1)]
@@ -52,8 +52,8 @@ def test_in_the_image_of_a_usual_lens_hardly_anything_is_left_to_iterate(name):
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-1e5, 1e5)] * 2), max_size=5))
-def test_no_pixel_is_too_far_away(uv):
-    """Whatever a message may say of a centre has coordinates or none."""
+def test_any_pixel_is_accepted(uv):
+    """Any centre in a message gives coordinates or NaN."""
     lens = LENSES["usual"]
     xy, scale = undistort(lens, np.array(uv).reshape(-1, 2))
     assert xy.shape == (2, len(uv))

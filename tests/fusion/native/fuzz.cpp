@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Fusion's core on numbers made to break it, for a build with sanitizers: `fuzz ROUNDS [SEED]`. Every array
-// lies in memory of exactly its own size, so that a read beyond it is caught; indices and sizes are right, as
-// the bindings see to that. Exits with 1 where a result names what is not there.
+// Fuzzes the native core of fusion in a build with sanitizers: `fuzz ROUNDS [SEED]`. Every array has exactly
+// its own size in memory, so that the sanitizer finds reads beyond its end. Indices and sizes are valid,
+// because the bindings check them. Exits with 1 if a result refers to an element that does not exist.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -11,8 +11,8 @@
 
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
-#include "meetings.hpp"
-#include "motion.hpp"
+#include "motion_model.hpp"
+#include "ray_intersections.hpp"
 
 namespace {
 
@@ -25,12 +25,12 @@ class Random {
     explicit Random(unsigned seed) : engine_(seed) {}
     size_t below(size_t n) { return std::uniform_int_distribution<size_t>(0, n - 1)(engine_); }
     double normal() { return std::normal_distribution<double>()(engine_); }
-    /// As a sane caller has it, or, by the share `wild`, what no sane caller has.
+    /// A normal number or, with the probability `wild`, a hostile one.
     double number(double scale, double wild) {
-        constexpr double kNone = std::numeric_limits<double>::quiet_NaN(),
-                         kEndless = std::numeric_limits<double>::infinity();
-        constexpr double kHostile[] = {0,      -0.0,   kNone, kEndless, -kEndless, 1e308,
-                                       -1e308, 1e-320, 1e18,  -1e18,    1e-9,      -1e-9};
+        constexpr double kNaN = std::numeric_limits<double>::quiet_NaN(),
+                         kInfinity = std::numeric_limits<double>::infinity();
+        constexpr double kHostile[] = {0,      -0.0,   kNaN, kInfinity, -kInfinity, 1e308,
+                                       -1e308, 1e-320, 1e18, -1e18,     1e-9,       -1e-9};
         const bool is_wild = std::uniform_real_distribution<double>()(engine_) < wild;
         return is_wild ? kHostile[below(std::size(kHostile))] : scale * normal();
     }
@@ -48,8 +48,8 @@ class Random {
         return {number(scale, wild), number(scale, wild), number(scale, wild)};
     }
     Matrix matrix(double wild) { return {vector(1, wild), vector(1, wild), vector(1, wild)}; }
-    Square square(double wild) {
-        Square made{};
+    ErrorMatrix square(double wild) {
+        ErrorMatrix made{};
         for (int i = 0; i < kErrors; ++i)
             for (int j = 0; j < kErrors; ++j) made[i][j] = number(0.05, wild) + (i == j);
         return made;
@@ -59,62 +59,62 @@ class Random {
     std::mt19937 engine_;
 };
 
-Poses poses_of(Random& random, size_t bodies, size_t frames, double wild) {
+FramePoses poses_of(Random& random, size_t bodies, size_t frames, double wild) {
     std::vector<Body> all;
     for (size_t b = 0; b < bodies; ++b)
-        all.push_back({turn(random.vector(1, wild)), random.vector(1, wild), random.vector(3, wild),
-                       random.vector(2, wild)});
+        all.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(1, wild),
+                       random.vector(3, wild), random.vector(2, wild)});
     std::vector<Exposure> exposures;
     for (size_t f = 0; f < frames; ++f)
-        exposures.push_back(
-            {turn(random.vector(1, wild)), random.vector(3, wild), random.number(0.01, wild)});
-    return {std::move(all), std::move(exposures)};
+        exposures.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(3, wild),
+                             random.number(0.01, wild)});
+    return {all, exposures};
 }
 
-/// Views, equations, sums and remainders of discs, then the bodies a step later.
+/// Views, equations, sums and residuals of discs; then the prediction of the bodies.
 bool estimate(Random& random, double wild) {
     const size_t bodies = 1 + random.below(6), frames = 1 + random.below(4), n = random.below(40);
-    const Poses poses = poses_of(random, bodies, frames, wild);
+    const FramePoses poses = poses_of(random, bodies, frames, wild);
     const Indices frame = random.indices(n, frames), body = random.indices(n, bodies);
     const Numbers marker = random.numbers(3 * n, 0.2, wild), radius = random.numbers(n, 0.05, wild);
     const Discs discs{frame.data(), body.data(), {marker.data(), n}, radius.data()};
     Numbers views(11 * n);
-    view_all(poses, discs, views.data());
+    view_discs(poses, discs, views.data());
     const Numbers xy = random.numbers(2 * n, 1, wild), four = random.numbers(4 * n, 800, wild),
                   axes = random.numbers(2 * n, 20, wild), one = random.numbers(n, 1, wild);
     const std::unique_ptr<bool[]> single(new bool[bodies]());
-    std::vector<Rows> rows(n), outlines(n);
-    linearise(poses, Centres{discs, {xy.data(), n}, {four.data(), n}, single.get()}, rows.data());
-    linearise(poses, Outlines{discs, {axes.data(), n}, one.data(), {four.data(), n}, one.data()},
+    std::vector<Equations> rows(n), outlines(n);
+    linearize(poses, CentreObservations{discs, {xy.data(), n}, {four.data(), n}, single.get()}, rows.data());
+    linearize(poses, OutlineObservations{discs, {axes.data(), n}, one.data(), {four.data(), n}, one.data()},
               outlines.data());
-    std::vector<Square> H(bodies);
-    std::vector<Step> g(bodies);
+    std::vector<ErrorMatrix> H(bodies);
+    std::vector<ErrorVector> g(bodies);
     for (size_t b = 0; b < bodies; ++b) H[b] = random.square(wild), g[b][0] = random.number(1, wild);
     Numbers weights(n, 1);
-    const System system{rows.data(), body.data(), n, bodies};
+    const EquationSystem system{rows.data(), body.data(), n, bodies};
     reweigh(system, H.data(), g.data(), weights.data());
     const Numbers steps = random.numbers(bodies * kErrors, 0.1, wild);
     Numbers left(2 * n);
-    remain(system, steps.data(), left.data());
+    residuals(system, steps.data(), left.data());
     for (size_t b = 0; b < bodies; ++b) {
-        Body moving{turn(random.vector(1, wild)), random.vector(1, wild), random.vector(1, wild),
-                    random.vector(1, wild)};
+        Body moving{rotation_from_vector(random.vector(1, wild)), random.vector(1, wild),
+                    random.vector(1, wild), random.vector(1, wild)};
         predict(moving, H[b], {random.number(0.01, wild), random.number(1, wild), 1, b % 2 == 0});
         try {
             inverse(H[b]);
-        } catch (const std::runtime_error&) {  // which a Python program hears of as RuntimeError
+        } catch (const std::runtime_error&) {  // RuntimeError in Python
         }
     }
     return true;
 }
 
-/// Gates: pairs of what there is, none twice.
+/// Candidates are pairs of existing elements, none of them twice.
 bool associate(Random& random, double wild) {
     const size_t bodies = 1 + random.below(5), frames = 1 + random.below(4), n = random.below(80);
-    const Poses poses = poses_of(random, bodies, frames, wild);
+    const FramePoses poses = poses_of(random, bodies, frames, wild);
     std::vector<ExpectedMarker> markers;
     for (size_t k = random.below(20); k > 0; --k) {
-        const Square P = random.square(wild);
+        const ErrorMatrix P = random.square(wild);
         markers.push_back(ExpectedMarker::of(int64_t(random.below(bodies)), random.vector(0.2, wild),
                                              random.number(0.05, wild), random.matrix(wild), P[0].data()));
     }
@@ -134,8 +134,8 @@ bool associate(Random& random, double wild) {
     return true;
 }
 
-/// Ranges that rays agree on: each of those that its ray can have, or none.
-bool meet(Random& random, double wild) {
+/// The densest range of a ray is a possible one, or NaN.
+bool intersect(Random& random, double wild) {
     const size_t frames = 1 + random.below(5), n = random.below(60), sizes = 1 + random.below(3);
     std::vector<Viewpoint> viewpoints;
     for (size_t f = 0; f < frames; ++f)
@@ -150,7 +150,7 @@ bool meet(Random& random, double wild) {
     const Rays rays{frame.data(), directions.data(), reach.data(), limits.data(), n, sizes};
     const std::vector<double> ranges = densest_ranges(rays, viewpoints);
     for (size_t k = 0; k < n; ++k)
-        if (std::isfinite(ranges[k]) && !(ranges[k] > 0 && ranges[k] <= rays.farthest(k) * (1 + 1e-9)))
+        if (std::isfinite(ranges[k]) && !(ranges[k] > 0 && ranges[k] <= rays.max_range(k) * (1 + 1e-9)))
             return false;
     return ranges.size() == n;
 }
@@ -171,9 +171,9 @@ int main(int argc, char** argv) {
     Random random(argc > 2 ? unsigned(std::atoi(argv[2])) : 1);
     for (int round = 0; round < rounds; ++round) {
         const double wild = round % 4 == 0 ? 0 : 0.3 / (round % 4 * round % 4 + 1);
-        if (!estimate(random, wild) || !associate(random, wild) || !meet(random, wild) ||
+        if (!estimate(random, wild) || !associate(random, wild) || !intersect(random, wild) ||
             !undistort(random, wild)) {
-            std::fprintf(stderr, "round %d: a result that can't be\n", round);
+            std::fprintf(stderr, "round %d: impossible result\n", round);
             return 1;
         }
     }

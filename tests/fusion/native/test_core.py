@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The native core against the same equations in NumPy (`tests/fusion/equations.py`).
+"""The native core compared with the same equations in NumPy (`tests/fusion/equations.py`).
 
-Both round differently, no more: in the order of 1e-15 of the largest term; 1e-9 leaves room for cancellation.
+Only the rounding differs, by about 1e-15 of the largest term; 1e-9 allows for cancellation.
 """
 
 from dataclasses import replace
@@ -23,13 +23,13 @@ from tests.fusion import equations
 from tests.fusion.synthetic import ring
 
 CAMERAS = ring()
-OPTICS = CameraArray(CAMERAS)
+ARRAY = CameraArray(CAMERAS)
 BODIES, EACH = 7, 60
 assert_near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
 
 
 def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
-    """Turning bodies about the middle, and detections that have nothing to do with them; one can't be seen at all."""
+    """Rotating bodies near the centre, and unrelated detections; one body is not visible."""
     random = np.random.default_rng(seed)
     n = len(CAMERAS) * EACH
     states = States(
@@ -39,22 +39,22 @@ def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
         random.normal(size=(BODIES, 3)),
         np.tile(np.eye(12), (BODIES, 1, 1)),
     )
-    states.p[0] = 2 * OPTICS.centres[0]  # behind a camera
+    states.p[0] = 2 * ARRAY.centres[0]  # behind a camera
     frames = [frame(name, random) for name in CAMERAS]
     discs = Discs(
         frame=np.repeat(np.arange(len(frames)), EACH),
         body=random.integers(0, BODIES, n),
-        row=np.arange(n),
-        marker=random.uniform(-0.2, 0.2, (3, n)),
+        marker=np.arange(n),
+        position=random.uniform(-0.2, 0.2, (3, n)),
         radius=random.uniform(0.02, 0.1, n),
     )
-    return states, MatchedObservations.seeing(
-        DetectionTable.of(FrameSet(0, tuple(frames)), OPTICS, 0.1), discs
+    return states, MatchedObservations.of_discs(
+        DetectionTable.of(FrameSet(0, tuple(frames)), ARRAY, 0.1), discs
     )
 
 
 def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
-    """A camera's, up to 20 ms beside the instant."""
+    """A frame up to 20 ms from the time of the frame set."""
     root = random.normal(size=(EACH, 2, 2))
     axes = np.sort(random.uniform(10, 30, (EACH, 2)))[:, ::-1]
     none, level = np.full(EACH, -1, np.int32), np.ones(EACH)
@@ -65,48 +65,48 @@ def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
     )
 
 
-def test_views_are_the_observation_models():
+def test_views_equal_the_observation_model():
     states, seen = scene()
-    exposures = seen.seen.exposures
-    found = OPTICS.view(OPTICS.pose(states, exposures), seen.discs)
-    expected = equations.view(equations.pose(OPTICS, states, exposures), seen.discs)
+    exposures = seen.detections.exposures
+    found = ARRAY.views(states, exposures, seen.discs)
+    expected = equations.view(equations.pose(ARRAY, states, exposures), seen.discs)
     assert np.isnan(expected.xy).any()
     for name in ("centre", "normal", "q", "xy", "facing"):
         assert_near(getattr(found, name), getattr(expected, name))
 
 
-def test_equations_of_centres_are_the_derivatives():
+def test_equations_of_centres_equal_the_derivatives():
     states, seen = scene()
-    exposures, discs = seen.seen.exposures, seen.discs
+    exposures, discs = seen.detections.exposures, seen.discs
     single = np.arange(BODIES) == 1
-    of_centre = seen.seen.xy, seen.whiten, single
-    found = OPTICS.pose(states, exposures).linearise(*discs.columns, *of_centre)
-    poses = equations.pose(OPTICS, states, exposures)
+    of_centre = seen.detections.xy, seen.whiten, single
+    found = ARRAY.frame_poses(states, exposures).linearize_centres(discs.columns, *of_centre)
+    poses = equations.pose(ARRAY, states, exposures)
     views = equations.view(poses, discs)
-    A = equations.derive(OPTICS, poses, exposures, discs, views, seen.whiten)
+    A = equations.derive(ARRAY, poses, exposures, discs, views, seen.whiten)
     A[:, 6:9, single[discs.body]] = 0
-    b = np.einsum("ain,in->an", seen.whiten, seen.seen.xy - views.xy)
+    b = np.einsum("ain,in->an", seen.whiten, seen.detections.xy - views.xy)
     rows = np.concatenate([A, b[:, None]], 1).transpose(2, 0, 1)
     rows[np.isnan(b[0])] = 0
     assert_near(found, rows, atol=1e-9 * np.abs(rows).max())
 
 
-def test_equations_of_outlines_are_the_shears_quotients():
-    """An outline's shape is what two numbers leave that are (range / radius)^2, up to 4e4, times larger; by the step of
-    1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives in the order of 30."""
+def test_equations_of_outlines_equal_difference_quotients():
+    """The shape of an outline is a difference of numbers that are larger by (range / radius)^2, up to 4e4. Divided by
+    the step of 1e-4 and sigma, rounding of 2e-16 becomes 1e-6, of derivatives of about 30."""
     states, seen = scene()
-    exposures, discs = seen.seen.exposures, seen.discs
+    exposures, discs = seen.detections.exposures, seen.discs
     sigma = np.linspace(0.1, 0.2, len(discs))
-    of_outline = seen.seen.axes_px, seen.seen.angle_rad, seen.seen.scale, sigma
-    found = OPTICS.pose(states, exposures).linearise_outlines(*discs.columns, *of_outline)
-    poses = equations.pose(OPTICS, states, exposures)
+    of_outline = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, sigma
+    found = ARRAY.frame_poses(states, exposures).linearize_outlines(discs.columns, *of_outline)
+    poses = equations.pose(ARRAY, states, exposures)
     views = equations.view(poses, discs)
     rows = equations.shape_rows(poses, discs, views, seen, sigma)
     rows[np.isnan(views.xy[0])] = 0
     assert_near(found, rows, atol=1e-6)
 
 
-def test_sums_and_weights_are_those_of_reweighted_least_squares():
+def test_sums_and_weights_equal_reweighted_least_squares():
     random = np.random.default_rng(8)
     rows, body = random.normal(size=(200, 2, 13)), random.integers(0, 5, 200)
     rows[:9, :, 12] += 20  # outliers
@@ -116,24 +116,24 @@ def test_sums_and_weights_are_those_of_reweighted_least_squares():
         assert_near(got, expected)
     steps = random.normal(size=(5, 12))
     rest = rows[:, :, 12] - np.einsum("nai,ni->na", rows[:, :, :12], steps[body])
-    assert_near(_core.remainder(rows, body, steps), rest.T)
+    assert_near(_core.residuals(rows, body, steps), rest.T)
 
 
-def test_prediction_is_the_motion_models():
+def test_prediction_equals_the_motion_model():
     random = np.random.default_rng(6)
     states, _ = scene()
     root = random.normal(size=(BODIES, 12, 20))
     states = replace(states, P=root @ root.transpose(0, 2, 1))
     of_each = random.uniform(1e-3, 0.2, BODIES), random.uniform(0.1, 9, (BODIES, 2)), np.arange(BODIES) == 2
     (found, motion), (expected, of_errors) = predict(states, *of_each), equations.predict(states, *of_each)
-    assert_near(motion.turn, of_errors.turn)
+    assert_near(motion.T, of_errors.T)
     for name in States.__slots__:
         assert_near(getattr(found, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_least_cost(seed: int):
-    """Against SciPy's assignment of whole frames, from a few pairs to every marker near every detection."""
+def test_assignment_chooses_the_most_pairs_at_the_lowest_cost(seed: int):
+    """Compared with SciPy on whole frames, from a few pairs to every marker near every detection."""
     random = np.random.default_rng(seed)
     frame = np.repeat(np.arange(3), random.integers(1, 30, 3))
     marker, detection = np.nonzero(random.random((25, len(frame))) < random.uniform(0.02, 1))
@@ -155,7 +155,7 @@ def test_of_pairs_that_contest_each_other_as_many_as_can_be_are_chosen_at_the_le
     assert costs[chosen].sum() == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_covariance_is_the_inverse_of_its_information():
+def test_inverses_are_inverse_matrices():
     root = np.random.default_rng(9).normal(size=(3, 12, 20))
     information = root @ root.transpose(0, 2, 1)
     assert_near(_core.inverses(information), np.linalg.inv(information))
@@ -165,19 +165,18 @@ def test_a_covariance_is_the_inverse_of_its_information():
 
 
 def test_candidates_are_the_pairs_within_the_gates():
-    """Of discs a few pixels beside detections: some pairs are near enough, of some the size does not fit."""
+    """Discs a few pixels from detections: some pairs are too far apart, and some sizes do not fit."""
     states, seen = scene()
-    exposures, discs = seen.seen.exposures, seen.discs
+    exposures, discs = seen.detections.exposures, seen.discs
     random = np.random.default_rng(3)
     states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)
     rows = random.choice(len(discs), 100, replace=False)
     expected = _core.ExpectedMarkers(
-        states.R, states.P, discs.body[rows], discs.marker[:, rows].copy(), discs.radius[rows]
+        states.R, states.P, discs.body[rows], discs.position[:, rows].copy(), discs.radius[rows]
     )
-    poses = OPTICS.pose(states, exposures)
-    of_frame = seen.seen.axes_px[0], OPTICS.focal[exposures.camera]
+    poses = ARRAY.frame_poses(states, exposures)
     (marker, sighting), cost = expected.candidates(
-        poses, seen.seen.frame, seen.seen.xy, seen.seen.scale, seen.seen.cov, *of_frame
+        poses, seen.detections.columns, ARRAY.focal[exposures.camera]
     )
     found = {}
     for f, tau in enumerate(exposures.tau):
@@ -186,12 +185,12 @@ def test_candidates_are_the_pairs_within_the_gates():
         found |= {
             (f, *pair): value
             for pair, value in equations.candidates(
-                OPTICS, states, seen.seen, there, expected.covariances(tau)
+                ARRAY, states, seen.detections, there, expected.covariances(tau)
             ).items()
         }
     got = dict(
         zip(
-            zip(seen.seen.frame[sighting].tolist(), marker.tolist(), sighting.tolist(), strict=True),
+            zip(seen.detections.frame[sighting].tolist(), marker.tolist(), sighting.tolist(), strict=True),
             cost,
             strict=True,
         )
@@ -202,31 +201,33 @@ def test_candidates_are_the_pairs_within_the_gates():
 
 
 def test_indices_and_lengths_are_checked():
-    """An array that does not fit is refused rather than read beyond its end."""
+    """The core refuses an array that does not fit and never reads beyond its end."""
     states, seen = scene()
-    poses = OPTICS.pose(states, seen.seen.exposures)
-    frame, body, marker, radius = seen.discs.columns
+    poses = ARRAY.frame_poses(states, seen.detections.exposures)
+    frame, body = seen.discs.frame, seen.discs.body
+    position, radius = seen.discs.position, seen.discs.radius
     for wrong in (body + BODIES, body - BODIES):
         with pytest.raises(IndexError):
-            poses.view(frame, wrong, marker, radius)
+            poses.views(_core.DiscColumns(frame, wrong, position, radius))
     with pytest.raises(ValueError, match="lengths"):
-        poses.view(frame, body, marker[:, 1:].copy(), radius)
+        _core.DiscColumns(frame, body, position[:, 1:].copy(), radius)
     with pytest.raises(IndexError):
-        _core.remainder(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
+        _core.residuals(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
 
 
-def test_a_disc_that_is_seen_from_its_edge_gives_numbers_or_nothing():
-    """Its outline is a line: within a step of the derivative (1e-4 rad) of it there is none to compare with."""
+def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
+    """Its outline is a line. Within one step of the derivative (1e-4 rad) of it there is no outline to compare with."""
     tilt = np.radians(90) + np.linspace(-3e-4, 3e-4, 61)
     n, none = len(tilt), np.zeros(len(tilt), np.intp)
     up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])  # towards the camera
     R = rotation_from_vector(np.outer(tilt, [1.0, 0.0, 0.0])) @ up
     still = np.zeros((n, 3))
     ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
-    poses = _core.Poses(R, ahead, still, still, camera, np.zeros((1, 3)), np.zeros(1))
-    discs = none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04)
+    exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1))
+    poses = _core.FramePoses(_core.BodyStates(R, ahead, still, still), exposures)
+    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04))
     scale = np.tile(800 * np.eye(2)[..., None], n)
     axes = np.tile([[30.0], [10.0]], n)
-    rows = poses.linearise_outlines(*discs, axes, np.zeros(n), scale, np.full(n, 0.1))
+    rows = poses.linearize_outlines(discs, axes, np.zeros(n), scale, np.full(n, 0.1))
     assert np.isfinite(rows).all()
     assert not rows[n // 2].any()

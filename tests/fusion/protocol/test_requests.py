@@ -44,7 +44,7 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
         request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
         assert list(robots_of(request_reply(client, key, encode(request))[0]).robots) == ["rover", "wide"]
         assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.status == ["tracked", None]
+        assert server.pipeline.tracker.table.status == ["tracked", None]
         reply, _ = request_reply(client, key, json.dumps({"remove": ["wide"]}).encode())
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == ["rover"]
@@ -79,7 +79,7 @@ def test_undo_fails_without_a_correction_and_restores_a_corrected_camera(tmp_pat
         assert done.stdout == "cam1 has its previous pose again and is no longer monitored\n"
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)
         assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.watch.held == {"cam1"}
+        assert server.pipeline.tracker.extrinsics.pinned == {"cam1"}
 
 
 def test_a_published_rig_is_used_after_a_restart(tmp_path):

@@ -11,12 +11,14 @@ import pytest
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
-from fusion.tracking.tracker import Limits, Tracker
+from fusion.tracking.result import TrackingResult
+from fusion.tracking.tracker import Tracker
 from tests.fusion.conftest import errors
 from tests.fusion.serving import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
@@ -60,12 +62,12 @@ def test_crossing_robots_of_different_shards_keep_their_detections():
     trackers = [Tracker(arena.cameras, robots, shard=Shard(k, 2)) for k in (1, 2)]
     n_shared = 0
     for k, frame_set in enumerate(synchronize(arena.frames(30))):
-        fused = [tracker.fuse(frame_set) for tracker in trackers]
-        used = [used_detections(tracker) for tracker in trackers]
+        fused = [tracker.track(frame_set) for tracker in trackers]
+        used = [used_detections(tracker, result) for tracker, result in zip(trackers, fused, strict=True)]
         assert not used[0] & used[1]
         n_shared += bool(used[0]) and bool(used[1])
         for tracker, other_tracker in zip(trackers, trackers[::-1], strict=True):
-            other_tracker.follow(decode(encode(tracker.tell()), ShardPoses))
+            other_tracker.table.receive(decode(encode(tracker.table.shard_poses()), ShardPoses))
         poses = [pose for one in fused for pose in one.poses]
         assert len({pose.robot for pose in poses}) == len(poses)
         if k > 3:
@@ -82,11 +84,10 @@ def synchronize(frames: list[CalibratedFrame]) -> list[FrameSet]:
     return synchronizer.finish()
 
 
-def used_detections(tracker: Tracker) -> set[int]:
-    """The detections that a shard used for its own robots in the last frame set."""
-    assert tracker._last is not None
-    _, _, matches, _ = tracker._last
-    return set(matches.sighting[tracker.owned[tracker.catalogue.robot[matches.disc]]].tolist())
+def used_detections(tracker: Tracker, result: TrackingResult) -> set[int]:
+    """The detections that a shard used for its own robots."""
+    own = tracker.table.owned[tracker.table.markers.robot[result.assignments.marker]]
+    return set(result.assignments.detection[own].tolist())
 
 
 @pytest.mark.parametrize(
@@ -140,8 +141,8 @@ def test_two_shards_on_loopback_each_track_their_own_robots(tmp_path):
             until(are_all_right)
             assert server.pipeline.tracker is not None
             assert second.pipeline.tracker is not None
-            assert server.pipeline.tracker.owned.tolist() == [True, False, False]
-            assert second.pipeline.tracker.owned.tolist() == [False, True, True]
+            assert server.pipeline.tracker.table.owned.tolist() == [True, False, False]
+            assert second.pipeline.tracker.table.owned.tolist() == [False, True, True]
         finally:
             second.stop()
             thread.join(DEADLINE_S)

@@ -16,11 +16,11 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from fusion.commands.record import record
 from fusion.commands.replay import replay
+from fusion.model.limits import Limits
 from fusion.protocol.messages import Robots
 from fusion.recordings.record import read_recording
 from fusion.recordings.run import OfflineArena, fuse_recording
-from fusion.tracking.result import Fused
-from fusion.tracking.tracker import Limits
+from fusion.tracking.result import TrackingResult
 from tests.fusion.conftest import errors, poses_of
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
@@ -101,7 +101,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
 
 
-def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[Fused]:
+def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[TrackingResult]:
     arrivals = [(message.t_ns, message) for message in arena.messages(n)]
     arrivals.sort(key=lambda arrival: arrival[0])
     limits = Limits(sigma_floor_px=1e-3)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import SILENT_NS, FrameSynchronizer
-from fusion.tracking.tracker import Limits
 
 PERIOD = 33_333_333
 MS = 1_000_000

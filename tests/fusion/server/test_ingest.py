@@ -16,7 +16,7 @@ from fusion.protocol.messages import FusionStatus
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import MAX_UNCALIBRATED, Ingest
 from fusion.server.status import PipelineStatus, ServerStatistics
-from fusion.tracking.result import Fused
+from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
 
@@ -37,16 +37,18 @@ class Pipeline:
         self.ingest, self.synchronizer = Ingest(KEYS, self.statistics), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 
-    def take(self, message: Detections, received_ns: int) -> list[Fused]:
+    def take(self, message: Detections, received_ns: int) -> list[TrackingResult]:
         """The frame sets that were complete then."""
         frame = self.ingest.receive(
             encode(message), KEYS.detections(message.camera), received_ns, self.arena.cameras
         )
         if frame is not None:
             self.synchronizer.add(frame)
-        fused = [self.tracker.fuse(frame_set) for frame_set in self.synchronizer.take(received_ns)]
-        self.tracker.inspect()
-        return fused
+        results = []
+        for frame_set in self.synchronizer.take(received_ns):
+            results.append(self.tracker.track(frame_set))
+            self.tracker.check_extrinsics(frame_set, results[-1])
+        return results
 
     @property
     def faults(self) -> dict[str, int]:
@@ -56,13 +58,13 @@ class Pipeline:
         return self.statistics.report(time.time_ns(), PipelineStatus())
 
 
-def play(pipeline: Pipeline, messages: list[Detections]) -> list[Fused]:
-    """The fused frame sets of all messages, each of which arrives 5 ms after its exposure."""
+def play(pipeline: Pipeline, messages: list[Detections]) -> list[TrackingResult]:
+    """The results of all messages, each of which arrives 5 ms after its exposure."""
     ordered = sorted(messages, key=lambda message: message.t_ns)
     return [fused for m in ordered for fused in pipeline.take(m, m.t_ns + 5_000_000)]
 
 
-def states(fused: list[Fused], robot: str = "a") -> list[str]:
+def states(fused: list[TrackingResult], robot: str = "a") -> list[str]:
     return [pose.state for f in fused for pose in f.poses if pose.robot == robot]
 
 

@@ -16,9 +16,9 @@ from calib.rig.rig import Rig
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
+from fusion.model.limits import Limits
 from fusion.protocol.messages import FusionStatus, RobotPose
 from fusion.server.server import Server
-from fusion.tracking.tracker import Limits
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, connected, live, send, serving, until
 
@@ -86,7 +86,7 @@ def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_
         until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
         tracker = server.pipeline.tracker
         assert tracker is not None
-        server.transport.enqueue(lambda: tracker.states.P.fill(np.nan))
+        server.transport.enqueue(lambda: tracker.table.states.P.fill(np.nan))
         status = client.status(DEADLINE_S)
         send(server, live(ARENA.messages(12), ago_ns=5 * 10**8))
         until(lambda: status.next().faults == {"frame set without a solution": 1})

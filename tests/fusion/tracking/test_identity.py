@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Who is who: identical robots, occlusions, crowds; and what is said when nothing tells."""
+"""Identities: identical robots, occlusions, crowds, and ambiguous detections."""
 
 import time
 
@@ -10,16 +10,16 @@ from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
 from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, require_distinct
-from fusion.tracking.constellation import Fit, identify
-from fusion.tracking.multiview import Marker, group
-from fusion.tracking.tracker import Limits
+from fusion.tracking.constellation import Criteria, Fit, identify
+from fusion.tracking.multiview import Marker, find_markers
 from tests.benchmarks.fusion_accuracy import accuracy
 from tests.benchmarks.fusion_grouping import cold_grouping
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
 from tests.benchmarks.fusion_swaps import identity
-from tests.fusion.conftest import errors, fuse
+from tests.fusion.conftest import errors, track
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line, ring
 
 
@@ -28,34 +28,32 @@ def twin(start: tuple[float, float, float]) -> Robot:
 
 
 def test_identical_robots_pass_each_other_within_0_3_m(run_arena):
-    """One over the other, at 1 m/s each: only where they were tells them apart."""
+    """One above the other, at 1 m/s each: only their history distinguishes them."""
     arena = Arena(
         {"a": twin((-0.6, 0.0, 0.15)), "b": twin((0.6, 0.0, 0.45))},
         {"a": line((-0.6, 0.0, 0.15), (1.0, 0, 0)), "b": line((0.6, 0.0, 0.45), (-1.0, 0, 0))},
         sigma_px=0.05,
     )
-    fused, poses = run_arena(arena, 36)
+    results, poses = run_arena(arena, 36)
     for robot in "ab":
-        assert len(poses(robot)) >= len(fused) - 2
+        assert len(poses(robot)) >= len(results) - 2
         assert np.abs(errors(arena, poses(robot)[3:])[:, 3:]).max() < 5e-3
 
 
-def test_identical_robots_need_a_beginning():
+def test_identical_robots_need_a_start():
     bare = Robot(diameter_m=TRIANGLE.diameter_m, markers=TRIANGLE.markers)
-    with pytest.raises(FusionError, match=r"identical: give both a start_m, 0\.6 m or more apart"):
+    with pytest.raises(FusionError, match=r"identical.*start_m.*0\.6 m"):
         require_distinct({"a": bare, "b": bare})
     with pytest.raises(FusionError, match="identical"):
         require_distinct({"a": twin((0.0, 0, 0)), "b": twin((0.1, 0, 0))})
     require_distinct({"a": twin((0.0, 0, 0)), "b": twin((1.0, 0, 0))})
 
 
-def test_robots_of_one_marker_need_a_beginning_or_sizes_of_their_own():
+def test_single_marker_robots_need_a_start_or_different_diameters():
     def single(diameter_m: float, *start: float) -> Robot:
-        return Robot(diameter_m=diameter_m, start_m=start or None)  # pyright: ignore[reportArgumentType] three of them
+        return Robot(diameter_m=diameter_m, start_m=start or None)  # pyright: ignore[reportArgumentType] three numbers
 
-    with pytest.raises(
-        FusionError, match=r"'a' and 'b' are identical: give both a start_m.*or print one of them"
-    ):
+    with pytest.raises(FusionError, match=r"'a' and 'b' are identical.*start_m"):
         require_distinct({"a": single(0.1), "b": single(0.12)})
     with pytest.raises(FusionError, match="identical"):
         require_distinct({"a": single(0.1, 0.0, 0.0, 0.0), "b": single(0.1)})
@@ -63,9 +61,9 @@ def test_robots_of_one_marker_need_a_beginning_or_sizes_of_their_own():
     require_distinct({"a": single(0.1), "b": single(0.13), "c": TRIANGLE})
 
 
-def test_identical_robots_after_an_occlusion_are_told_apart_by_where_they_were(run_arena):
-    """Both hidden for 0.5 s, 1.6 m apart: back under their names within 0.2 s. Ground robots move 0.2 m (a sigma)
-    from where they were expected in that time."""
+def test_history_distinguishes_identical_robots_after_an_occlusion(run_arena):
+    """Both are hidden for 0.5 s, 1.6 m apart, and acquired under their names within 0.2 s. In that time ground robots
+    deviate from the prediction by 0.2 m (one sigma)."""
     arena = Arena(
         {"a": twin((-0.8, 0.0, 0.2)), "b": twin((0.8, 0.0, 0.2))},
         {"a": line((-0.8, 0.0, 0.2), (0.2, 0.1, 0)), "b": line((0.8, 0.0, 0.2), (-0.2, 0.1, 0))},
@@ -79,16 +77,16 @@ def test_identical_robots_after_an_occlusion_are_told_apart_by_where_they_were(r
         assert np.abs(errors(arena, back)[:, 3:]).max() < 5e-3
 
 
-def test_shapes_a_centimetre_apart_are_told_apart_on_the_move():
-    """Of these robots two differ by 12 mm at the most. Free-running cameras at 30 Hz see moving markers up to 15 ms
-    apart, 15 mm at 1 m/s: distances alone leave both open for ever, their detections do not."""
+def test_moving_constellations_that_differ_by_a_centimetre_are_distinguished():
+    """Two of these robots differ by 12 mm at most. Free-running cameras at 30 Hz see moving markers up to 15 ms apart,
+    15 mm at 1 m/s: distances alone never decide, the detections do."""
     got = identity(Load(20, 3, 4, 30.0), 1.5)
     assert (got.wrong, got.swaps) == (0, 0)
     assert got.tracked > 0.95
 
 
-def test_a_crowd_that_crosses_is_not_swapped():
-    """Ten robots of three identical roundels through each other, every fourth detection missing."""
+def test_a_crossing_crowd_is_not_swapped():
+    """Ten robots with three identical roundels cross each other; every fourth detection is missing."""
     got = identity(Load(10, 3, 6, 30.0, crossing=True, missing=0.25, false=2.0), 4.0)
     assert (got.wrong, got.swaps) == (0, 0)
     assert got.tracked > 0.95
@@ -101,8 +99,8 @@ def test_ten_minutes_of_a_crowd_have_no_swap():
 
 
 @pytest.mark.parametrize("sized", [True, False])
-def test_identical_points_are_grouped_without_history(sized):
-    """The goals: precision 99.9 %, recall 99 %; here all, over three arenas."""
+def test_identical_markers_are_grouped_without_history(sized):
+    """Precision and recall are 100 % in three arenas; the goals are 99.9 % and 99 %."""
     for seed in range(3):
         precision, recall, _ = cold_grouping(seed, sized=sized)
         assert (precision, recall) == (1.0, 1.0)
@@ -116,43 +114,45 @@ def test_no_detection_is_in_two_markers():
         CalibratedFrame.measure(name, 0, seen, cameras[name])
         for name, seen in zip(cameras, noise, strict=True)
     ]
-    optics = CameraArray(cameras)
-    sightings = DetectionTable.of(FrameSet(0, tuple(frames)), optics, 0.0)
-    markers = group(optics, sightings, np.arange(len(sightings)), np.array([0.12]))
-    taken = np.concatenate([marker.sightings for marker in markers])
+    camera_array = CameraArray(cameras)
+    detections = DetectionTable.of(FrameSet(0, tuple(frames)), camera_array, 0.0)
+    markers = find_markers(camera_array, detections, np.arange(len(detections)), np.array([0.12]))
+    taken = np.concatenate([marker.detections for marker in markers])
     assert len(np.unique(taken)) == len(taken)
     for marker in markers:
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
 
 
-def test_where_distances_are_vague_nothing_is_claimed_and_soon():
-    """Markers whose places are known to 0.2 m, as from late frames: hundreds of thousands of ways to see a robot."""
+def test_uncertain_distances_identify_nothing_in_bounded_time():
+    """Markers with position sigmas of 0.2 m, as from late frames: hundreds of thousands of mappings to a robot."""
     begun = time.process_time()
-    assert not found_among(0.2, DIAMETER_M)
-    assert time.process_time() - begun < 10  # 0.1 s alone; minutes before there was a bound
+    assert not fits_among(0.2, DIAMETER_M)
+    assert time.process_time() - begun < 10  # 0.1 s; minutes without the bound
 
 
-def test_markers_of_another_size_are_no_robot():
-    assert not found_among(0.002, 2 * DIAMETER_M)
+def test_markers_of_another_size_identify_no_robot():
+    assert not fits_among(0.002, 2 * DIAMETER_M)
 
 
-def found_among(sigma_m: float, diameter_m: float) -> list[Fit]:
-    """What is taken for one of twelve robots among 80 markers anywhere, of places known to `sigma_m`."""
+def fits_among(sigma_m: float, diameter_m: float) -> list[Fit]:
+    """The fits of twelve robots to 80 markers at random positions with standard deviation `sigma_m`."""
     rng, none = np.random.default_rng(4), np.empty(0, np.intp)
     places = rng.uniform([-2, -1, 0], [2, 1, 0.5], (80, 3))
     markers = [Marker(p, sigma_m**2 * np.eye(3), none, none, diameter_m) for p in places]
     robots = dict(enumerate(Load(12, 4).bodies.values()))
-    return identify(robots, markers, lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
+    return identify(
+        robots, markers, Criteria(lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
+    )
 
 
 @pytest.mark.parametrize("robot", ["a", "c"])
-def test_one_camera_keeps_tracked_only_what_it_can_tell(robot):
-    """Three roundels of known places fix a robot before one camera; a single one's range is not known well."""
+def test_one_camera_tracks_a_constellation_but_not_a_single_marker(robot):
+    """Three roundels determine the pose of a robot in one view; the range of a single roundel is uncertain."""
     arena = Arena(
         {"a": TRIANGLE, "c": SINGLE}, {"a": line((0.5, 0, 0.2)), "c": line((-0.5, 0, 0.2))}, sigma_px=0.05
     )
     frames = [f for f in arena.frames(60) if arena.seconds(f.t_ns) < 0.5 or f.camera == "cam0"]
-    late = [p for fused in fuse(arena, frames)[25:] for p in fused.poses if p.robot == robot]
+    late = [p for result in track(arena, frames)[25:] for p in result.poses if p.robot == robot]
     sigma = np.array([np.sqrt(np.linalg.eigvalsh(p.covariance_matrix[3:6, 3:6])[-1]) for p in late])
     tracked = np.array([p.state == "tracked" for p in late])
     assert (sigma[tracked] < Limits().tracked_sigma_m).all()
@@ -161,11 +161,11 @@ def test_one_camera_keeps_tracked_only_what_it_can_tell(robot):
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0, 2.0])
 def test_accuracy_and_covariance_at_speed(speed_m_s):
-    """Free-running cameras, a tenth of the detections missing. 4 robots and 70 instants, each of which shares a part of
-    its errors with the next: the squared errors' mean of some 100 independent ones is 1 +- 4 sqrt(2 / 6 / 100). By
-    the filter that is told its associations: nothing is lost. By the bound: 1.15 times, the goal."""
+    """Free-running cameras, a tenth of the detections missing. Four robots in 70 frame sets with correlated errors give
+    about 100 independent samples: the mean squared error is 1 +- 4 sqrt(2 / 6 / 100). The tracker is as accurate as a
+    filter with known associations, and within 1.15 times the bound."""
     got = accuracy(Load(4, 4, 6, 60.0, speed_m_s, crossing=True), 1.5)
     assert got.tracked == 1.0
     assert got.honesty == pytest.approx(1, abs=4 * np.sqrt(2 / 6 / 100))
-    assert got.tracker_mm < 1.02 * got.told_mm
+    assert got.tracker_mm < 1.02 * got.known_mm
     assert got.tracker_mm < 1.15 * got.bound_mm

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One instant of one robot, solved a second way: by GTSAM's own factors, lens, derivatives and optimiser.
+"""One update of one robot, compared with GTSAM's own factors, lens model, derivatives and optimizer.
 
-Nothing of `fusion` but the numbers that go in is shared. The problem is turned round: seen from the robot, its markers
-are fixed landmarks and the rig moves, so the unknown is the rig's pose X = T_robot_world and each camera is a sensor
-that the rig carries. That is what `GenericProjectionFactor` is for. The estimator has the robot's pose, its own
-derivatives, and GTSAM for linear elimination only. The discs are tiny, hence points: the shift of a disc's outline,
-which GTSAM has no factor for, is tested elsewhere against sampled circles.
+Both share only the input numbers. The problem is inverted: in the frame of the robot its markers are fixed landmarks
+and the rig moves, so the unknown is the pose X = T_robot_world of the rig and each camera is a sensor on the rig, as
+`GenericProjectionFactor` expects. The estimator has the pose of the robot, its own derivatives, and GTSAM for linear
+elimination only. The discs are so small that they are points: GTSAM has no factor for the outline of a disc, which
+other tests compare with sampled circles.
 """
 
 from dataclasses import replace
@@ -25,18 +25,17 @@ from fusion.model.states import States
 from fusion.tracking.estimator import Estimator, Prediction
 from tests.fusion.synthetic import ring
 
-CAMERAS = ring(distortion=(-0.1, 0.02, 0.0003, -0.0002))  # all that GTSAM's Cal3DS2 models
+CAMERAS = ring(distortion=(-0.1, 0.02, 0.0003, -0.0002))  # the terms of GTSAM's Cal3DS2
 MARKERS = np.array([[0.15, 0.0, 0.0], [-0.13, 0.14, 0.02], [-0.03, -0.14, 0.05], [0.1, 0.1, 0.0]])
 SIGMAS = (0.004, 0.002)  # of the prior: rad, m
 X = gtsam.symbol("x", 0)
 
 
 @pytest.mark.parametrize(("noise_px", "outliers"), [(0.2, 0), (0.2, 2)])
-def test_the_estimator_agrees_with_a_graph_of_gtsams_own_factors(noise_px, outliers):
-    """Both minimise the same robust cost (measured: to 1e-7 at an outlier of 3 px, whose distance in the undistorted
-    plane is taken as affine: 1e-3 px of it, weighed by a tenth). The covariances differ by the first order of the
-    correction, which turns the prior's coordinates: half of some 5e-3 rad, times the prior's share of the
-    information, a fifth."""
+def test_the_estimator_agrees_with_a_graph_of_gtsam_factors(noise_px, outliers):
+    """Both minimize the same robust cost. Measured difference: 1e-7 with an outlier of 3 px, whose distance in the
+    undistorted plane is affine (1e-3 px with a weight of 0.1). The covariances differ to first order in the correction,
+    which rotates the coordinates of the prior: half of 5e-3 rad, times the prior's share of the information, 1/5."""
     rng = np.random.default_rng(5)
     prior = predicted(rng)
     seen = observed(prior.states, rng, noise_px, outliers)
@@ -50,7 +49,7 @@ def test_the_estimator_agrees_with_a_graph_of_gtsams_own_factors(noise_px, outli
 
 
 def predicted(rng: np.random.Generator) -> Prediction:
-    """A robot at rest, after a time so short that its pose keeps the prior's round covariance."""
+    """A robot at rest after so short a time that its pose keeps the isotropic covariance of the prior."""
     R, p = rotation_from_vector([0.1, -0.2, 0.7]), np.array([0.2, -0.1, 0.3])
     at = States.at_rest(R[None], p[None], (*SIGMAS, 1.0, 1.0))
     return Estimator(CameraArray(CAMERAS), np.full((1, 2), 10.0), np.array([False])).predict(
@@ -61,7 +60,7 @@ def predicted(rng: np.random.Generator) -> Prediction:
 def observed(
     predicted: States, rng: np.random.Generator, noise_px: float, outliers: int
 ) -> MatchedObservations:
-    """Every marker in every camera, of a robot about a sigma beside the prediction; noise along one axis is double."""
+    """Every marker in every camera, for a robot about one sigma from the prediction; u is twice as noisy as v."""
     R = predicted.R[0] @ rotation_from_vector(SIGMAS[0] * rng.normal(size=3))
     p = predicted.p[0] + SIGMAS[1] * rng.normal(size=3)
     n, k = len(MARKERS), len(CAMERAS)
@@ -77,23 +76,23 @@ def observed(
     discs = Discs(
         frame=np.repeat(np.arange(k), n),
         body=np.zeros(n * k, np.intp),
-        row=np.tile(np.arange(n), k),
-        marker=np.tile(MARKERS.T, k),
+        marker=np.tile(np.arange(n), k),
+        position=np.tile(MARKERS.T, k),
         radius=np.full(n * k, 1e-6),
     )
-    return MatchedObservations.seeing(
+    return MatchedObservations.of_discs(
         DetectionTable.of(FrameSet(0, tuple(frames)), CameraArray(CAMERAS), 0.0), discs
     )
 
 
 def placed(camera: Camera) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
-    """Where a camera is, and its lens, in GTSAM's types."""
+    """The pose and the lens model of a camera in GTSAM's types."""
     lens = gtsam.Cal3DS2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, *camera.distortion)
     return gtsam.Pose3(camera.matrix()), lens
 
 
 def oracle(predicted: States, seen: MatchedObservations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R, p and the covariance (6, 6) of the turn in the robot's frame and of p in the world."""
+    """R, p and the covariance (6, 6) of the rotation (robot frame) and of p (world frame)."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     T = gtsam.Pose3(gtsam.Rot3(predicted.R[0]), predicted.p[0])
     start.insert(X, T.inverse())
@@ -103,7 +102,9 @@ def oracle(predicted: States, seen: MatchedObservations) -> tuple[np.ndarray, np
         graph.add(gtsam.NonlinearEqualityPoint3(gtsam.symbol("m", k), marker))
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY / np.sqrt(NOMINAL_WEIGHT))
     cameras = [placed(camera) for camera in CAMERAS.values()]
-    for row, (uv, cov) in enumerate(zip(seen.seen.uv.T, seen.seen.cov.transpose(2, 0, 1), strict=True)):
+    for row, (uv, cov) in enumerate(
+        zip(seen.detections.uv.T, seen.detections.cov.transpose(2, 0, 1), strict=True)
+    ):
         noise = gtsam.noiseModel.Gaussian.Covariance(NOMINAL_WEIGHT * cov)
         pose, lens = cameras[seen.discs.frame[row]]
         marker, robust = gtsam.symbol("m", row % len(MARKERS)), gtsam.noiseModel.Robust.Create(cauchy, noise)
@@ -119,13 +120,13 @@ def oracle(predicted: States, seen: MatchedObservations) -> tuple[np.ndarray, np
 
 
 def by_robot(T: gtsam.Pose3) -> np.ndarray:
-    """(6, 6) the estimator's error by that of X, its inverse: (X exp(xi))^-1 = X^-1 exp(-Ad_X xi), p in the world."""
+    """(6, 6) derivative of the estimator's error by that of X, its inverse: (X exp(xi))^-1 = X^-1 exp(-Ad_X xi)."""
     J = -T.inverse().AdjointMap()
     J[3:] = T.rotation().matrix() @ J[3:]
     return J
 
 
 def turned(predicted: States) -> np.ndarray:
-    """(6, 6) the prior's covariance in the tangent space of X."""
+    """(6, 6) covariance of the prior in the tangent space of X."""
     J = np.linalg.inv(by_robot(gtsam.Pose3(gtsam.Rot3(predicted.R[0]), predicted.p[0])))
     return J @ predicted.P[0, :6, :6] @ J.T

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Properties of tracking: exact without noise, honest with it, nobody swapped, nothing guessed."""
+"""Properties of tracking: exact without noise, correct covariances, no identity swaps, no guesses."""
 
 import numpy as np
 import pytest
 
 from fusion.model.frames import CalibratedFrame
+from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking.tracker import Limits, Tracker
-from tests.fusion.conftest import errors, fuse
+from fusion.tracking.tracker import Tracker
+from tests.fusion.conftest import errors, track
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
 TIGHT = Limits(sigma_floor_px=1e-3)
@@ -15,9 +16,9 @@ MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), 
 
 
 @pytest.mark.parametrize("motion", [line((0.3, 0.1, 0.2), tilt=(0.2, 0.1, 0.5)), MOVING])
-def test_exact_without_noise_though_cameras_run_free(run_arena, motion):
-    """Uniform motion is in the model, so what remains after the start is linearisation and the lens over a disc:
-    a distorted ellipse's centre is 1e-3 px off."""
+def test_exact_without_noise_with_free_running_cameras(run_arena, motion):
+    """The model includes uniform motion. The remaining errors come from linearization and from the affine lens over a
+    disc: the centre of a distorted ellipse is 1e-3 px off."""
     arena = Arena({"a": TRIANGLE}, {"a": motion})
     _, poses = run_arena(arena, limits=TIGHT)
     late = poses("a")[10:]
@@ -30,8 +31,8 @@ def test_exact_without_noise_though_cameras_run_free(run_arena, motion):
     assert np.abs(late[-1].velocity - velocity).max() < 0.01
 
 
-def test_free_running_cameras_cost_nothing(run_arena):
-    """With the same noise, the accuracy of cameras that fire apart is that of cameras that fire together."""
+def test_free_running_cameras_are_as_accurate_as_synchronized_ones(run_arena):
+    """With the same noise, the accuracy does not depend on the phases of the cameras."""
     rms = []
     for phases in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.27, -0.41, 0.38)):
         arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.05, phases=phases)
@@ -41,13 +42,13 @@ def test_free_running_cameras_cost_nothing(run_arena):
     assert rms[1] < 1e-3
 
 
-def test_published_covariance_is_honest():
-    """Squared Mahalanobis errors of the last of several instants follow chi-square with 6 degrees: the mean of 60
-    runs is 6 +- 4 sqrt(12 / 60)."""
+def test_published_covariance_matches_the_errors():
+    """Squared Mahalanobis errors of the last of several poses follow chi-square with 6 degrees of freedom: the mean of
+    60 runs is 6 +- 4 sqrt(12 / 60)."""
     squares, positions = [], []
     for seed in range(60):
         arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.1, seed=seed)
-        pose = fuse(arena, arena.frames(5), Limits(sigma_floor_px=1e-3))[-2].poses[0]
+        pose = track(arena, arena.frames(5), Limits(sigma_floor_px=1e-3))[-2].poses[0]
         e, P = errors(arena, [pose])[0], pose.covariance_matrix
         squares.append(e @ np.linalg.solve(P[:6, :6], e))
         positions.append(e[3:] @ np.linalg.solve(P[3:6, 3:6], e[3:]))
@@ -55,21 +56,21 @@ def test_published_covariance_is_honest():
     assert np.mean(positions) == pytest.approx(3, abs=4 * np.sqrt(6 / 60))
 
 
-def test_several_robots_are_found_at_once_among_false_detections(run_arena):
+def test_several_robots_are_acquired_at_once_among_false_detections(run_arena):
     arena = Arena(
         {"a": TRIANGLE, "b": WIDE},
         {"a": line((-0.5, 0.3, 0.15), (0.3, 0, 0)), "b": line((0.5, -0.2, 0.6), (0, 0.3, 0))},
         sigma_px=0.05,
         distractors=4,
     )
-    fused, poses = run_arena(arena)
+    results, poses = run_arena(arena)
     for robot in "ab":
-        assert len(poses(robot)) >= len(fused) - 2
+        assert len(poses(robot)) >= len(results) - 2
         assert np.abs(errors(arena, poses(robot)[3:])[:, 3:]).max() < 3e-3
 
 
 def test_crossing_robots_are_not_swapped(run_arena):
-    """They pass over each other 0.3 m apart, so that each hides among the other's markers in some images."""
+    """They pass each other at a distance of 0.3 m, so their markers mix in some images."""
     arena = Arena(
         {"a": TRIANGLE, "b": WIDE, "c": SINGLE},
         {
@@ -85,7 +86,7 @@ def test_crossing_robots_are_not_swapped(run_arena):
         assert np.abs(errors(arena, poses(robot)[3:])[:, 3:]).max() < 5e-3
 
 
-def test_a_hidden_robot_coasts_is_lost_and_comes_back(run_arena):
+def test_a_hidden_robot_coasts_is_lost_and_is_acquired_again(run_arena):
     arena = Arena(
         {"a": TRIANGLE},
         {"a": line((0.0, 0.0, 0.2), (0.2, 0, 0))},
@@ -103,9 +104,9 @@ def test_a_hidden_robot_coasts_is_lost_and_comes_back(run_arena):
 
 
 @pytest.mark.parametrize("cameras", [2, 4])
-def test_covariance_is_honest_from_the_first_instant_on(cameras):
-    """Of a robot that was just found, and of one found again: its speed is not known, so that free-running cameras
-    know its place to millimetres only, and say so. Chi-square with 6 degrees, mean 6 +- 4 sqrt(12 / 20)."""
+def test_covariance_matches_the_errors_from_the_first_pose_on(cameras):
+    """The velocity of a robot that was just acquired is unknown, so free-running cameras determine its position to
+    millimetres only. Chi-square with 6 degrees of freedom: mean 6 +- 4 sqrt(12 / 20)."""
     squares = []
     for seed in range(10):
         arena = Arena(
@@ -116,7 +117,7 @@ def test_covariance_is_honest_from_the_first_instant_on(cameras):
             hidden=lambda robot, marker, t: 0.2 < t < 0.6,
         )
         frames = [f for f in arena.frames(26) if cameras == 4 or f.camera in ("cam0", "cam2")]
-        poses = [pose for fused in fuse(arena, frames, TIGHT) for pose in fused.poses]
+        poses = [pose for result in track(arena, frames, TIGHT) for pose in result.poses]
         before = ["lost", *(pose.state for pose in poses)]
         found = [p for was, p in zip(before, poses, strict=False) if was == "lost" != p.state]
         assert len(found) == 2
@@ -139,16 +140,16 @@ def test_two_visible_markers_keep_a_constellation_tracked(run_arena):
     assert np.abs(errors(arena, late)[:, 3:]).max() < 5e-3
 
 
-def test_two_of_three_markers_find_no_robot(run_arena):
+def test_two_of_three_markers_acquire_no_robot(run_arena):
     arena = Arena(
         {"a": TRIANGLE}, {"a": line((0, 0, 0.2))}, sigma_px=0.05, hidden=lambda robot, marker, t: marker == 1
     )
-    fused, poses = run_arena(arena, 10)
+    results, poses = run_arena(arena, 10)
     assert poses("a") == []
-    assert (fused[5].markers.robot_index() == -1).sum() == 2
+    assert (results[5].markers.robot_index() == -1).sum() == 2
 
 
-def test_a_single_marker_has_a_place_and_a_normal_and_says_that_its_turn_is_unknown(run_arena):
+def test_a_single_marker_has_a_position_and_a_normal_and_a_large_variance_of_its_rotation(run_arena):
     arena = Arena(
         {"c": SINGLE}, {"c": line((0.1, 0.2, 0.3), (0.5, 0, 0), tilt=(0.35, -0.1, 0))}, sigma_px=0.03
     )
@@ -164,36 +165,39 @@ def test_a_single_marker_has_a_place_and_a_normal_and_says_that_its_turn_is_unkn
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.8])
-def test_a_marker_of_nobody_has_position_velocity_and_normal(speed: float):
-    """Squared Mahalanobis errors of place and speed of the last of ten instants follow chi-square with 3 degrees
-    each, the mean of 30 runs being 3 +- 4 sqrt(6 / 30); the normal, from four views, is within its 12 degrees."""
+def test_an_unlabeled_marker_has_position_velocity_and_normal(speed: float):
+    """Squared Mahalanobis errors of position and velocity in the last of ten frame sets follow chi-square with 3
+    degrees of freedom: the mean of 30 runs is 3 +- 4 sqrt(6 / 30). The normal from four views is within 12 degrees."""
     squares = []
     for seed in range(30):
         motion = line((-0.1, 0.1, 0.3), velocity=(speed, -speed / 2, 0.1 * speed), tilt=(0.2, 0.1, 0.0))
         arena = Arena({"x": SINGLE}, {"x": motion}, sigma_px=0.1, seed=seed)
-        tracker, instants = Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT), FrameSynchronizer(33_333_333)
+        tracker, synchronizer = (
+            Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT),
+            FrameSynchronizer(33_333_333),
+        )
         for frame in arena.frames(10):
-            instants.add(frame)
-        *_, last = (tracker.fuse(instant) for instant in instants.finish()[:-1])
+            synchronizer.add(frame)
+        *_, last = (tracker.track(frame_set) for frame_set in synchronizer.finish()[:-1])
         R, p = motion(arena.seconds(last.t_ns))
         assert last.markers.robot_index().tolist() == [-1]
         assert last.markers.normals()[0] @ R[:, 2] > np.cos(np.radians(12))
         P = np.frombuffer(last.markers.covariance, "<f4").reshape(3, 3).astype(float)
         e = last.markers.positions()[0] - p
         off = last.markers.velocities()[0] - np.multiply((1, -0.5, 0.1), speed)
-        V = tracker.loose._tracks.states.P[0, 9:, 9:]
+        V = tracker.unlabeled._tracks.states.P[0, 9:, 9:]
         squares.append([e @ np.linalg.solve(P, e), off @ np.linalg.solve(V, off)])
     assert np.mean(squares, 0) == pytest.approx([3, 3], abs=4 * np.sqrt(6 / 30))
 
 
-def test_single_markers_that_nothing_tells_apart_stay_unlabelled(run_arena):
+def test_indistinguishable_single_markers_stay_unlabeled(run_arena):
     arena = Arena({"c": SINGLE, "d": SINGLE}, {"c": line((0.3, 0, 0.2)), "d": line((-0.3, 0, 0.2))})
-    fused, poses = run_arena(arena, 8)
+    results, poses = run_arena(arena, 8)
     assert poses("c") == poses("d") == []
-    assert len(fused[4].markers) == 2
+    assert len(results[4].markers) == 2
 
 
-def test_a_known_start_tells_single_markers_apart(run_arena):
+def test_a_known_start_distinguishes_single_markers(run_arena):
     robots = {
         "c": SINGLE.__class__(diameter_m=0.12, start_m=(0.3, 0.0, 0.2)),
         "d": SINGLE.__class__(diameter_m=0.12, start_m=(-0.3, 0.0, 0.2)),
@@ -204,33 +208,33 @@ def test_a_known_start_tells_single_markers_apart(run_arena):
 
 
 def test_detections_without_axes_are_enough(run_arena):
-    """As out of observations.csv: geometry alone matches the views."""
+    """As from observations.csv: geometry alone associates the views."""
     arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.05)
     frames = []
     for frame in arena.frames(20):
         roundels = frame.roundels
         bare = type(roundels).from_points(roundels.uv, 0.3)
         frames.append(CalibratedFrame.measure(frame.camera, frame.t_ns, bare, arena.cameras[frame.camera]))
-    fused = fuse(arena, frames)
-    tracked = [pose for instant in fused for pose in instant.poses]
+    results = track(arena, frames)
+    tracked = [pose for result in results for pose in result.poses]
     assert len(tracked) >= 17
     assert np.abs(errors(arena, tracked[3:])[:, 3:]).max() < 5e-3
 
 
-def test_late_frames_are_used_and_leave_the_covariance_honest():
-    """cam1 is 100 ms behind, so its frames miss their instants. The robot turns a circle at 0.5 m/s (1 m/s^2): what it
-    did meanwhile is within what a late detection's noise grew by, so the mean squared error of 12 runs is 6 at the
-    most + 4 sqrt(12 / 12), and cam1 is used."""
+def test_late_frames_are_used_and_the_covariance_covers_them():
+    """cam1 is 100 ms late, so its frames miss their frame sets. The robot moves in a circle at 0.5 m/s (1 m/s^2). The
+    inflated noise of late detections covers this motion: the mean squared error of 12 runs is below
+    6 + 4 sqrt(12 / 12), and cam1 is used."""
     squares = []
     for seed in range(12):
         arena = Arena({"a": TRIANGLE}, {"a": circle}, sigma_px=0.1, seed=seed)
         tracker, closed = Tracker(arena.cameras, arena.robots, TIGHT), []
-        instants = FrameSynchronizer(33_333_333, 60_000_000)
+        synchronizer = FrameSynchronizer(33_333_333, 60_000_000)
         arrivals = [(f.t_ns + (100_000_000 if f.camera == "cam1" else 0), f) for f in arena.frames(14)]
         for now_ns, frame in sorted(arrivals, key=lambda arrival: arrival[0]):
-            instants.add(frame)
-            closed += [tracker.fuse(instant) for instant in instants.take(now_ns)]
-        late = [fused for fused in closed if fused.poses and fused.cameras["cam1"].used]
+            synchronizer.add(frame)
+            closed += [tracker.track(frame_set) for frame_set in synchronizer.take(now_ns)]
+        late = [result for result in closed if result.poses and result.cameras["cam1"].used]
         pose = late[-1].poses[0]
         e, P = errors(arena, [pose])[0], pose.covariance_matrix[:6, :6]
         squares.append(e @ np.linalg.solve(P, e))

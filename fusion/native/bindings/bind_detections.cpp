@@ -10,17 +10,36 @@ namespace {
 
 using Markers = std::vector<ExpectedMarker>;
 
-/// R and P are those of the bodies, `body` that of each marker.
-void make_expected(Markers* self, const In<double, -1, 3, 3>& R, const In<double, -1, 12, 12>& P,
-                   const Index& body, const Vectors& marker, const Numbers& radius) {
+/// The arrays of N detections, sorted by frame.
+struct DetectionColumns {
+    Index frame;
+    Pairs xy;
+    Matrices2 scale, cov;
+    Numbers major;
+
+    DetectionColumns(const Index& frames, const Pairs& xys, const Matrices2& scales, const Matrices2& covs,
+                     const Numbers& majors)
+        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors) {
+        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size()});
+    }
+
+    Detections view() const {
+        const size_t n = frame.size();
+        return {frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n), major.data()};
+    }
+};
+
+/// R and P are by body; `body`, `position` and `radius` are by marker.
+void make_expected(Markers* self, const Rotations& R, const Covariances& P, const Index& body,
+                   const Vectors& position, const Numbers& radius) {
     const size_t n = body.size();
     require_equal(R.shape(0), {P.shape(0)});
     require_equal(n, {radius.size()});
     below(R.shape(0), body);
-    const auto places = columns<3>(marker, n);
+    const auto positions = columns<3>(position, n);
     Markers markers;
     for (size_t k = 0; k < n; ++k)
-        markers.push_back(ExpectedMarker::of(body(k), places.vector(k), radius(k),
+        markers.push_back(ExpectedMarker::of(body(k), positions.vector(k), radius(k),
                                              matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
     new (self) Markers(std::move(markers));
 }
@@ -34,17 +53,13 @@ Out covariances(const Markers& markers, double tau) {
     return all;
 }
 
-auto candidates(const Markers& markers, const Poses& poses, const Index& frame, const Pairs& xy,
-                const Matrices2& scale, const Matrices2& cov, const Numbers& major, const Numbers& focal) {
-    const size_t n = frame.size();
-    below(poses.exposures().size(), frame);
-    require_equal(n, {major.size()});
+auto candidates(const Markers& markers, const FramePoses& poses, const DetectionColumns& detections,
+                const Numbers& focal) {
+    below(poses.exposures().size(), detections.frame);
     require_equal(poses.exposures().size(), {focal.size()});
     for (const ExpectedMarker& marker : markers) require_below(poses.n_bodies(), marker.body);
-    const Detections seen{frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n),
-                          major.data()};
     std::vector<Candidate> found;
-    unlocked([&] { found = find_candidates(poses, markers, seen, focal.data()); });
+    unlocked([&, all = detections.view()] { found = find_candidates(poses, markers, all, focal.data()); });
     auto [pairs, rows] = make<int64_t>({2, found.size()});
     auto [costs, to] = make({found.size()});
     for (const Candidate& pair : found) {
@@ -67,6 +82,9 @@ auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const I
 }  // namespace
 
 void bind_detections(nb::module_& m) {
+    m.attr("SLACK_PX") = kSlackPx;
+    nb::class_<DetectionColumns>(m, "DetectionColumns")
+        .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&>());
     nb::class_<Markers>(m, "ExpectedMarkers")
         .def("__init__", &make_expected)
         .def("covariances", &covariances)

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where rays of different cameras meet: the native core against all pairs at once in NumPy."""
+"""Intersections of rays of different cameras: the native core against all pairs in NumPy."""
 
 import numpy as np
 import pytest
 
-from fusion._core import MIN_PARALLAX, densest_ranges
+from fusion._core import MIN_PARALLAX, Viewpoints, densest_ranges
 from tests.fusion.synthetic import ring
 
 F, EACH, SIZES = 5, 40, np.array([0.1, 0.16])
 
 
 def scene(seed: int) -> tuple[np.ndarray, ...]:
-    """Rays of five frames, two of them of one camera, to points of which each frame sees some, and upwards."""
+    """Rays of five frames, two of them of one camera, to points that some frames see, and rays that point upwards."""
     random = np.random.default_rng(seed)
     camera = np.array([0, 1, 1, 2, 3])
     centre = np.array([c.matrix()[:3, 3] for c in ring().values()])
@@ -28,7 +28,7 @@ def scene(seed: int) -> tuple[np.ndarray, ...]:
 
 
 def expected(camera, centre, moved, frame, d, reach, ranges) -> np.ndarray:
-    """(N,) by all pairs."""
+    """(N,) ranges from all pairs."""
     n, o = len(frame), centre[camera[frame]]
     w, b = o[:, None] - o, d @ d.T
     wi, wj = np.einsum("ijc,ic->ij", w, d), np.einsum("ijc,jc->ij", w, d)
@@ -40,15 +40,18 @@ def expected(camera, centre, moved, frame, d, reach, ranges) -> np.ndarray:
     low, high = ranges[..., 0], ranges[..., 1]
     suits = ((low[:, None] < s[..., None]) & (s[..., None] < high[:, None])).any(2)
     suits &= ((low[None] < t[..., None]) & (t[..., None] < high[None])).any(2)
-    meets = (camera[frame][:, None] != camera[frame]) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
-    meets &= suits & ((between**2).sum(2) < limit**2)
+    intersects = (camera[frame][:, None] != camera[frame]) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
+    intersects &= suits & ((between**2).sum(2) < limit**2)
     return np.array(
-        [densest(s[k, meets[k]], limit[k, meets[k]] / np.sqrt(parallax[k, meets[k]])) for k in range(n)]
+        [
+            densest(s[k, intersects[k]], limit[k, intersects[k]] / np.sqrt(parallax[k, intersects[k]]))
+            for k in range(n)
+        ]
     )
 
 
 def densest(ranges: np.ndarray, reach: np.ndarray) -> float:
-    """The mean of those that agree with the one with which most do."""
+    """The mean of the ranges that agree with the one that has most agreement."""
     if not len(ranges):
         return np.nan
     ranges, reach = ranges[np.argsort(ranges)], reach[np.argsort(ranges)]
@@ -58,23 +61,23 @@ def densest(ranges: np.ndarray, reach: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_ranges_are_those_of_all_pairs(seed: int):
-    """Both round differently: 1e-12 of a range, over the parallax's 0.003."""
+def test_ranges_equal_those_of_all_pairs(seed: int):
+    """Rounding differs by 1e-12 of a range, divided by the parallax of 0.003."""
     given = scene(seed)
-    found = densest_ranges(*given)
+    found = densest_ranges(Viewpoints(*given[:3]), *given[3:])
     assert 0.5 < np.isfinite(found).mean() < 1
     np.testing.assert_allclose(found, expected(*given), rtol=1e-9)
 
 
-def test_nearly_parallel_rays_do_not_meet():
-    """Two rays cross a metre away, under twenty degrees and under two."""
+def test_nearly_parallel_rays_do_not_intersect():
+    """Two rays cross at a distance of one metre, at angles of 20 and 2 degrees."""
     ranges = np.tile([0.0, 50.0], (2, 1, 1))
 
     def crossing(degrees: float) -> np.ndarray:
         aside = np.tan(np.radians(degrees))
         d = np.array([[0.0, 0.0, 1.0], [-aside, 0.0, 1.0]]) / [[1.0], [np.hypot(aside, 1)]]
         centres, one = np.array([[0.0, 0.0, 0.0], [aside, 0.0, 0.0]]), np.arange(2)
-        return densest_ranges(one, centres, np.zeros(2), one, d, np.full(2, 1e-3), ranges)
+        return densest_ranges(Viewpoints(one, centres, np.zeros(2)), one, d, np.full(2, 1e-3), ranges)
 
     assert np.isnan(crossing(2.0)).all()
     np.testing.assert_allclose(crossing(20.0), [1, 1 / np.cos(np.radians(20))])

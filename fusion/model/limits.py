@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The tunable limits of tracking: a module of its own because server, tracking and recordings all read them."""
+
+import msgspec
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Tunable limits; the defaults suit printed roundels and calibrated cameras."""
+
+    sigma_floor_px: float = 0.08  # added in quadrature to the noise that detectors report
+    lost_after_s: float = 0.3  # without an observation
+    lateness_ms: float = 150.0  # how long a frame set waits for a camera; USB cameras can be 100 ms late
+    tracked_sigma_m: float = (
+        0.05  # a robot with a larger position sigma is `coasting`, even while it is visible
+    )

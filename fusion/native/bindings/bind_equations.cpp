@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include <nanobind/stl/tuple.h>
+
+#include <algorithm>
+
+#include "arrays.hpp"
+#include "motion_model.hpp"
+
+namespace roundel::fusion {
+namespace {
+
+EquationSystem system_of(const EquationArray& equations, const Index& body, size_t n_bodies) {
+    require_equal(equations.shape(0), {body.size()});
+    return {reinterpret_cast<const Equations*>(equations.data()), below(n_bodies, body), body.size(),
+            n_bodies};
+}
+
+auto reweigh_arrays(const EquationArray& equations, const Index& body, const Covariances& information,
+                    const In<double, -1, 12>& right, const Numbers& weights) {
+    const size_t n = information.shape(0);
+    const EquationSystem system = system_of(equations, body, n);
+    require_equal(n, {right.shape(0)});
+    require_equal(body.size(), {weights.size()});
+    auto [H, to_H] = make({n, kErrors, kErrors});
+    auto [g, to_g] = make({n, kErrors});
+    auto [w, to_w] = make({body.size()});
+    std::copy_n(information.data(), information.size(), to_H);
+    std::copy_n(right.data(), right.size(), to_g);
+    std::copy_n(weights.data(), weights.size(), to_w);
+    unlocked([&, to_H = to_H, to_g = to_g, to_w = to_w] {
+        reweigh(system, reinterpret_cast<ErrorMatrix*>(to_H), reinterpret_cast<ErrorVector*>(to_g), to_w);
+    });
+    return std::make_tuple(H, g, w);
+}
+
+Out residuals_of(const EquationArray& equations, const Index& body, const In<double, -1, 12>& steps) {
+    const EquationSystem system = system_of(equations, body, steps.shape(0));
+    auto [both, to] = make({2, body.size()});
+    unlocked([&] { residuals(system, steps.data(), to); });
+    return both;
+}
+
+Out inverses(const Covariances& information) {
+    auto [covariances, to] = make({information.shape(0), kErrors, kErrors});
+    const auto* from = reinterpret_cast<const ErrorMatrix*>(information.data());
+    unlocked([&, out = reinterpret_cast<ErrorMatrix*>(to)] {
+        std::transform(from, from + information.shape(0), out, inverse);
+    });
+    return covariances;
+}
+
+auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Numbers& dt,
+                    const In<double, -1, 2>& densities, const In<bool, -1>& single) {
+    const size_t n = bodies.size();
+    require_equal(n, {P.shape(0), dt.size(), densities.shape(0), single.size()});
+    auto [R_then, to_R] = make({n, 3, 3});
+    auto [p_then, to_p] = make({n, 3});
+    auto [P_then, to_P] = make({n, kErrors, kErrors});
+    auto [T, to_T] = make({n, 3, 3});
+    std::copy_n(P.data(), P.size(), to_P);
+    for (size_t b = 0; b < n; ++b) {
+        Body body = bodies[b];
+        const MotionInterval interval{dt(b), densities(b, 0), densities(b, 1), single(b)};
+        write(predict(body, reinterpret_cast<ErrorMatrix*>(to_P)[b], interval), to_T + 9 * b);
+        write(body.R, to_R + 9 * b);
+        write(body.p, to_p + 3 * b);
+    }
+    return std::make_tuple(R_then, p_then, P_then, T);
+}
+
+}  // namespace
+
+void bind_equations(nb::module_& m) {
+    m.attr("CAUCHY") = kCauchy;
+    m.attr("NOMINAL_WEIGHT") = kNominalWeight;
+    m.def("predict", &predict_bodies);
+    m.def("reweigh", &reweigh_arrays);
+    m.def("residuals", &residuals_of);
+    m.def("inverses", &inverses);
+}
+
+}  // namespace roundel::fusion

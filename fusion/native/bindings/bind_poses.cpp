@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "arrays.hpp"
+#include "linearization.hpp"
+
+namespace roundel::fusion {
+namespace {
+
+/// The arrays of N discs. Their indices are checked where the numbers of frames and bodies are known.
+struct DiscColumns {
+    Index frame, body;
+    Vectors position;
+    Numbers radius;
+
+    DiscColumns(const Index& frames, const Index& bodies, const Vectors& positions, const Numbers& radii)
+        : frame(frames), body(bodies), position(positions), radius(radii) {
+        require_equal(frame.size(), {body.size(), position.shape(1), radius.size()});
+    }
+};
+
+void make_bodies(BodyStates* self, const Rotations& R, const Positions& p, const Positions& omega,
+                 const Positions& v) {
+    require_equal(R.shape(0), {p.shape(0), omega.shape(0), v.shape(0)});
+    BodyStates bodies;
+    for (size_t b = 0; b < R.shape(0); ++b)
+        bodies.push_back({matrix_at(R.data() + 9 * b), vector_at(p.data() + 3 * b),
+                          vector_at(omega.data() + 3 * b), vector_at(v.data() + 3 * b)});
+    new (self) BodyStates(std::move(bodies));
+}
+
+void make_exposures(CameraExposures* self, const Rotations& R_cam_world, const Positions& centres,
+                    const Numbers& tau) {
+    require_equal(tau.size(), {R_cam_world.shape(0), centres.shape(0)});
+    CameraExposures exposures;
+    for (size_t f = 0; f < tau.size(); ++f)
+        exposures.push_back(
+            {matrix_at(R_cam_world.data() + 9 * f), vector_at(centres.data() + 3 * f), tau(f)});
+    new (self) CameraExposures(std::move(exposures));
+}
+
+Discs discs_of(const FramePoses& poses, const DiscColumns& discs) {
+    return {below(poses.exposures().size(), discs.frame), below(poses.n_bodies(), discs.body),
+            columns<3>(discs.position, discs.frame.size()), discs.radius.data()};
+}
+
+Out views_of(const FramePoses& poses, const DiscColumns& columns_of) {
+    const Discs discs = discs_of(poses, columns_of);
+    auto [views, to] = make({11, discs.size()});
+    unlocked([&] { view_discs(poses, discs, to); });
+    return views;
+}
+
+Out linearize_centres(const FramePoses& poses, const DiscColumns& columns_of, const Pairs& xy,
+                      const Matrices2& whiten, const In<bool, -1>& single) {
+    const Discs discs = discs_of(poses, columns_of);
+    require_equal(poses.n_bodies(), {single.size()});
+    const CentreObservations observed{discs, columns<2>(xy, discs.size()), columns<4>(whiten, discs.size()),
+                                      single.data()};
+    auto [equations, to] = make({discs.size(), 2, kErrors + 1});
+    unlocked([&] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
+    return equations;
+}
+
+Out linearize_outlines(const FramePoses& poses, const DiscColumns& columns_of, const Pairs& axes,
+                       const Numbers& angle, const Matrices2& scale, const Numbers& sigma) {
+    const Discs discs = discs_of(poses, columns_of);
+    require_equal(discs.size(), {angle.size(), sigma.size()});
+    const OutlineObservations observed{discs, columns<2>(axes, discs.size()), angle.data(),
+                                       columns<4>(scale, discs.size()), sigma.data()};
+    auto [equations, to] = make({discs.size(), 2, kErrors + 1});
+    unlocked([&] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
+    return equations;
+}
+
+Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, const Vectors& normal,
+              const Numbers& radius, const Matrices2& scale) {
+    const size_t n = angle.size();
+    require_equal(n, {axes.shape(1), centre.shape(1), normal.shape(1), radius.size(), scale.shape(2)});
+    auto [both, to] = make({2, n});
+    const Columns<3> c{centre.data(), n}, d{normal.data(), n};
+    for (size_t k = 0; k < n; ++k) {
+        const Shape measured = measured_outline(axes(0, k), axes(1, k), angle(k));
+        const Shape expected =
+            outline(c.vector(k), d.vector(k), radius(k), Scale::of(columns<4>(scale, n), k));
+        const Shear s = shear(measured, expected);
+        to[k] = s.along, to[n + k] = s.across;
+    }
+    return both;
+}
+
+}  // namespace
+
+void bind_poses(nb::module_& m) {
+    nb::class_<BodyStates>(m, "BodyStates").def("__init__", &make_bodies);
+    nb::class_<CameraExposures>(m, "CameraExposures").def("__init__", &make_exposures);
+    nb::class_<DiscColumns>(m, "DiscColumns")
+        .def(nb::init<const Index&, const Index&, const Vectors&, const Numbers&>());
+    nb::class_<FramePoses>(m, "FramePoses")
+        .def(nb::init<const BodyStates&, const CameraExposures&>())
+        .def("views", &views_of)
+        .def("linearize_centres", &linearize_centres)
+        .def("linearize_outlines", &linearize_outlines);
+    m.def("shears", &shears_of);
+}
+
+}  // namespace roundel::fusion

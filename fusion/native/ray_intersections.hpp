@@ -1,0 +1,37 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <vector>
+
+#include "columns.hpp"
+
+/// Intersects viewing rays of different cameras, within the ranges that the apparent sizes allow.
+namespace roundel::fusion {
+
+/// Squared sine of 3 degrees: rays closer to parallel do not determine a range.
+constexpr double kMinParallax = 0.00273905;
+
+/// The camera of a frame, its centre of projection, and how far the fastest marker moves between the time of
+/// the frame set and that of the frame (signed as the time).
+struct Viewpoint {
+    int64_t camera;
+    Vector centre;
+    double moved;
+};
+
+/// N viewing rays: frame, unit direction, tolerance (metres per metre of range), and the smallest and largest
+/// possible range for each of K marker sizes.
+struct Rays {
+    const int64_t* frame;
+    const Vector* direction;
+    const double* reach;
+    const double* ranges;  // N x K x 2
+    size_t n, n_sizes;
+
+    bool allows(size_t ray, double range) const;
+    double max_range(size_t ray) const;
+};
+
+/// The range of each ray on which most intersections agree, averaged over these; NaN without intersections.
+std::vector<double> densest_ranges(const Rays& rays, const std::vector<Viewpoint>& frames);
+
+}  // namespace roundel::fusion

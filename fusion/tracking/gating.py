@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Gates, noise levels and initial covariances shared by the trackers, and the misfit that they test."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.arrays import Array, Index
+from fusion._core import SLACK_PX
+from fusion.model.observations import MatchedObservations
+
+MAX_CHI2 = (
+    8.0  # mean squared Mahalanobis residual of a robot or marker, including SLACK_PX of calibration error
+)
+POSITION_GATE = 16.3  # chi-square with 3 degrees of freedom; rejects one true position in 1000
+DECISIVE_CHI2 = 9.0  # by which an alternative must be worse
+AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold change it by more than noise
+DIAMETER_TOLERANCE = 0.2  # relative, between the diameter that a view implies and that of a marker
+MAX_SPEED_M_S = 2.0  # of the fastest marker that is searched for
+FORGET_NS = 300_000_000  # unlabeled markers are forgotten after this time without a detection
+
+# Standard deviations of a robot that was just acquired: rad, m, rad/s, m/s.
+START_SIGMAS = (0.2, 0.05, 4.0, 1.5)
+START_SIGMAS_SINGLE = (0.3, 0.05, 10.0, 1.5)  # of a single marker
+START_S = 1e-3  # shortest prediction interval; the motion model needs a positive one
+
+
+def misfit(observations: MatchedObservations, residuals_px: Array) -> Array:
+    """(N,) squared residuals in standard deviations, including `SLACK_PX`; infinite where not visible.
+
+    Args:
+        observations: N observations.
+        residuals_px: (2, N), NaN where the disc is not visible.
+    """
+    cov = observations.detections.cov
+    d2 = np.sum(residuals_px**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
+    return np.nan_to_num(d2, nan=np.inf)
+
+
+def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:
+    """(B,) means of values (N,) of the bodies (N,); 0 for bodies without values."""
+    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
