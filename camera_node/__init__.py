@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One a camera: frame to roundels to Zenoh."""
+"""The program of one camera: detects roundels in its frames and publishes them over Zenoh."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m camera_node` publishes a camera; `detect` looks at images, `print` makes roundels."""
+"""The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels."""
 
 import logging
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Array types of all packages: `Array` holds numbers, `Index` rows of other arrays, `Mask` truth, `Grey` an image."""
+"""Array types of all packages: `Array` of floats, `Index` of integers, `Mask` of booleans, `Grey` of an 8-bit image."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files that people write: YAML in, checked against a msgspec Struct; text out, atomically."""
+"""Reads YAML files into msgspec Structs with errors that name the place of a fault, and writes files atomically."""
 
 import difflib
 import os
@@ -17,11 +17,11 @@ from camera_node.errors import ConfigError
 T = TypeVar("T")
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-NAME = re.compile(r"[^/*$#?\s]+")
+NAME = re.compile(r"[^/*$#?\s]+")  # without the special characters of Zenoh keys
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can name an arena, a camera or a robot: it becomes a part of Zenoh keys."""
+    """Whether a text is a valid name of an arena, a camera or a robot, which are parts of Zenoh keys."""
     return NAME.fullmatch(text) is not None
 
 
@@ -29,7 +29,7 @@ def load_yaml(path: Path, kind: type[T]) -> T:
     """Read a YAML file as `kind`.
 
     Raises:
-        ConfigError: the file is missing or unreadable, is no YAML, or does not fit `kind`; the message names
+        ConfigError: the file is missing or unreadable, is not YAML, or does not match `kind`; the message names
             the file and the place in it, such as `$.cameras.cam0.fx`.
     """
     try:
@@ -39,7 +39,7 @@ def load_yaml(path: Path, kind: type[T]) -> T:
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; check the path") from None
     except OSError as error:
-        raise ConfigError(f"{path} can't be read: {error.strerror}") from None
+        raise ConfigError(f"{path} can't be read: {error.strerror}; give a readable file") from None
     except (msgspec.DecodeError, yaml.YAMLError, UnicodeDecodeError) as error:
         where = " ".join(str(error).replace('in "<byte string>", ', "at ").split())
         raise ConfigError(f"{path} is not valid YAML: {where}") from None
@@ -51,13 +51,15 @@ def load_yaml(path: Path, kind: type[T]) -> T:
 
 
 def _require_single(node: yaml.Node | None) -> None:
-    """Raise YAMLError where a mapping has a key twice: PyYAML would take the last one in silence."""
+    """Raise YAMLError where a mapping has a key twice; PyYAML would silently use the last one."""
     if isinstance(node, yaml.MappingNode):
         lines: dict[str, int] = {}
         for key, value in node.value:
             name, line = str(key.value), key.start_mark.line + 1
             if name in lines:
-                raise yaml.YAMLError(f"'{name}' is there twice, in lines {lines[name]} and {line}; keep one")
+                raise yaml.YAMLError(
+                    f"'{name}' is defined twice, in lines {lines[name]} and {line}; remove one"
+                )
             lines[name] = line
             _require_single(value)
     elif isinstance(node, yaml.SequenceNode):
@@ -66,7 +68,7 @@ def _require_single(node: yaml.Node | None) -> None:
 
 
 def _name_entry(data: Any, kind: type, fault: str) -> str:
-    """The fault with the name of the entry that has it: of mappings, msgspec only says `[...]`."""
+    """Insert the name of the faulty entry of a mapping, for which msgspec writes `[...]`."""
     mappings = (
         ((key, value) for key, value in data.items() if isinstance(value, dict)) if "[...]" in fault else ()
     )
@@ -81,17 +83,17 @@ def _name_entry(data: Any, kind: type, fault: str) -> str:
 
 
 def _suggest(kind: type, fault: str) -> str:
-    """Where the fault is a field that does not exist: those that do, the one that was meant first if it shows."""
-    told = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
-    known = _fields(msgspec.inspect.type_info(kind), (told[2] or "").split(".")[1:]) if told else []
-    if not told or not known:
+    """For an unknown field: the known field with the most similar name, or all known fields. Empty for other faults."""
+    match = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
+    known = _fields(msgspec.inspect.type_info(kind), (match[2] or "").split(".")[1:]) if match else []
+    if not match or not known:
         return ""
-    meant = difflib.get_close_matches(told[1], known, 1)
-    return f"; did you mean `{meant[0]}`?" if meant else f"; it may hold {', '.join(known)}"
+    similar = difflib.get_close_matches(match[1], known, 1)
+    return f"; did you mean `{similar[0]}`?" if similar else f"; known fields: {', '.join(known)}"
 
 
 def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
-    """Names of the fields of the struct that lies some steps into a type."""
+    """Names of the fields of the struct at a path of field names inside a type."""
     if isinstance(info, msgspec.inspect.UnionType):
         return [name for kind in info.types for name in _fields(kind, steps)]
     if isinstance(info, msgspec.inspect.DictType):
@@ -104,17 +106,17 @@ def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
 
 
 def dump_yaml(data: msgspec.Struct) -> str:
-    """A file's text, short lists on one line; fields at their defaults are left out if the struct says so."""
+    """Encode a struct as YAML, with short lists on one line; structs with `omit_defaults` omit default values."""
     return yaml.dump(
         msgspec.to_builtins(data), Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True
     )
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old text or the new one, never a part.
+    """Write a file so that a reader sees either the old text or the new one.
 
     Raises:
-        ConfigError: the folder does not exist or can't be written to.
+        ConfigError: the folder does not exist or is not writable.
     """
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -129,11 +131,11 @@ def write_atomically(path: Path, text: str) -> None:
             os.unlink(name)
             raise
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; is its folder there?") from None
+        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
 
 
 class _Dumper(yaml.SafeDumper):
-    """Lists of numbers stand on one line, as a person would write them."""
+    """Writes lists of numbers and texts on one line."""
 
 
 def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:

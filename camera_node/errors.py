@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a user can mend, and how a program says it.
+"""Errors that a user can fix, and how programs report them.
 
     RoundelError
-    ├── ConfigError          a file or an option: missing, broken, or of the wrong kind
-    ├── CameraError          a camera, an image or another source of frames
-    ├── NetworkError         a Zenoh endpoint: taken, unreachable or refused
+    ├── ConfigError          a file or an option is missing or invalid
+    ├── CameraError          a camera, an image or another source of frames delivers no frames
+    ├── NetworkError         a Zenoh endpoint is taken, unreachable or refused
     ├── calib.CalibrationError
     ├── fusion.FusionError
     └── web.WebError
 
-Every message says what is wrong, where, and what to do. Faults in live data are never raised: they are counted.
+Every message names the fault, its place and the remedy. Faults in live data are counted and never raised.
 """
 
 import difflib
@@ -19,23 +19,23 @@ from collections.abc import Callable, Sequence
 
 
 class RoundelError(Exception):
-    """The base of every fault that a user can mend."""
+    """Base class of all errors that a user can fix."""
 
 
 class ConfigError(RoundelError):
-    """A file or an option that is missing, broken or of the wrong kind."""
+    """A file or an option is missing or invalid."""
 
 
 class CameraError(RoundelError):
-    """A camera, an image or another source of frames that does not deliver."""
+    """A camera, an image or another source of frames delivers no frames."""
 
 
 class NetworkError(RoundelError):
-    """A Zenoh endpoint that is taken, unreachable or refused."""
+    """A Zenoh endpoint is taken, unreachable or refused."""
 
 
 def run(program: Callable[[], int | None]) -> None:
-    """Run a command line program and exit: 0 or its own code; 2 with one line for a fault a user can mend."""
+    """Run a command and exit with its code; a RoundelError is printed as one line, with exit code 2."""
     try:
         code = program()
     except RoundelError as error:
@@ -43,16 +43,16 @@ def run(program: Callable[[], int | None]) -> None:
         code = 2
     except KeyboardInterrupt:
         code = 130
-    except BrokenPipeError:  # whoever read the output has seen enough, as in `detect --json | head`
+    except BrokenPipeError:  # the reader closed the pipe, as in `detect --json | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code or 0)
 
 
 def check_command(arguments: Sequence[str], known: Sequence[str]) -> None:
-    """Raise ConfigError where the first argument is meant as a command, and is none of those known."""
+    """Raise ConfigError where the first argument is not an option and not a known command."""
     if not arguments or arguments[0].startswith("-") or arguments[0] in known:
         return
-    meant = difflib.get_close_matches(arguments[0], known, 1)
-    hint = f"did you mean {meant[0]}?" if meant else f"there are {', '.join(known)}"
-    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} (--help tells the options)")
+    similar = difflib.get_close_matches(arguments[0], known, 1)
+    hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
+    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} (--help lists the options)")

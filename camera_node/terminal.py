@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The one place where all programs print: results on stdout, progress on stderr.
+"""Prints the output of all programs: results on stdout, progress on stderr.
 
-Lines are wrapped on a terminal only. What another program reads from a pipe, or a test, does not depend on a width.
+Lines are wrapped only on a terminal, so that output in a pipe does not depend on a width.
 """
 
 import sys
@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import track as _track
 
 T = TypeVar("T")
-UNLIMITED = 10_000  # columns where the output is not a terminal
+UNLIMITED = 10_000  # columns, where the output is not a terminal
 
 
 def console() -> Console:
@@ -26,12 +26,12 @@ def progress_console() -> Console:
 
 
 def say(text: str, on: Console | None = None) -> None:
-    """Print one line as it is, without markup and without a line break inside."""
+    """Print one line unchanged: without markup and without wrapping."""
     (on or console()).print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def track(steps: Iterable[T], description: str, total: float | None = None) -> Iterable[T]:
-    """The steps, with a progress bar that disappears at the end."""
+    """Yield the steps and show a progress bar, which disappears at the end."""
     return _track(steps, description, total, console=progress_console(), transient=True)
 
 

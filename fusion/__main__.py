@@ -39,7 +39,9 @@ class Serve:
     arena: str | None = None
     """The arena's name, the first part of all Zenoh keys."""
     listen: tuple[str, ...] | None = None
-    """Zenoh endpoints to listen on, such as tcp/0.0.0.0:7447."""
+    """Zenoh endpoints to listen on, such as tcp/0.0.0.0:7447; the operating system chooses port 0."""
+    endpoints_file: Path | None = None
+    """A file to write once the server listens: the endpoints at which it is reached, one a line."""
     zenoh: Path | None = None
     """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
     rig: Path | None = None
@@ -55,15 +57,18 @@ class Serve:
         """Serve until Ctrl-C or SIGTERM."""
         from dataclasses import asdict
 
+        from camera_node.config import write_atomically
         from fusion.server.config import ArenaConfig, load_arena, override
         from fusion.server.server import Server
 
         settings = asdict(self)
-        path = settings.pop("config")
+        path, endpoints_file = settings.pop("config"), settings.pop("endpoints_file")
         config = override(load_arena(path) if path else ArenaConfig(), **settings)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with Server(config) as server:
+                if endpoints_file:
+                    write_atomically(endpoints_file, "".join(f"{e}\n" for e in server.endpoints))
                 server.run()
         except KeyboardInterrupt:
             pass

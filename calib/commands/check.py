@@ -14,8 +14,9 @@ from calib.commands.output import check_folder, provenance, save_maps, say, writ
 from calib.commands.recording import read_recording
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
+from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig, load_rig
-from calib.wand.bundle_adjustment.problem import LENS, POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.agreement import Agreement, Placed, compare
@@ -130,10 +131,12 @@ def placed(result: WandCalibration) -> Placed:
     adjusted = result.adjusted
     free, count = list(adjusted.problem.free), len(result.names)
     pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
-    by_prior = adjusted.by_prior().reshape(count, len(free), count, len(free))[:, pose][:, :, :, lens]
+    by_prior = camera_covariance(adjusted).by_prior.reshape(count, len(free), count, len(free))[:, pose][
+        :, :, :, lens
+    ]
     by_lens = by_prior.reshape(6 * count, 4 * count)
     rest = result.covariance - by_lens @ by_lens.T
-    sigma = adjusted.problem.doubt()[:, lens]
+    sigma = adjusted.problem.claimed_prior_sigma()[:, lens]
     lenses = {
         name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
         for k, name in enumerate(result.names)

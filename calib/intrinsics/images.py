@@ -12,7 +12,7 @@ import zenoh
 from camera_node.arrays import Grey
 from camera_node.errors import CameraError
 from camera_node.protocol.messages import Keys
-from camera_node.sources.grey import grey
+from camera_node.sources.grey import to_grey
 from camera_node.sources.replay import IMAGES, read_grey
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
@@ -73,7 +73,7 @@ def _read_video(path: Path) -> Iterator[Picture]:
         number = 0
         while video.grab():
             if number % stride == 0 and (image := video.retrieve()[1]) is not None:
-                yield f"frame {number}", grey(image)
+                yield f"frame {number}", to_grey(image)
             number += 1
     finally:
         video.release()

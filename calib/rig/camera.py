@@ -12,6 +12,13 @@ from camera_node.geometry.pose import Pose, invert, skew
 
 AnyLens = TypeVar("AnyLens", bound=Lens)
 
+# The parameters of one camera, by their columns in every Jacobian and covariance: rotation and translation in the
+# camera's own frame, time offset, clock drift, and log focal length, cx, cy, k1 of the lens.
+POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
+PER_CAMERA = 12
+# The shape of the lens is never adjusted, only tested: log fx / fy, and the three distortion coefficients after k1.
+SHAPE = (12, 13, 14, 15)
+
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A lens, its pose in the world (None until it is calibrated), and what its clock is off.

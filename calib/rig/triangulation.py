@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
-from calib.rig.camera import Camera, pixel_jacobians, transform
-from calib.wand.bundle_adjustment.problem import POSE
+from calib.rig.camera import POSE, Camera, pixel_jacobians, transform
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert

@@ -8,10 +8,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import written
+from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, WandObservations
+from calib.wand.bundle_adjustment.problem import State, WandObservations
 from calib.wand.quality.clock_jump import ClockJump, find_jump
 from calib.wand.quality.lengths import measure_lengths
 from calib.wand.quality.lens_change import find_changes
@@ -92,19 +94,19 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> WandCalibration:
     if told.distance is not None and told.scaled:
         adjusted = loosen(adjusted, told.distance)
         solution = replace(solution, adjusted=adjusted)
-    joint = adjusted.covariance(POSE)
-    offsets, offset_sigma = clock_values(adjusted, OFFSET, 1e3)
-    drift, drift_sigma = clock_values(adjusted, DRIFT, 1e6)
+    covariance = camera_covariance(adjusted)
+    joint = covariance.of(POSE)
+    offsets, offset_sigma = clock_values(adjusted.state, covariance, OFFSET, 1e3)
+    drift, drift_sigma = clock_values(adjusted.state, covariance, DRIFT, 1e6)
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
-    covariance = joint.reshape(6 * count, 6 * count)
-    placed = _place(rig, solution, told, joint, offsets)
+    placed = _place(rig, solution, told, covariance, offsets)
     return WandCalibration(
         placed,
         _report(solution, told, joint),
         told.names,
         adjusted,
         solution.observations,
-        covariance,
+        joint.reshape(6 * count, 6 * count),
         offsets,
         offset_sigma,
         drift,
@@ -113,16 +115,18 @@ def conclude(rig: Rig, solution: Solution, told: Told) -> WandCalibration:
     )
 
 
-def clock_values(adjusted: Adjusted, part: tuple[int, ...], unit: float) -> tuple[Array, Array]:
+def clock_values(
+    state: State, covariance: CameraCovariance, part: tuple[int, ...], unit: float
+) -> tuple[Array, Array]:
     """Values and standard deviations (C,) of a clock's parameter."""
-    values = adjusted.state.clocks[:, part[0] - OFFSET[0]]
-    sigma = np.sqrt(np.einsum("cpcp->c", adjusted.covariance(part)))
+    values = state.clocks[:, part[0] - OFFSET[0]]
+    sigma = np.sqrt(np.einsum("cpcp->c", covariance.of(part)))
     return values * unit, sigma * unit
 
 
-def _place(rig: Rig, solution: Solution, told: Told, joint: Array, offset_ms: Array) -> Rig:
+def _place(rig: Rig, solution: Solution, told: Told, covariance: CameraCovariance, offset_ms: Array) -> Rig:
     state, cameras = solution.adjusted.state, dict(rig.cameras)
-    lens_sigma = np.sqrt(np.einsum("cpcp->cp", solution.adjusted.covariance(LENS)))
+    joint, lens_sigma = covariance.of(POSE), np.sqrt(np.einsum("cpcp->cp", covariance.of(LENS)))
     for name in told.unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
     for k, name in enumerate(told.names):
@@ -137,7 +141,7 @@ def _place(rig: Rig, solution: Solution, told: Told, joint: Array, offset_ms: Ar
             T_world_cam=Pose.from_matrix(state.cameras[k]),
             time_offset_ms=float(offset_ms[k]),
             covariance=tuple(tuple(row) for row in joint[k, :, k].tolist()),
-            lens_sigma=written(lens, cameras[name].lens_sigma, lens_sigma[k]),
+            lens_sigma=parameter_sigma(lens, cameras[name].lens_sigma, lens_sigma[k]),
         )
     T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
     return move(msgspec.structs.replace(rig, cameras=cameras), T_world)
@@ -155,7 +159,7 @@ def _report(solution: Solution, told: Told, joint: Array) -> WandReport:
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_outliers(told.names, seen, adjusted),
         metric=told.metric or told.scaled,
-        widened=adjusted.dependence**0.5,
+        widened=adjusted.inflation**0.5,
         scaled_by=told.distance if told.scaled else None,
         compared=compare(told.distance, told.names, adjusted) if told.distance and not told.scaled else None,
     )

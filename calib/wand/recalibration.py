@@ -8,16 +8,17 @@ import msgspec
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import LENS, OFFSET, POSE
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.dependence import widen
-from calib.wand.bundle_adjustment.lens_prior import settle, written
-from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import LENS, OFFSET, POSE, WandObservations
+from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
+from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors, parameter_sigma
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
+from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.calibrate import check_recording, gather_wave, read
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.outcome import clock_values
 from calib.wand.quality.checks import check_agreement, check_lenses
-from calib.wand.solution import with_disc_centres
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert
@@ -81,12 +82,14 @@ def place_one(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -
     if found is None:
         raise CalibrationError("the wand's lengths do not fit what the cameras saw: is the wand file right?")
     problem, state, observations = found
-    problem = replace(problem.freeing(POSE, OFFSET), sought=(this,))
-    state = find_robustly(problem, observations, state)
-    observations = with_disc_centres(wave, problem, state, observations)
-    first = widen(adjust(problem.freeing(POSE, OFFSET, LENS), observations, state))
+    problem = replace(problem.with_free(POSE, OFFSET), estimated=(this,))
+    state = optimize_robustly(problem, observations, state)
+    observations = with_disc_centres(problem, state, observations, wand.diameter_m)
+    first = inflate_covariance(adjust(problem.with_free(POSE, OFFSET, LENS), observations, state))
     check_lenses(recording.names, first)
-    adjusted = widen(adjust(settle(first.problem, first), observations, first.state))
+    adjusted = inflate_covariance(
+        adjust(estimate_lens_priors(first.problem, first), observations, first.state)
+    )
     check_agreement(recording.names, adjusted, observations)
     return _conclude(rig, name, this, adjusted, observations)
 
@@ -117,16 +120,17 @@ def _start(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) -> tup
 
 def _conclude(rig: Rig, name: str, this: int, adjusted: Adjusted, seen: WandObservations) -> Recalibration:
     before, T = rig.cameras[name], adjusted.state.cameras[this]
-    cov = adjusted.covariance(POSE)[this, :, this]
-    offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted, OFFSET, 1e3))
-    lens_sigma = np.sqrt(np.diag(adjusted.covariance(LENS)[this, :, this]))
+    covariance = camera_covariance(adjusted)
+    cov = covariance.of(POSE)[this, :, this]
+    offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted.state, covariance, OFFSET, 1e3))
+    lens_sigma = np.sqrt(np.diag(covariance.of(LENS)[this, :, this]))
     lens = adjusted.state.lens(this, before)
     camera = msgspec.structs.replace(
         before.with_parameters(lens.parameters),
         T_world_cam=Pose.from_matrix(T),
         time_offset_ms=float(offset_ms),
         covariance=tuple(tuple(row) for row in cov.tolist()),
-        lens_sigma=written(lens, before.lens_sigma, lens_sigma),
+        lens_sigma=parameter_sigma(lens, before.lens_sigma, lens_sigma),
     )
     used = adjusted.used & (seen.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import POSE, unobserved
+from calib.wand.bundle_adjustment.problem import gauge_directions
 
 SIGMA_M = 0.005  # of a tape's reading from one lens to another: where in it the centre is, nobody sees
 CLEAR = 3.0  # sigmas, beyond which measures contradict each other
@@ -101,7 +103,7 @@ def compare(distance: Distance, names: Sequence[str], adjusted: Adjusted) -> Com
     gap = first[:3, 3] - second[:3, 3]
     long = float(np.linalg.norm(gap))
     along = np.concatenate([gap @ first[:3, :3], -gap @ second[:3, :3]]) / long
-    cov = adjusted.covariance(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
+    cov = camera_covariance(adjusted).of(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
     return Comparison(distance, long, float(np.sqrt(along @ cov @ along + distance.sigma_m**2)))
 
 
@@ -109,7 +111,7 @@ def loosen(adjusted: Adjusted, distance: Distance) -> Adjusted:
     """The adjustment with the distance that carried its scale taken as uncertain: S + s^2 g g' for its covariance S,
     the cameras' change g with the world's scale, the choice of the world apart, and its relative deviation s, at the
     noise that observations claim; of the information, a downdate of rank one (Sherman and Morrison)."""
-    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.dependence**0.5)
+    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.inflation**0.5)
     if relative == 0:
         return adjusted
     free = adjusted.problem.free
@@ -117,7 +119,7 @@ def loosen(adjusted: Adjusted, distance: Distance) -> Adjusted:
     grown[:, [free.index(p) for p in POSE[3:]]] = np.einsum(
         "cji,cj->ci", adjusted.state.cameras[:, :3, :3], adjusted.state.cameras[:, :3, 3]
     )
-    gauge = np.linalg.qr(unobserved(adjusted.state, free))[0]
+    gauge = np.linalg.qr(gauge_directions(adjusted.state, free))[0]
     change = grown.ravel() - gauge @ (gauge.T @ grown.ravel())
     pulled = adjusted.information @ change
     pulled -= gauge @ (gauge.T @ pulled)

@@ -6,24 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.wand.bundle_adjustment.dependence import widen
-from calib.wand.bundle_adjustment.disc_centres import centre_offsets
-from calib.wand.bundle_adjustment.lens_prior import settle
-from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import (
-    CRYSTAL,
-    DRIFT,
-    LENS,
-    OFFSET,
-    POSE,
-    SLEWED,
-    Problem,
-    State,
-    WandObservations,
-)
-from calib.wand.bundle_adjustment.trajectory import acceleration_density
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
+from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
+from calib.wand.bundle_adjustment.problem import CRYSTAL_DRIFT, SLEWED_DRIFT, Problem, State, WandObservations
 from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
+from calib.wand.trajectory import acceleration_density
 from calib.wand.wave import Wave
 from camera_node.arrays import Array
 
@@ -61,15 +51,15 @@ def solve(
         cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
     problem, state, observations = _around(wave, cameras, offset_s, FEW, known)
     clocks = (OFFSET, DRIFT) if np.ptp(problem.knot_s) > DRIFT_S else (OFFSET,)
-    problem = problem.freeing(POSE, *clocks)
-    state = find_robustly(problem, observations, state)
+    problem = problem.with_free(POSE, *clocks)
+    state = optimize_robustly(problem, observations, state)
     # Of rough places, noise looks like acceleration: a weak prior takes it up, and what is left seems too precise.
     density = acceleration_density(problem.knot_s, state.motion[:, 0], wave.gap_s)
-    problem = replace(problem.freeing(problem.free, LENS), density=density)
-    centred = with_disc_centres(wave, problem, state, observations)
+    problem = replace(problem.with_free(problem.free, LENS), density=density)
+    centred = with_disc_centres(problem, state, observations, wave.wand.diameter_m)
     few = adjust(problem, centred, state)
     check_lenses(wave.names, few)
-    judged = widen(few)
+    judged = inflate_covariance(few)
     told = [part for part in clocks if _tells(judged, part)]
     free = (LENS, *(clocks if OFFSET in told else told))
     offset_s = few.state.clocks[:, 0] if OFFSET in told else np.zeros(len(cameras))
@@ -81,16 +71,16 @@ def solve(
     start = replace(start, clocks=np.column_stack([offset_s, drift]), lenses=few.state.lenses)
     density = acceleration_density(few.problem.knot_s, few.state.motion[:, 0], wave.gap_s)
     # A clock that runs on its own drifts, though a short wave may not show it.
-    drift_sigma = SLEWED if DRIFT in told else CRYSTAL
-    problem = replace(problem.freeing(POSE, *free), density=density, drift_sigma=drift_sigma)
-    observations = with_disc_centres(wave, problem, start, observations)
-    first = replace(adjust(problem, observations, start, rounds=1), dependence=judged.dependence)
-    adjusted = adjust(settle(problem, first), observations, first.state)
+    drift_sigma = SLEWED_DRIFT if DRIFT in told else CRYSTAL_DRIFT
+    problem = replace(problem.with_free(POSE, *free), density=density, drift_sigma=drift_sigma)
+    observations = with_disc_centres(problem, start, observations, wave.wand.diameter_m)
+    first = replace(adjust(problem, observations, start, rounds=1), inflation=judged.inflation)
+    adjusted = adjust(estimate_lens_priors(problem, first), observations, first.state)
     check_agreement(wave.names, adjusted, observations)
     if metric:
         check_sizes(wave.wand, adjusted, observations)
         check_spacing(wave.wand, adjusted, observations)
-    return Solution(widen(adjusted), observations)
+    return Solution(inflate_covariance(adjusted), observations)
 
 
 def _around(
@@ -114,20 +104,11 @@ def _farthest(cameras: Array) -> tuple[int, int, float]:
     return int(a), int(b), float(gaps[a, b])
 
 
-def with_disc_centres(wave: Wave, problem: Problem, state: State, seen: WandObservations) -> WandObservations:
-    """The observations with discs' own centres in place of their ellipses'."""
-    points = Linearisation(problem, seen).positions(state)
-    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
-    return replace(
-        seen, uv=seen.uv - centre_offsets(lenses, state.cameras, seen, points, wave.wand.diameter_m / 2)
-    )
-
-
 def _tells(few: Adjusted, part: tuple[int, ...]) -> bool:
     """Whether the data want clocks apart: by more than Schwarz's criterion (BIC) asks of as many parameters, with the
-    covariance, and the number of observations that count as news, that neighbouring errors leave (`dependence`)."""
+    covariance, and the number of observations that count as news, that neighbouring errors leave (`inflation`)."""
     values = few.state.clocks[:, part[0] - OFFSET[0]]
     values = values - values.mean()
-    cov = few.covariance(part)[:, 0, :, 0]
+    cov = camera_covariance(few).of(part)[:, 0, :, 0]
     squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
-    return bool(squared > (len(values) - 1) * np.log(2 * few.used.sum() / few.dependence))
+    return bool(squared > (len(values) - 1) * np.log(2 * few.used.sum() / few.inflation))

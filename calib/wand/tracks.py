@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.wand.bundle_adjustment.trajectory import hermite
 from calib.wand.detections import FrameTable, WandDetections
+from calib.wand.trajectory import hermite
 from camera_node.arrays import Array, Index
 
 FOLLOW_PX = 8.0  # how far a marker may be from between its neighbours, at least

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.wand.bundle_adjustment.trajectory import finite_velocities, hermite
 from calib.wand.detections import FrameTable, WandDetections
 from calib.wand.initialization.initial_rig import InitialRig, find_start
 from calib.wand.initialization.two_view import INTERPOLATED, SLOWEST_S, TwoViewGeometry, sampson
+from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens

@@ -9,10 +9,10 @@ import numpy as np
 from calib.wand.bundle_adjustment.frame_sets import choose_instants, group_instants
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
-from calib.wand.bundle_adjustment.trajectory import AffineWand, acceleration_density, finite_velocities
 from calib.wand.detections import WandDetections
 from calib.wand.initialization.initial_rig import triangulate
 from calib.wand.tracks import MarkerTrack
+from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m camera_node detect`: what the detector sees in image files."""
+"""`python -m camera_node detect`: detects roundels in image files."""
 
 import json
 from dataclasses import dataclass
@@ -24,40 +24,42 @@ from camera_node.terminal import console, say
 
 @dataclass(frozen=True, kw_only=True)
 class Detect:
-    """Find the roundels in image files."""
+    """Detect the roundels in image files."""
 
     images: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """PNG or JPEG files."""
     json: bool = False
-    """Print one JSON object an image instead of a table."""
+    """Print one JSON object for each image instead of a table."""
     draw: Path | None = None
-    """Write the image with its roundels drawn on it to this file; takes a single image."""
+    """Draw the roundels on the image and write it to this file; for a single image."""
     detector: Literal["chords", "paper"] = "chords"
-    """Which search."""
+    """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
     inner_ratio: tuple[float, ...] = (0.6, 0.41)
     """Inner over outer diameter of the prints in use."""
     rig: Path | None = None
-    """A rig.yaml with the camera's lens: adds both poses of each roundel. Needs --name and --diameter."""
+    """A rig.yaml with the camera's lens: adds both poses of each roundel. Requires --name and --diameter."""
     name: str | None = None
     """The camera in the rig."""
     diameter: float | None = None
     """Outer diameter of the black disc, metres."""
 
     def run(self) -> int:
-        """Print what is seen; the exit code.
+        """Print the roundels of all images and return the exit code.
 
         Raises:
-            ConfigError: options that don't fit together, or a rig that can't be used.
-            CameraError: a file that is missing or no image.
+            ConfigError: options contradict each other, or the rig is invalid.
+            CameraError: a file is missing or no image.
         """
         lens = self._lens()
         if not self.images:
             raise ConfigError("no image given; name one or more PNG or JPEG files")
         if self.draw and len(self.images) > 1:
-            raise ConfigError(f"--draw takes one image, got {len(self.images)}; call once an image")
+            raise ConfigError(
+                f"--draw takes one image, got {len(self.images)}; run the command once for each image"
+            )
         for path in self.images:
             image = read_grey(path)
-            # Images of a command line are no sequence: each one meets a detector without memories.
+            # The images are not a sequence, so each one gets a detector without tracks.
             detector = Detector(detector=self.detector, inner_ratios=self.inner_ratio)
             roundels = detector.detect(image)
             rows = [_describe(roundel) for roundel in roundels]
@@ -70,7 +72,7 @@ class Detect:
     def _lens(self) -> Lens | None:
         given = [self.rig is not None, self.name is not None, self.diameter is not None]
         if any(given) and not all(given):
-            raise ConfigError("--rig, --name and --diameter go together; give all three or none")
+            raise ConfigError("--rig, --name and --diameter must be given together; give all three or none")
         if self.rig is None or self.name is None or self.diameter is None:
             return None
         if not 0.001 <= self.diameter <= 10:
@@ -93,7 +95,7 @@ class Detect:
         except cv2.error:
             written = False
         if not written:
-            raise ConfigError(f"{self.draw} can't be written; name a .png or .jpg in a folder that is there")
+            raise ConfigError(f"{self.draw} can't be written; give a .png or .jpg in an existing folder")
 
 
 def _describe(roundel: Roundel) -> dict[str, Any]:
@@ -113,7 +115,7 @@ def _describe(roundel: Roundel) -> dict[str, Any]:
 
 
 def _add_poses(rows: list, roundels: Roundels, lens: Lens, diameter_m: float) -> None:
-    """Adds `centre_u`, `centre_v` (of the likelier pose) and `poses`; nulls where the lens has no inverse."""
+    """Add `centre_u`, `centre_v` (of the likelier pose) and `poses`: None and empty where the lens has no inverse."""
     located = locate_all(roundels, lens, diameter_m)
     for row, both in zip(rows, located, strict=True):
         poses = both or ()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Roundels to print: an SVG in millimetres, to be printed at 100 %."""
+"""`python -m camera_node print`: draws a sheet of roundels as an SVG in millimetres, to be printed at 100 %."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,12 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 
 PAPER_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 8.0  # what most printers can't reach, and room for the scale
+MARGIN_MM = 8.0  # unprintable margin of most printers; the scale is drawn in it
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Write a sheet of roundels to print, with the scale to check the print by."""
+    """Write a sheet of roundels to print, with a scale to check the print."""
 
     out: Annotated[Path, tyro.conf.Positional]
     """The SVG file to write."""
@@ -26,32 +26,32 @@ class Sheet:
     inner_ratio: float = 0.6
     """Inner over outer diameter, d_i / d_o."""
     surround_ratio: float = 9 / 7
-    """White card over outer diameter, d / d_o; wider where the floor is dark and the view far."""
+    """White card over outer diameter, d / d_o; increase it for dark floors and distant cameras."""
     paper: str = "a4"
     """a4, a3 or letter."""
 
     def run(self) -> int:
-        """Write the sheet and say how many roundels it holds."""
+        """Write the sheet and print the number of roundels on it."""
         svg, count = draw(self)
         write_atomically(self.out, svg)
         roundels = "1 roundel" if count == 1 else f"{count} roundels"
         size = f"d_o = {self.diameter * 1e3:g} mm"
-        print(f"{self.out}: {roundels} of {size}; print at 100 %, then measure one")
+        print(f"{self.out}: {roundels} of {size}; print at 100 %, then measure one of them")
         return 0
 
 
 def draw(sheet: Sheet) -> tuple[str, int]:
-    """The SVG text and the number of roundels on it, as many as fit.
+    """Draw as many roundels as fit on the paper; return the SVG text and their number.
 
     Raises:
-        ConfigError: an impossible size, an unknown paper, or a roundel that is larger than the paper.
+        ConfigError: a size is invalid, the paper is unknown, or a roundel is larger than the paper.
     """
     try:
         body = Body(
             diameter_m=sheet.diameter, inner_ratio=sheet.inner_ratio, surround_ratio=sheet.surround_ratio
         )
     except ValueError as error:
-        raise ConfigError(f"no sheet: {error}") from None
+        raise ConfigError(f"invalid sheet: {error}") from None
     if sheet.paper not in PAPER_MM:
         raise ConfigError(f"--paper {sheet.paper} is not known; choose one of {', '.join(PAPER_MM)}")
     width, height = PAPER_MM[sheet.paper]

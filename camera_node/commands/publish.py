@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m camera_node`: publishes what one camera sees."""
+"""`python -m camera_node`: publishes the detections of one camera."""
 
 import contextlib
 import signal
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from camera_node.commands.source_selection import open_source
 from camera_node.config import is_name
 from camera_node.errors import ConfigError
-from camera_node.sources.frame import SourceSettings
-from camera_node.sources.replay import PacedSource
+from camera_node.simulation.camera import SimulatedCamera
+from camera_node.sources.frame import Source, SourceSettings
+from camera_node.sources.replay import FrameFolder, PacedSource, VideoFile
+from camera_node.sources.v4l2 import V4l2Source, find_device
 
 
 @dataclass(frozen=True)
 class Publish:
-    """Publish what a camera sees: every roundel of every frame, over Zenoh, until stopped.
+    """Publish every roundel of every frame of one camera over Zenoh, until stopped.
 
-    To look at single images instead: python -m camera_node detect IMAGE...
+    To detect in single images: python -m camera_node detect IMAGE...
     To print roundels: python -m camera_node print roundels.svg
     """
 
@@ -33,36 +35,65 @@ class Publish:
     arena: str = "arena"
     """The arena's name, the first part of all Zenoh keys."""
     zenoh: Path | None = None
-    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+    """A Zenoh configuration file (JSON5) for TLS, access control or scouting."""
     detector: Literal["chords", "paper"] = "chords"
-    """Which search; paper is that of Faigl et al., ICRA 2013, the reference."""
+    """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
     inner_ratios: tuple[float, ...] = (0.6, 0.41)
     """Inner over outer diameters of the roundels in use."""
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> None:
-        """Open everything, publish until the source ends or a signal comes, and close everything."""
+        """Open the source and the session, publish until the source ends or a signal arrives, and close both."""
         import cv2
 
+        from camera_node.detection.detector import Detector
         from camera_node.node.node import Node
         from camera_node.protocol.session import open_client
 
         _check_name("name", self.name)
         _check_name("arena", self.arena)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        cv2.setNumThreads(1)  # a camera is one process of several on its machine
+        cv2.setNumThreads(1)  # a machine runs one process for each of its cameras
         with contextlib.ExitStack() as stack:
             source = open_source(self.source, self.settings, self.name)
             stack.callback(source.close)
             session = stack.enter_context(open_client(self.connect, self.zenoh))
-            keep_stamps = isinstance(source, PacedSource) and self.settings.stamps == "recorded"
-            detector = {"detector": self.detector, "inner_ratios": self.inner_ratios}
+            detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
+            keep_stamps = source.is_recording and self.settings.stamps == "recorded"
+            node = Node(self.name, source, detector, session, self.arena, keep_stamps)
             with contextlib.suppress(KeyboardInterrupt):
-                Node(self.name, source, session, self.arena, detector, keep_stamps).run()
+                node.run()
+
+
+def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Source:
+    """Open the source that `--source` names: `sim`, a folder, a video file, or a camera by number, path or name.
+
+    Args:
+        text: the value of `--source`.
+        settings: each kind of source uses those that apply to it.
+        name: the camera's name in a simulated arena.
+
+    Raises:
+        CameraError: the source does not exist or does not open.
+        ConfigError: a setting is invalid, or a simulation has no scene.
+    """
+    settings.check()
+    if text == "sim":
+        return _open_simulation(settings, name)
+    if Path(text).is_dir():
+        return PacedSource(FrameFolder(Path(text)), settings)
+    if Path(text).is_file():
+        return PacedSource(VideoFile(Path(text), settings.fps), settings)
+    return V4l2Source(find_device(text), settings)
+
+
+def _open_simulation(settings: SourceSettings, name: str) -> Source:
+    if settings.scene is None:
+        raise ConfigError("--source sim needs an arena: add --scene FILE, such as configs/demo/scene.yaml")
+    epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
+    return SimulatedCamera(settings.scene, name, epoch_ns)
 
 
 def _check_name(option: str, name: str) -> None:
     if not is_name(name):
-        raise ConfigError(
-            f"--{option} '{name}' can't be a part of a Zenoh key: leave out / * $ # ? and spaces"
-        )
+        raise ConfigError(f"--{option} '{name}' is not valid in a Zenoh key; remove / * $ # ? and spaces")

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.errors import ConfigError
-from camera_node.sources.grey import grey
 
 
 @dataclass(frozen=True)
@@ -115,20 +114,18 @@ class Detector:
         other._core.take_over(self._core)
         return other
 
-    def detect(self, image: NDArray[np.uint8] | NDArray[np.uint16]) -> DetectedRoundels:
+    def detect(self, image: Grey) -> DetectedRoundels:
         """Detect all roundels in a grey image.
 
         Args:
-            image: (h, w), uint8, or uint16 with 10 to 16 bits, which is converted to 8 bits.
+            image: (h, w), uint8; its rows need not be contiguous in memory.
 
         Raises:
-            ValueError: the array is not a grey image.
+            ValueError: the array is not such an image; `camera_node.sources.grey.to_grey` converts other formats.
         """
-        if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
-            raise ValueError(
-                f"a grey image (h, w) of uint8 or uint16 is needed, got {image.dtype} {image.shape}"
-            )
-        columns = self._core.detect(grey(image))
+        if image.dtype != np.uint8 or image.ndim != 2:
+            raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
+        columns = self._core.detect(image if image.strides[1] == 1 else np.ascontiguousarray(image))
         roundels = DetectedRoundels(
             cov=columns["pose_cov"][:, :2, :2],
             id=np.full(len(columns["track"]), -1, np.int32),

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where roundels stand before one camera: an ellipse and a known diameter leave two poses."""
+"""Computes the two poses of a disc that explain its ellipse in one view and its known diameter.
+
+See docs/detector_model.md, section 9.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,10 +15,9 @@ from camera_node.detection.disc_adjustment import adjust, covariance_through, sh
 from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
 from camera_node.geometry.lens import Lens
 
-BOUNDARY = 24  # points of an ellipse that are taken through the lens
-SCATTER = (
-    1.5  # squared errors of small roundels' offsets over their covariance, which is to first order (measured)
-)
+BOUNDARY = 24  # points of an ellipse that are undistorted
+# Mean squared error of small roundels' offsets relative to their covariance, which is of first order (measured).
+SCATTER = 1.5
 AROUND = np.linspace(0, 2 * np.pi, BOUNDARY, endpoint=False)
 
 
@@ -26,8 +28,8 @@ class DiscPose:
     Attributes:
         position_m: (3,) the disc's centre, camera frame.
         normal: (3,) unit vector out of the printed side, towards the camera.
-        centre_uv: (2,) raw pixels where the disc's centre projects.
-        probability: that this is the pose rather than the other one.
+        centre_uv: (2,) image of the disc's centre, raw pixels.
+        probability: probability of this pose compared with the other one.
     """
 
     position_m: Array
@@ -38,7 +40,7 @@ class DiscPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscPoses:
-    """Both poses of N discs, the likelier first; rows are NaN where the lens has no inverse at an ellipse.
+    """Both poses of N discs, the likelier first; rows are NaN where the lens has no inverse at the ellipse.
 
     Shapes: position_m and normal (N, 2, 3), centre_uv (N, 2, 2), probability (N, 2); as in `DiscPose`.
     """
@@ -55,7 +57,7 @@ class DiscPoses:
         return (self[k] for k in range(len(self)))
 
     def __getitem__(self, k: int) -> tuple[DiscPose, DiscPose] | None:
-        """Both poses of one disc; None where there are none."""
+        """Both poses of one disc; None where the row is NaN."""
         if not np.isfinite(self.position_m[k]).all():
             return None
         columns = (self.position_m[k], self.normal[k], self.centre_uv[k], self.probability[k])
@@ -98,24 +100,24 @@ def locate_all(roundels: Roundels, lens: Lens, diameter_m: float) -> DiscPoses:
 
 
 def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
-    """Distance of a disc's centre from the camera, metres, by the ellipse's principal axis; NaN without an inverse.
+    """Distance of a disc's centre from the camera, metres, by the ellipse's major axis; NaN without an inverse.
 
-    Section III-C of Faigl et al. (ICRA 2013): of all diameters of a slanted disc, one stands across the line of sight
-    and is seen as the ellipse's major axis, L = d_o / major. Here the axis is measured in the image plane of a camera
-    of focal length one that looks at the ellipse, so that neither the lens nor the place in the image matters.
+    Section III-C of Faigl et al. (ICRA 2013): one diameter of a slanted disc is perpendicular to the line of sight and
+    appears as the ellipse's major axis, so that L = d_o / major. Here the axis is measured in the image plane of a
+    camera of focal length one that points at the ellipse, so that lens and position in the image have no effect.
 
-    Perspective leaves a systematic error. The dual conic of a circle of radius r around (0, 0, L) that is slanted by
-    theta, c c^T - r^2 (I - n n^T), has major / 2 = r / sqrt(L^2 - r^2 sin^2 theta) and gives the correction
+    Perspective causes a systematic error. The dual conic of a circle of radius r around (0, 0, L) that is slanted by
+    theta, c c^T - r^2 (I - n n^T), has major / 2 = r / sqrt(L^2 - r^2 sin^2 theta), which gives the corrected distance
     L-hat = sqrt((d_o / major)^2 + (d_o / 2)^2 sin^2 theta), sin^2 theta = 1 - (minor / major)^2. The correction is
-    derived here from the geometry; the paper's text was not at hand to compare it with. What remains is of the order of
+    derived from the geometry, as the paper's own correction was not available. The remaining error is of the order of
     (d_o / L)^4.
     """
     ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
     rays = lens.rays(np.vstack([ellipse[:, :2], _boundaries(ellipse)[0]]))
     if not np.isfinite(rays).all():
         return float("nan")
-    seen = rays[1:] @ _look_along(rays[0]).T
-    minor, major = _axes(_fit_conics(seen[None, :, :2] / seen[None, :, 2:])[0])
+    turned = rays[1:] @ _rotation_to_axis(rays[0]).T
+    minor, major = _axes(_fit_conics(turned[None, :, :2] / turned[None, :, 2:])[0])
     sin2 = 1 - (minor / major) ** 2
     uncorrected = _core.distance_by_principal_axis(diameter_m, major)
     return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
@@ -155,7 +157,7 @@ def _adjust(
 
 
 def _boundaries(ellipses: Array) -> Array:
-    """(N, BOUNDARY, 2) raw pixels around ellipses (N, 5)."""
+    """(N, BOUNDARY, 2) points of ellipses (N, 5), raw pixels."""
     c, s = np.cos(ellipses[:, 4]), np.sin(ellipses[:, 4])
     along = ellipses[:, 2, None] / 2 * np.cos(AROUND)
     across = ellipses[:, 3, None] / 2 * np.sin(AROUND)
@@ -165,7 +167,7 @@ def _boundaries(ellipses: Array) -> Array:
 
 
 def _fit_conics(xy: Array) -> Array:
-    """Symmetric Q (N, 3, 3) with p^T Q p = 0 for points p = (x, y, 1) of N ellipses (N, M, 2), signature (+, +, -)."""
+    """Fit conics Q (N, 3, 3), p^T Q p = 0 with signature (+, +, -), to points p = (x, y, 1) of N ellipses (N, M, 2)."""
     mean, scale = xy.mean(axis=1), xy.std(axis=(1, 2))
     x, y = np.moveaxis((xy - mean[:, None]) / scale[:, None, None], 2, 0)
     rows = np.stack([x * x, x * y, y * y, x, y], axis=-1)
@@ -178,13 +180,13 @@ def _fit_conics(xy: Array) -> Array:
 
 
 def decompose(Q: Array, radius: float) -> tuple[Array, Array]:
-    """Positions and normals (N, 2, 3) of the circles of `radius` whose images are the conics Q (N, 3, 3).
+    """Compute positions and normals (N, 2, 3) of the circles of `radius` whose images are the conics Q (N, 3, 3).
 
     The dual conic of a circle's image is Q^-1 = mu (c c^T - r^2 (I - n n^T)), c its centre.
     """
     n, dual = _normals(Q), np.linalg.inv(Q)[:, None]
     towards = (dual @ n[..., None])[..., 0]  # mu (c . n) c
-    t = _at_right_angles(n, towards)
+    t = _perpendicular(n, towards)
     mu = -np.einsum("nki,nkij,nkj->nk", t, dual, t) / radius**2
     c = towards / (mu * np.sqrt((n * towards).sum(-1) / mu))[..., None]
     c *= np.where(c[..., 2:] > 0, 1.0, -1.0)
@@ -192,7 +194,7 @@ def decompose(Q: Array, radius: float) -> tuple[Array, Array]:
 
 
 def _normals(Q: Array) -> Array:
-    """(N, 2, 3) unit normals of the planes that cut the cones p^T Q p = 0 in circles, one a solution."""
+    """(N, 2, 3) unit normals of the planes that intersect the cones p^T Q p = 0 in circles, one for each solution."""
     values, v = np.linalg.eigh(Q)
     l3, l2, l1 = values.T[..., None]
     along = np.sqrt(np.maximum(l1 - l2, 0.0) / (l1 - l3)) * v[:, :, 2]
@@ -200,28 +202,28 @@ def _normals(Q: Array) -> Array:
     return np.stack([along + up, along - up], axis=1)
 
 
-def _at_right_angles(n: Array, towards: Array) -> Array:
-    """(N, 2, 3) unit vectors at right angles to the normals n and to `towards`; any to n where these are one."""
+def _perpendicular(n: Array, towards: Array) -> Array:
+    """(N, 2, 3) unit vectors perpendicular to the normals n and to `towards`, or to n alone where both are parallel."""
     t = np.cross(n, towards / np.linalg.norm(towards, axis=-1, keepdims=True))
     t = np.where(np.linalg.norm(t, axis=-1, keepdims=True) < 1e-9, np.cross(n, [1.0, 0.0, 0.0]), t)
     return t / np.linalg.norm(t, axis=-1, keepdims=True)
 
 
 def _odds(chi2: Array) -> Array:
-    """Probabilities (N, 2) of two poses by their chi-square."""
+    """Probabilities (N, 2) of two poses from their chi-square."""
     weight = np.exp(-(chi2 - chi2.min(axis=1, keepdims=True)) / 2 / SCATTER)
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def _look_along(ray: Array) -> Array:
-    """A rotation (3, 3) that turns a unit ray (3,) into the optical axis."""
+def _rotation_to_axis(ray: Array) -> Array:
+    """(3, 3) rotation that maps a unit ray (3,) to the optical axis."""
     x = np.cross([0.0, 1.0, 0.0], ray)
     x /= np.linalg.norm(x)
     return np.array([x, np.cross(ray, x), ray])
 
 
 def _axes(Q: Array) -> Array:
-    """(2,) full minor and major axis of a conic (3, 3)."""
+    """(2,) full minor and major axis of an ellipse with the conic (3, 3)."""
     centre = np.linalg.solve(Q[:2, :2], -Q[:2, 2])
     level = -(Q[2, 2] + Q[2, :2] @ centre)
     return 2 * np.sqrt(level / np.linalg.eigvalsh(Q[:2, :2])[::-1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Detections drawn on their image."""
+"""Draws detected roundels on their image."""
 
 import cv2
 import numpy as np
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from camera_node.detection.roundels import Roundel, Roundels
 
 GREEN, RED = (60, 200, 60), (40, 40, 230)
-SHIFT = 4  # OpenCV draws in 1/16 pixels
+SHIFT = 4  # fractional bits of OpenCV's coordinates: 1/16 pixel
 
 
 def draw_roundels(image: NDArray[np.uint8], roundels: Roundels) -> NDArray[np.uint8]:
-    """A colour copy (h, w, 3), BGR, of a grey image (h, w), with each outer ellipse, its centre and its number."""
+    """Copy a grey image (h, w) to BGR (h, w, 3) and draw the outer ellipse, centre and number of each roundel."""
     canvas = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for k, roundel in enumerate(roundels):
         _draw(canvas, roundel, str(k if roundel.id is None else roundel.id))

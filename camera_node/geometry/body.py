@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rigid things that carry printed roundels: a wand, a robot."""
+"""Rigid bodies with printed roundels: wands and robots."""
 
 import math
 
@@ -12,13 +12,13 @@ Vector = tuple[float, float, float]
 
 
 class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Roundels of one size at known places, printed side +z.
+    """Roundels of one size at known positions of a rigid body, with their printed side towards +z.
 
     Attributes:
         diameter_m: outer diameter d_o of the black disc, metres.
-        markers: centres in the body's frame, metres.
-        inner_ratio: d_i / d_o, of the white disc inside; 0.6 in the paper.
-        surround_ratio: d / d_o, of the white card around; 9/7 in the paper.
+        markers: centres of the roundels, body frame, metres.
+        inner_ratio: d_i / d_o, diameter of the white inner disc over d_o; 0.6 in the paper.
+        surround_ratio: d / d_o, diameter of the white card over d_o; 9/7 in the paper.
     """
 
     diameter_m: float

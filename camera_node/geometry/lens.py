@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The lens: the only code that knows distortion. Pixel (0, 0) is the centre of the top-left pixel."""
+"""Camera intrinsics with lens distortion. Pixel (0, 0) is the centre of the top-left pixel."""
 
 from pathlib import Path
 from typing import Literal, Self
@@ -14,14 +14,14 @@ from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 
-MAX_FISHEYE_DEG = 89.0  # from the axis: beyond, x/z and y/z run away
+MAX_FISHEYE_DEG = 89.0  # from the axis; x/z and y/z diverge at 90 degrees
 
 
 class Lens(msgspec.Struct, frozen=True, kw_only=True):
-    """Intrinsics of a camera, in OpenCV's models and order.
+    """Intrinsics of a camera in OpenCV's models and order of parameters.
 
-    `distortion` holds k1, k2, p1, p2, k3, ... of OpenCV's pinhole model (0, 4, 5, 8, 12 or 14 numbers), or the four of
-    `cv2.fisheye`. `fx fy cx cy` are pixels.
+    `distortion` contains k1, k2, p1, p2, k3, ... of OpenCV's pinhole model (0, 4, 5, 8, 12 or 14 numbers) or k1 to k4
+    of `cv2.fisheye`. `fx`, `fy`, `cx` and `cy` are in pixels.
     """
 
     width: int
@@ -35,7 +35,9 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if not (0 < self.width <= 32768 and 0 < self.height <= 32768):
-            raise ValueError(f"an image of {self.width} x {self.height} pixels is not possible")
+            raise ValueError(
+                f"an image of {self.width} x {self.height} px is not possible; give 1 to 32768 px a side"
+            )
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError("the focal lengths fx and fy must be above 0 pixels")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
@@ -73,29 +75,29 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         return np.array(self.distortion or (0.0,) * 4)
 
     def project(self, points: ArrayLike) -> Array:
-        """Raw pixels (N, 2) of points (N, 3) in the camera frame, metres; NaN for points not before the camera."""
+        """Project points (N, 3), camera frame, to raw pixels (N, 2); NaN for points not in front of the camera."""
         points = np.asarray(points, float).reshape(-1, 3)
-        before = points[:, 2] > 1e-9
+        front = points[:, 2] > 1e-9
         uv = np.full((len(points), 2), np.nan)
-        if before.any():
-            uv[before] = self._project(points[before])[0]
+        if front.any():
+            uv[front] = self._project(points[front])[0]
         return uv
 
     def project_with_jacobian(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Raw pixels (N, 2), and their derivative (N, 2, 3) by the points (N, 3) of the camera frame.
+        """Project points (N, 3), camera frame, to raw pixels (N, 2), with the derivatives (N, 2, 3) by the points.
 
-        Points not before the camera have NaN in both.
+        Both are NaN for points that are not in front of the camera.
         """
         return self.project_with_jacobians(points)[:2]
 
     def project_with_jacobians(self, points: ArrayLike) -> tuple[Array, Array, Array]:
-        """As `project_with_jacobian`, and the derivative (N, 2, 4 + D) by the lens's own `parameters`."""
+        """As `project_with_jacobian`, with the derivatives (N, 2, 4 + D) by the lens's `parameters` in addition."""
         points = np.asarray(points, float).reshape(-1, 3)
-        before = points[:, 2] > 1e-9
+        front = points[:, 2] > 1e-9
         shapes = ((2,), (2, 3), (2, 4 + len(self.distortion)))
         uv, J_point, J_lens = (np.full((len(points), *shape), np.nan) for shape in shapes)
-        if before.any():
-            uv[before], J_point[before], J_lens[before] = self._project(points[before])
+        if front.any():
+            uv[front], J_point[front], J_lens[front] = self._project(points[front])
         return uv, J_point, J_lens
 
     def _project(self, points: Array) -> tuple[Array, Array, Array]:
@@ -107,13 +109,13 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
             uv, jacobian = cv2.projectPoints(points, zero, zero, self.K, self._coefficients)[:2]
             translation, lens = slice(3, 6), slice(6, 6 + free)
         jacobian = np.asarray(jacobian, float).reshape(len(points), 2, -1)
-        # At zero rotation, moving the frame and moving the point are the same.
+        # Without rotation, the derivatives by translation and by the point are equal.
         return uv.reshape(-1, 2).astype(float), jacobian[:, :, translation], jacobian[:, :, lens]
 
     def normalise(self, uv: ArrayLike) -> Array:
-        """Undistorted image plane coordinates x/z, y/z (N, 2) of raw pixels (N, 2).
+        """Undistort raw pixels (N, 2) to normalised image coordinates x/z, y/z (N, 2).
 
-        NaN where the distortion has no inverse (far outside the image), or the ray is not before the camera.
+        NaN where the distortion has no inverse (far outside the image) or the ray does not point forward.
         """
         uv = np.asarray(uv, float).reshape(-1, 2)
         if len(uv) == 0:
@@ -129,9 +131,9 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         return xy
 
     def _normalise_fisheye(self, uv: Array) -> Array:
-        """Newton's method on theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8) (Kannala and Brandt 2006).
+        """Solve theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8) by Newton's method (Kannala and Brandt 2006).
 
-        `cv2.fisheye.undistortPoints` gives up where theta_d is above 90 degrees, though theta is not.
+        `cv2.fisheye.undistortPoints` fails where theta_d is above 90 degrees, although theta is not.
         """
         distorted = (uv - [self.cx, self.cy]) / [self.fx, self.fy]
         theta_d = np.linalg.norm(distorted, axis=1)
@@ -157,10 +159,10 @@ class _Lenses(msgspec.Struct):
 
 
 def load_lens(path: Path, name: str) -> Lens:
-    """The lens of camera `name` in a rig file; whatever else the file says is left to `calib`.
+    """Read the lens of camera `name` from a rig file; `calib` reads the other fields of the file.
 
     Raises:
-        ConfigError: the file is missing or broken, or holds no such camera.
+        ConfigError: the file is missing or invalid, or has no such camera.
     """
     cameras = load_yaml(path, _Lenses).cameras
     if name not in cameras:

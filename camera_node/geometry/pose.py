@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses as people write them (`position_m`, `wxyz`) and as mathematics uses them (a 4x4 matrix).
+"""Poses as in YAML files (`position_m`, `wxyz`) and as 4x4 matrices, and conversions between forms of rotations.
 
 `p_world = T_world_cam @ p_cam`: adjacent names cancel.
 """
 
 import math
 
-import cv2
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +14,7 @@ from camera_node.arrays import Array
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A rigid motion as it stands in a YAML file: metres, and a quaternion w, x, y, z of any length but zero."""
+    """A pose as in a YAML file: position in metres, and a quaternion w, x, y, z of any length except zero."""
 
     position_m: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -49,20 +48,41 @@ def rotation_from_wxyz(wxyz: ArrayLike) -> Array:
 
 
 def wxyz_from_rotation(R: ArrayLike) -> Array:
-    """(4,) unit quaternion w >= 0, x, y, z of a (3, 3) rotation (Shepperd's largest component first)."""
+    """(..., 4) unit quaternions w >= 0, x, y, z of rotations (..., 3, 3).
+
+    Divides by the largest component (Shepperd 1978).
+    """
     R = np.asarray(R, float)
-    squares = 1 + np.array([np.trace(R), *(2 * np.diag(R) - np.trace(R))])
-    k = int(np.argmax(squares))
-    a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    d, e, f = R[1, 0] + R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2]
-    s = squares[k]
-    q = np.array([[s, a, b, c], [a, s, d, e], [b, d, s, f], [c, e, f, s]][k])
-    return np.copysign(1.0, q[0]) * q / np.linalg.norm(q)
+    M = R.reshape(-1, 3, 3)
+    diagonal = np.einsum("nii->ni", M)
+    trace = diagonal.sum(1, keepdims=True)
+    squares = 1 + np.concatenate([trace, 2 * diagonal - trace], axis=1)  # four times w^2, x^2, y^2, z^2
+    w, x, y, z = squares.T
+    a, b, c = (M[:, [2, 0, 1], [1, 2, 0]] - M[:, [1, 2, 0], [2, 0, 1]]).T
+    d, e, f = (M[:, [1, 0, 2], [0, 2, 1]] + M[:, [0, 2, 1], [1, 0, 2]]).T
+    rows = np.array([[w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z]])
+    q = rows[np.argmax(squares, axis=1), :, np.arange(len(M))]
+    q = np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)
+    return q.reshape(*R.shape[:-2], 4)
 
 
-def rotation_from_vector(omega: ArrayLike) -> Array:
-    """(3, 3) rotation by the vector `omega` (3,): axis times angle, radians."""
-    return np.asarray(cv2.Rodrigues(np.asarray(omega, float).reshape(3, 1))[0], float)
+def rotation_from_vector(vectors: ArrayLike) -> Array:
+    """(..., 3, 3) rotations by vectors (..., 3): axis times angle, radians.
+
+    Rodrigues' formula: R = cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T, a = |w|.
+    """
+    w = np.asarray(vectors, float)
+    angle = np.maximum(np.sqrt((w * w).sum(axis=-1, keepdims=True)), 1e-12)
+    half = np.sin(angle / 2) / angle
+    R = (2 * half * half * w)[..., :, None] * w[..., None, :]
+    return R + (skew(np.sin(angle) / angle * w) + np.cos(angle)[..., None] * np.eye(3))
+
+
+def vector_from_rotation(R: ArrayLike) -> Array:
+    """(..., 3) vectors, axis times angle, of rotations (..., 3, 3); angles are in [0, pi] radians."""
+    q = wxyz_from_rotation(R)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    return q[..., 1:] * (2 * np.arctan2(sine, q[..., :1]) / np.maximum(sine, 1e-12))
 
 
 def invert(T: Array) -> Array:
@@ -82,22 +102,22 @@ def skew(vectors: ArrayLike) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """(6, 6) how a (4, 4) rigid motion carries a twist, rotation first: T Exp(xi) = Exp(Ad xi) T."""
+    """(6, 6) adjoint of a (4, 4) rigid motion, for twists with rotation first: T Exp(xi) = Exp(Ad xi) T."""
     R, p = T[:3, :3], T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
 
 def look_at(position: ArrayLike, target: ArrayLike) -> Array:
-    """T_world_cam (4, 4) of a camera at `position` that looks at `target`, its image upright (world z up).
+    """T_world_cam (4, 4) of a camera at `position` that looks at `target`, with an upright image (world z up).
 
     Raises:
-        ValueError: the target stands straight above or below the camera, where upright has no meaning.
+        ValueError: the target is exactly above or below the camera, where no upright image is defined.
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     z = target - position
     x = np.cross(z, [0.0, 0.0, 1.0])
     if np.linalg.norm(x) < 1e-9:
-        raise ValueError("the target stands straight above or below the camera")
+        raise ValueError("the camera's target is exactly above or below it; move one of them sideways")
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
@@ -106,7 +126,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Array:
 
 
 def rigid_motions(source: Array, target: Array) -> Array:
-    """The motions (..., 4, 4) T that bring `source` (..., N, 3) nearest to `target`: target ~ T source.
+    """(..., 4, 4) rigid motions T with the least squared distances between T `source` and `target`, both (..., N, 3).
 
     Kabsch 1976; Umeyama 1991 without scale.
     """
@@ -120,49 +140,3 @@ def rigid_motions(source: Array, target: Array) -> Array:
     T[..., :3, 3] = (b - a @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
     T[..., 3, 3] = 1.0
     return T
-
-
-def exp_so3(vectors: Array) -> Array:
-    """(N, 3, 3) rotations by vectors (N, 3)."""
-    return np.ascontiguousarray(turns(vectors.T).transpose(2, 0, 1))
-
-
-def log_so3(R: Array) -> Array:
-    """(N, 3) vectors of rotations (N, 3, 3) of less than half a turn: the quaternion's."""
-    q = wxyz_of(R)
-    sine = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2 * np.arctan2(sine, q[:, 0])
-    return q[:, 1:] * (angle / np.maximum(sine, 1e-12))[:, None]
-
-
-def turns(w: Array) -> Array:
-    """(3, 3, ...) rotations by vectors (3, ...).
-
-    Rodrigues' formula: R = cos(a) I + sin(a)/a [w]x + (1 - cos(a))/a^2 w w^T, a = |w|.
-    """
-    angle = np.maximum(np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]), 1e-12)
-    cosine, s, half = np.cos(angle), np.sin(angle) / angle * w, np.sin(angle / 2) / angle
-    R = (2 * half * half * w)[:, None] * w
-    R[0, 0] += cosine
-    R[1, 1] += cosine
-    R[2, 2] += cosine
-    R[0, 1] -= s[2]
-    R[1, 0] += s[2]
-    R[0, 2] += s[1]
-    R[2, 0] -= s[1]
-    R[1, 2] -= s[0]
-    R[2, 1] += s[0]
-    return R
-
-
-def wxyz_of(R: Array) -> Array:
-    """(N, 4) unit quaternions w >= 0, x, y, z of rotations (N, 3, 3) (Shepperd's largest component first)."""
-    diagonal = np.einsum("nii->ni", R)
-    trace = diagonal.sum(1, keepdims=True)
-    largest = np.argmax(np.concatenate([trace, 2 * diagonal - trace], 1), axis=1)
-    a, b, c = (R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]).T
-    d, e, f = (R[:, [1, 0, 2], [0, 2, 1]] + R[:, [0, 2, 1], [1, 0, 2]]).T
-    s = 1 + np.concatenate([trace, 2 * diagonal - trace], 1).T
-    rows = np.array([[s[0], a, b, c], [a, s[1], d, e], [b, d, s[2], f], [c, e, f, s[3]]])
-    q = rows[largest, :, np.arange(len(R))]
-    return np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Directions spread evenly over the sphere."""
+"""Evenly distributed directions on the unit sphere."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from camera_node.arrays import Array
 
 
 def fibonacci_sphere(n: int) -> Array:
-    """(n, 3) unit vectors spread evenly (Gonzalez 2010)."""
+    """(n, 3) unit vectors on a Fibonacci lattice (Gonzalez 2010)."""
     k = np.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     level = np.sqrt(1 - z**2)

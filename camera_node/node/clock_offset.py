@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How far the server's clock is ahead of this machine's, from round trips that queues delayed on either way.
+"""Estimates the offset and drift between the server's clock and this machine's from round trips of messages.
 
-When a question leaves, the server's clock shows no more than what the answer says; when the answer comes, no less
-(Marzullo and Owicki 1983). Each way by itself so bounds the offset from one side, and a queue only loosens its own
-bound: the quickest questions and the quickest answers tell, whichever round trips they belong to. Between them runs
-the drift, as Moon, Skelly and Towsley (INFOCOM 1999) find it from the lower envelope of one-way delays, here of both.
-The middle between both bounds is the estimate: nothing else is nearer in the worst case, and for random delays of
-equal law it has the greatest likelihood (Jeske, IEEE Trans. Communications 2005).
+A request bounds the offset from above and its reply from below, each by its own delay (Marzullo and Owicki 1983). The
+drift is bounded by the lower envelopes of both one-way delays (after Moon, Skelly and Towsley, INFOCOM 1999). The
+estimate is the middle of the remaining band, which has the least worst-case error and, for equally distributed random
+delays, the greatest likelihood (Jeske, IEEE Trans. Communications 2005). See docs/clock_offset.md for the derivation.
 """
 
 from collections import deque
@@ -17,15 +15,15 @@ import numpy as np
 
 from camera_node.arrays import Array
 
-WINDOW_NS = 300_000_000_000  # how long a round trip is remembered: longer than a bad minute
-DRIFT = 100e-6  # two clocks of 50 ppm each, running apart
-WANDER = 5e-6  # by which that changes within the window, by warmth and by time services
-READING_NS = 1000  # how finely clocks are read, at worst
+WINDOW_NS = 300_000_000_000  # age up to which round trips are used; longer than most network disturbances
+DRIFT = 100e-6  # largest relative drift: two clocks of 50 ppm each in opposite directions
+WANDER = 5e-6  # largest change of the drift within the window, by temperature and time services
+READING_NS = 1000  # coarsest resolution of a clock reading
 
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """One question to the server: this machine's times, monotonic, around the server's."""
+    """One request to the server: this machine's monotonic times before and after it, and the server's time."""
 
     sent_ns: int
     server_ns: int
@@ -33,8 +31,12 @@ class RoundTrip:
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
-    """Where the offset lies: `low` to `high` above `offset_ns` at `t_ns`, growing by `slowest` to `fastest` ns a ns."""
+class OffsetBand:
+    """Bounds of the offset over time.
+
+    At `t_ns` the offset lies between `low` and `high` ns above `offset_ns`. Its rate lies between `slowest` and
+    `fastest`, in ns per ns.
+    """
 
     t_ns: int
     offset_ns: int
@@ -44,40 +46,42 @@ class Band:
     fastest: float
 
     def at(self, t_ns: int) -> tuple[int, float]:
-        """Its middle, and half its width, nanoseconds."""
-        passed = t_ns - self.t_ns
-        middle = (self.low + self.high + (self.slowest + self.fastest) * passed) / 2
-        width = self.high - self.low + (self.fastest - self.slowest) * abs(passed)
+        """The middle of the band and half its width, ns, at this machine's monotonic time `t_ns`."""
+        elapsed = t_ns - self.t_ns
+        middle = (self.low + self.high + (self.slowest + self.fastest) * elapsed) / 2
+        width = self.high - self.low + (self.fastest - self.slowest) * abs(elapsed)
         return self.offset_ns + round(middle), width / 2
 
 
 @dataclass(frozen=True, slots=True)
-class Limit:
-    """What the offset is at most, or at least, at one time."""
+class OffsetLimit:
+    """An upper or lower bound of the offset at one time."""
 
     t_ns: int
     offset_ns: int
 
 
 class OffsetEstimator:
-    """The server's clock less this machine's, with a bound that holds while the clocks' drift is below `DRIFT` and
-    changes by less than `WANDER`.
+    """Estimates the server's clock minus this machine's, with an error bound.
 
-    Round trips that contradict each other mean that somebody set a clock: the older half is forgotten until the rest
-    agree. One by one would leave those that only just agree, and a band that is narrow for being wrong.
-    The estimate is the best at any time and does not slew, as what it stamps are measurements and no timers.
+    The bound holds while the drift is below `DRIFT` and changes by less than `WANDER`. Round trips that contradict
+    each other show that a clock was set: the estimator then discards the older half until the rest agrees. Discarding
+    one at a time would keep those that barely agree, and leave a band that is too narrow. The estimate is not slewed,
+    because it stamps measurements and drives no timers.
     """
 
     def __init__(self) -> None:
-        self._limits: deque[tuple[Limit, Limit]] = deque()  # most and least, of each burst
-        self._band: Band | None = None
+        self._limits: deque[tuple[OffsetLimit, OffsetLimit]] = (
+            deque()
+        )  # upper and lower limit from each burst
+        self._band: OffsetBand | None = None
 
     def add(self, *burst: RoundTrip) -> None:
-        """Learn from one or more round trips that were made at once, after all others."""
-        questions = [Limit(trip.sent_ns, trip.server_ns - trip.sent_ns) for trip in burst]
-        answers = [Limit(trip.received_ns, trip.server_ns - trip.received_ns) for trip in burst]
-        self._limits.append((min(questions, key=_offset), max(answers, key=_offset)))
-        now_ns = answers[-1].t_ns
+        """Update the estimate with one or more consecutive round trips, which are later than all earlier ones."""
+        requests = [OffsetLimit(trip.sent_ns, trip.server_ns - trip.sent_ns) for trip in burst]
+        replies = [OffsetLimit(trip.received_ns, trip.server_ns - trip.received_ns) for trip in burst]
+        self._limits.append((min(requests, key=_offset), max(replies, key=_offset)))
+        now_ns = replies[-1].t_ns
         while now_ns - self._limits[0][0].t_ns > WINDOW_NS:
             self._limits.popleft()
         while (band := find_band(self._limits, now_ns)) is None and self._limits:
@@ -86,40 +90,42 @@ class OffsetEstimator:
         self._band = band
 
     def at(self, t_ns: int) -> tuple[int, float] | None:
-        """The offset and its error bound, nanoseconds, at this machine's time; None before the first round trip."""
+        """The offset and its error bound, ns, at this machine's monotonic time; None before the first round trip."""
         return self._band.at(t_ns) if self._band else None
 
 
-def _offset(limit: Limit) -> int:
+def _offset(limit: OffsetLimit) -> int:
     return limit.offset_ns
 
 
-def find_band(limits: Sequence[tuple[Limit, Limit]], now_ns: int) -> Band | None:
-    """Where the offset lies now, by what it was at most and at least; None where they leave no place, or are none."""
+def find_band(limits: Sequence[tuple[OffsetLimit, OffsetLimit]], now_ns: int) -> OffsetBand | None:
+    """Bound the offset and its rate now by upper and lower limits; None where there are none or they contradict."""
     if not limits:
         return None
-    origin_ns = limits[-1][0].offset_ns  # numbers count from it, and from now: nothing is lost in rounding
-    (asked, high), (answered, low) = (
+    origin_ns = limits[-1][0].offset_ns  # relative to it and to now, float64 is exact enough
+    (requested, high), (replied, low) = (
         np.array([(limit.t_ns - now_ns, limit.offset_ns - origin_ns) for limit in column], float).T
         for column in zip(*limits, strict=True)
     )
     high, low = high + READING_NS, low - READING_NS
-    slowest, fastest = _rates(asked, high, answered, low)
-    top = float((high - fastest * asked).min())
-    bottom = float((low - slowest * answered).max())
+    slowest, fastest = _bound_rate(requested, high, replied, low)
+    top = float((high - fastest * requested).min())
+    bottom = float((low - slowest * replied).max())
     if slowest > fastest or bottom > top:
         return None
-    return Band(now_ns, origin_ns, bottom, top, slowest, fastest)
+    return OffsetBand(now_ns, origin_ns, bottom, top, slowest, fastest)
 
 
-def _rates(asked: Array, high: Array, answered: Array, low: Array) -> tuple[float, float]:
-    """The least and the greatest rate at which the offset may grow at any time of the window.
+def _bound_rate(requested: Array, high: Array, replied: Array, low: Array) -> tuple[float, float]:
+    """The smallest and the largest rate that the offset may have at any time of the window.
 
-    From the question i to the answer j it grows by low_j - high_i or more. That bounds its mean rate between them, from
-    below where the answer came after, and from above where it came before.
+    From request i to reply j the offset grows by at least low_j - high_i. This bounds its mean rate in between: from
+    below where the reply came later than the request, from above where it came earlier.
     """
-    span = answered[None, :] - asked[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):  # where both were at one time, which tells nothing
+    span = replied[None, :] - requested[:, None]
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # equal times carry no information; `where` skips them
         rate = (low[None, :] - high[:, None]) / span
     least = rate.max(where=span > 0, initial=-np.inf)
     most = rate.min(where=span < 0, initial=np.inf)

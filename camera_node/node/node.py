@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera node: frame -> detect -> stamp -> publish."""
+"""A camera node: reads frames, detects roundels, stamps them with the server's time and publishes them."""
 
 import contextlib
 import logging
@@ -8,16 +8,15 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import zenoh
 
+from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_roundels
-from camera_node.detection.roundels import Roundels
 from camera_node.node.clock_sync import ClockSync
-from camera_node.node.eye import Eye
-from camera_node.node.status import NodeStatistics
-from camera_node.protocol.messages import CameraStatus, Detections, Keys, Settings, encode
+from camera_node.node.settings import apply_settings, read_settings
+from camera_node.node.status import DetectedFrame, NodeStatistics
+from camera_node.protocol.messages import Detections, Keys, Settings, encode
 from camera_node.protocol.requests import (
     RequestError,
     encode_jpeg,
@@ -30,164 +29,165 @@ from camera_node.protocol.requests import (
 )
 from camera_node.protocol.session import ServerWatch
 from camera_node.sources.frame import Frame, Source
-from camera_node.sources.replay import PacedSource
 
 log = logging.getLogger("camera_node")
 
 STATUS_S = 1.0
-LISTENER_S = 5.0  # how long a recording waits for somebody to listen
-ROUTES_S = 0.3  # Zenoh routers know of a listener 0.1 s before they have agreed on the route to it
+LISTENER_S = 5.0  # longest time that a recording waits for a subscriber
+ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the route to it is ready
 
 
 class Node:
-    """One camera: its source, its detector and what it publishes, until the source ends or `close`."""
+    """Publishes the detections and the status of one camera, and answers requests for snapshots and settings."""
 
     def __init__(
         self,
         name: str,
         source: Source,
+        detector: Detector,
         session: zenoh.Session,
         arena: str = "arena",
-        detector: dict[str, Any] | None = None,
         keep_stamps: bool = False,
     ) -> None:
-        """Nothing is published before `run`.
+        """Publish nothing before `run`.
 
         Args:
             name: the camera's name.
-            source: closed by the node.
-            session: left open.
+            source: the frames; the node closes it.
+            detector: the detector with its initial settings.
+            session: a Zenoh session; the node leaves it open.
             arena: the first part of all keys.
-            detector: keyword arguments of `Detector`.
-            keep_stamps: publish the source's times as they are, and not in the server's time.
+            keep_stamps: publish the source's times unchanged instead of converting them to the server's time.
         """
-        self.name, self.source, self.session = name, source, session
-        self.keys = Keys(arena)
-        self.clock = ClockSync(session, self.keys)
-        self.health = NodeStatistics(name)
-        self.keep_stamps = keep_stamps
-        self.eye = Eye(source, detector or {})
-        self._seen: tuple[Frame, Roundels] | None = None
+        self.name = name
+        self._source, self._detector, self._session = source, detector, session
+        self._keys = Keys(arena)
+        self._clock = ClockSync(session, self._keys)
+        self._statistics = NodeStatistics(name)
+        self._keep_stamps = keep_stamps
+        self._changing = threading.Lock()  # of the detector, by requests
         self._closed = threading.Event()
 
     def run(self) -> None:
         """Publish every frame until the source ends or `close` is called.
 
         Raises:
-            CameraError: the source's frames can't be read.
+            CameraError: a frame of the source can't be read.
         """
         with contextlib.ExitStack() as stack:
             publisher = self._open(stack)
-            for seq, frame in enumerate(self.source):
-                roundels, detect_us = self._detect(frame)
-                publisher.put(self._message(seq, frame, roundels, detect_us))
-                self.health.count(frame, roundels, detect_us)
-                self._seen = frame, roundels
+            for seq, frame in enumerate(self._source):
+                detected = self._detect(frame)
+                t_ns, clock_error_us = self._stamp(frame)
+                publisher.put(self._encode(seq, detected, t_ns, clock_error_us))
+                self._statistics.count(detected)
 
     def close(self) -> None:
-        """End `run`, from another thread."""
+        """End `run`; called from another thread."""
         self._closed.set()
-        self.source.close()
+        self._source.close()
 
-    def _detect(self, frame: Frame) -> tuple[Roundels, float]:
-        begun = time.perf_counter_ns()
-        roundels = self.eye.detect(frame.image)
-        return roundels, (time.perf_counter_ns() - begun) / 1000
+    def _detect(self, frame: Frame) -> DetectedFrame:
+        begun_ns = time.perf_counter_ns()
+        roundels = self._detector.detect(frame.image)
+        return DetectedFrame(frame, roundels, (time.perf_counter_ns() - begun_ns) / 1000)
 
-    def _message(self, seq: int, frame: Frame, roundels: Roundels, detect_us: float) -> bytes:
-        height, width = frame.image.shape
-        t_ns, clock_error_us = self._stamp(frame)
+    def _stamp(self, frame: Frame) -> tuple[int, float]:
+        """The frame's capture time in the server's time, ns, and the bound of its clock error, us."""
+        if self._keep_stamps:
+            return frame.t_ns, 0.0
+        estimate = self._clock.estimate(frame.t_ns)
+        return (frame.t_ns + estimate[0], estimate[1] / 1000) if estimate else (frame.t_ns, math.nan)
+
+    def _encode(self, seq: int, detected: DetectedFrame, t_ns: int, clock_error_us: float) -> bytes:
+        height, width = detected.frame.image.shape
         message = Detections.pack(
-            roundels,
+            detected.roundels,
             camera=self.name,
             seq=seq,
             t_ns=t_ns,
-            exposure_us=frame.exposure_us,
-            detect_us=detect_us,
-            sent_ns=self.clock.to_server(time.time_ns()),
+            exposure_us=detected.frame.exposure_us,
+            detect_us=detected.detect_us,
+            sent_ns=self._clock.to_server(time.time_ns()),
             clock_error_us=clock_error_us,
             width=width,
             height=height,
         )
         return encode(message)
 
-    def _stamp(self, frame: Frame) -> tuple[int, float]:
-        """When it was taken, in the server's time, and what the clocks add to that at most, microseconds."""
-        if self.keep_stamps:
-            return frame.t_ns, 0.0
-        estimate = self.clock.estimate(frame.t_ns)
-        return (frame.t_ns + estimate[0], estimate[1] / 1000) if estimate else (frame.t_ns, math.nan)
-
     def _open(self, stack: contextlib.ExitStack) -> zenoh.Publisher:
-        """Declare everything that this node says and answers; `stack` takes it back."""
-        keys, name, session = self.keys, self.name, self.session
+        """Declare all publications, queryables and tokens, to be undeclared by `stack`."""
+        keys, name, session = self._keys, self.name, self._session
         stack.callback(self.close)
         publisher = session.declare_publisher(
             keys.detections(name),
-            congestion_control=zenoh.CongestionControl.DROP,  # an old frame is worth nothing
+            congestion_control=zenoh.CongestionControl.DROP,  # old frames are useless
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
         stack.callback(publisher.undeclare)
-        for key, answer in ((keys.snapshot(name), self._snapshot), (keys.settings(name), self._change)):
+        for key, answer in (
+            (keys.snapshot(name), self._answer_snapshot),
+            (keys.settings(name), self._answer_settings),
+        ):
             queryable = session.declare_queryable(key, partial(self._answer, answer))
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
         watch = ServerWatch(session, keys.fusion_alive)
         stack.callback(watch.close)
-        self.clock.start()
-        stack.callback(self.clock.close)
-        reporter = threading.Thread(target=self._report, args=(watch,), name="status", daemon=True)
+        self._clock.start()
+        stack.callback(self._clock.close)
+        reporter = threading.Thread(target=self._publish_status, args=(watch,), name="status", daemon=True)
         reporter.start()
         stack.callback(reporter.join, STATUS_S)
         stack.callback(self._closed.set)
-        if isinstance(self.source, PacedSource):
-            self._await_listener(publisher)
+        if self._source.is_recording:
+            self._await_subscriber(publisher)
         return publisher
 
-    def _await_listener(self, publisher: zenoh.Publisher) -> None:
-        """A recording starts when somebody listens: a live camera can't wait, a recording need not lose frames."""
-        listens = threading.Event()
+    def _await_subscriber(self, publisher: zenoh.Publisher) -> None:
+        """Wait until there is a subscriber, so that it receives all frames of a recording."""
+        matched = threading.Event()
         listener = publisher.declare_matching_listener(
-            lambda status: listens.set() if status.matching else None
+            lambda status: matched.set() if status.matching else None
         )
-        if not publisher.matching_status and not listens.wait(LISTENER_S):
-            log.warning("nobody listens to %s; the recording starts all the same", self.name)
+        if not publisher.matching_status and not matched.wait(LISTENER_S):
+            log.warning(
+                "no subscriber of %s after %g s; starting the recording anyway", self.name, LISTENER_S
+            )
         listener.undeclare()
         self._closed.wait(ROUTES_S)
 
-    def _report(self, watch: ServerWatch) -> None:
-        publisher = self.session.declare_publisher(self.keys.camera_status(self.name))
+    def _publish_status(self, watch: ServerWatch) -> None:
+        publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
         while not self._closed.wait(STATUS_S):
-            watch.tell_absence()
-            publisher.put(encode(self._status()))
+            watch.report_absence()
+            status = self._statistics.summarize(
+                self._clock.to_server(time.time_ns()),
+                self._clock.estimate(),
+                self._source,
+                self._detector.threshold,
+            )
+            publisher.put(encode(status))
         publisher.undeclare()
-
-    def _status(self) -> CameraStatus:
-        estimate = self.clock.estimate()
-        return self.health.status(
-            self.clock.to_server(time.time_ns()),
-            dropped=getattr(self.source, "dropped", 0),  # sources that can't fall behind don't count
-            threshold=self.eye.threshold,
-            exposure_us=self.eye.settings.exposure_us,
-            gain=self.eye.settings.gain,
-            clock_offset_ms=estimate[0] / 1e6 if estimate else None,
-            clock_error_ms=estimate[1] / 1e6 if estimate else None,
-        )
 
     def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:
         if not respond(query, answer):
-            self.health.refuse()
+            self._statistics.count_refusal()
 
-    def _snapshot(self, query: zenoh.Query) -> bytes:
-        if self._seen is None:
-            raise RequestError("no frame yet")
-        frame, roundels = self._seen
-        drawn = parse_draw(query.parameters)
-        image = draw_roundels(frame.image, roundels) if drawn else frame.image
+    def _answer_snapshot(self, query: zenoh.Query) -> bytes:
+        latest = self._statistics.latest
+        if latest is None:
+            raise RequestError("no frame yet; ask again when the camera delivers")
+        image = latest.frame.image
+        if parse_draw(query.parameters):
+            image = draw_roundels(image, latest.roundels)
         return encode_jpeg(image, parse_quality(query.parameters))
 
-    def _change(self, query: zenoh.Query) -> bytes:
-        if payload := payload_of(query):
-            self.eye.adjust(parse_request(payload, Settings))
-        return encode_reply(payload, self.eye.settings)
+    def _answer_settings(self, query: zenoh.Query) -> bytes:
+        payload = payload_of(query)
+        with self._changing:
+            if payload:
+                wanted = parse_request(payload, Settings)
+                self._detector = apply_settings(wanted, self._source, self._detector)
+            return encode_reply(payload, read_settings(self._source, self._detector))

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a camera node says of itself once a second."""
+"""Statistics of a camera node, and advice about the exposure, for its status once per second."""
 
 import math
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,28 +12,40 @@ import numpy as np
 from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import CameraStatus
-from camera_node.sources.frame import Frame
+from camera_node.sources.frame import Frame, Source
 
 THERMAL = Path("/sys/class/thermal")
 FULL = 250  # grey levels from which a pixel counts as saturated
-SATURATED_SHARE = 0.05
-WHITE = 200  # grey level that white paper should have: bright, with room for what is brighter
-DARK = 100  # from here up the white of roundels is bright enough
-DARK_GUESSED = 64  # the same of what may be paper: who knows what the picture shows
-MOST = 16  # times; more light than that is not a matter of settings
-STRIDE = 8  # every eighth pixel each way tells the brightness
-NOTHING = np.empty((0, 0), np.uint8), np.empty((0, 2))
+SATURATED_SHARE = 0.05  # of the pixels, above which an image without roundels is called saturated
+WHITE = 200  # grey level that white paper should have: bright, with room for brighter surfaces
+DARK = 100  # least grey level of the roundels' white that is bright enough
+DARK_GUESSED = 64  # the same where no roundel is seen and the paper's grey level is a guess
+MAX_FACTOR = 16  # largest change of exposure that is advised; darker scenes need more light
+STRIDE = 8  # the brightness is that of every eighth pixel in both directions
+NO_IMAGE, NO_CENTRES = np.empty((0, 0), np.uint8), np.empty((0, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class DetectedFrame:
+    """A frame, its roundels, and the duration of their detection in microseconds."""
+
+    frame: Frame
+    roundels: Roundels
+    detect_us: float
 
 
 class NodeStatistics:
-    """Counts frames, and sums them up once a second."""
+    """Counts frames and refused requests, and summarizes them once per second. Safe to use from several threads.
+
+    Attributes:
+        latest: the last counted frame; None before the first.
+    """
 
     def __init__(self, camera: str) -> None:
         self.camera = camera
-        self.refused = 0
+        self.latest: DetectedFrame | None = None
         self._lock = threading.Lock()
-        self._frames = 0
-        self._last: tuple[Frame, Roundels] | None = None
+        self._frames = self._refused = 0
         self._clear()
 
     def _clear(self) -> None:
@@ -40,24 +53,34 @@ class NodeStatistics:
         self._recent = self._roundels = 0
         self._detect_us = 0.0
 
-    def count(self, frame: Frame, roundels: Roundels, detect_us: float) -> None:
-        """One frame was detected in and published."""
+    def count(self, detected: DetectedFrame) -> None:
+        """Count a published frame."""
         with self._lock:
             self._frames += 1
             self._recent += 1
-            self._roundels += len(roundels)
-            self._detect_us += detect_us
-            self._last = frame, roundels
+            self._roundels += len(detected.roundels)
+            self._detect_us += detected.detect_us
+            self.latest = detected
 
-    def refuse(self) -> None:
-        """A request made no sense."""
+    def count_refusal(self) -> None:
+        """Count a refused request."""
         with self._lock:
-            self.refused += 1
+            self._refused += 1
 
-    def status(self, t_ns: int, **known) -> CameraStatus:
-        """The status since the last one; `known` are the fields that others know."""
+    def summarize(
+        self, t_ns: int, clock: tuple[int, float] | None, source: Source, threshold: float | None
+    ) -> CameraStatus:
+        """Build the status of the time since the last call.
+
+        Args:
+            t_ns: the time of the status, server's time.
+            clock: the server's time minus this machine's and the bound of its error, ns; None where unknown.
+            source: the source of the frames.
+            threshold: theta of `--detector paper`, grey levels; None with other detectors.
+        """
         with self._lock:
-            image, seen = (self._last[0].image, self._last[1].uv) if self._last else NOTHING
+            latest = self.latest
+            image, uv = (latest.frame.image, latest.roundels.uv) if latest else (NO_IMAGE, NO_CENTRES)
             n = max(1, self._recent)
             status = CameraStatus(
                 camera=self.camera,
@@ -66,13 +89,18 @@ class NodeStatistics:
                 height=image.shape[0],
                 fps=self._recent / max(1e-3, time.monotonic() - self._since),
                 frames=self._frames,
+                dropped=source.dropped,
                 detect_ms=self._detect_us / n / 1000,
                 roundels=self._roundels / n,
+                threshold=threshold,
                 saturated=saturated_share(image[::STRIDE, ::STRIDE]),
-                advice=advise(image, seen),
-                refused=self.refused,
+                exposure_us=source.exposure_us,
+                gain=source.gain,
+                clock_offset_ms=clock[0] / 1e6 if clock else None,
+                clock_error_ms=clock[1] / 1e6 if clock else None,
                 temperature_c=temperature(),
-                **known,
+                advice=advise(image, uv),
+                refused=self._refused,
             )
             self._clear()
         return status
@@ -84,29 +112,29 @@ def saturated_share(image: Grey) -> float:
 
 
 def advise(image: Grey, uv: Array) -> str:
-    """What is wrong with the light, and what to change by how much; nothing where all is well.
+    """Advise how to change the exposure; empty where the brightness is right.
 
-    The white in the middle of the roundels at `uv` (N, 2) tells. Where there are none, the histogram does.
+    Uses the white in the middle of the roundels at `uv` (N, 2) pixels, or the histogram where there are no roundels.
     """
     if not image.size:
         return ""
-    white, dark = (_white_seen(image, uv), DARK) if len(uv) else (_white_guessed(image), DARK_GUESSED)
+    white, dark = (_white_of(image, uv), DARK) if len(uv) else (_guess_white(image), DARK_GUESSED)
     if white >= FULL:
         return "saturated: halve the exposure or the gain"
     if white >= dark:
         return ""
-    return f"too dark: {min(MOST, WHITE / max(white, 1.0)):.1f} times the exposure or the gain"
+    return f"too dark: {min(MAX_FACTOR, WHITE / max(white, 1.0)):.1f} times the exposure or the gain"
 
 
-def _white_seen(image: Grey, uv: Array) -> float:
-    """The grey level of the white discs in the middle of roundels."""
+def _white_of(image: Grey, uv: Array) -> float:
+    """The median grey level of the white discs in the middle of the roundels."""
     h, w = image.shape
     u, v = np.rint(uv).astype(int).T
     return float(np.median(image[v.clip(0, h - 1), u.clip(0, w - 1)]))
 
 
-def _white_guessed(image: Grey) -> float:
-    """The grey level of paper in a picture without roundels: full where too much is, else the brightest hundredth's."""
+def _guess_white(image: Grey) -> float:
+    """The grey level of paper in an image without roundels: the 99th percentile, or `FULL` where many are saturated."""
     sampled = image[::STRIDE, ::STRIDE]
     if saturated_share(sampled) > SATURATED_SHARE:
         return FULL
@@ -114,7 +142,7 @@ def _white_guessed(image: Grey) -> float:
 
 
 def temperature(thermal: Path = THERMAL) -> float | None:
-    """The hottest zone of this machine, degrees Celsius; None where it has no sensor."""
+    """The temperature of this machine's hottest zone, degrees Celsius; None without a sensor."""
     degrees = [t for zone in thermal.glob("thermal_zone*/temp") if math.isfinite(t := _degrees(zone))]
     return max(degrees, default=None)
 

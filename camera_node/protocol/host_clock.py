@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""This machine's clocks: which one it is, and Unix time beside the monotonic clock."""
+"""Identifies this machine's clock and compares Unix time with the monotonic clock."""
 
 import time
 from functools import cache
 from pathlib import Path
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-READINGS = 3
+READINGS = 3  # of both clocks; the fastest is used
 
 
 @cache
 def clock_id() -> str:
-    """The name of this machine's clock, which programs in containers share; empty where it has none."""
+    """The boot id, which names the clock that all containers of this machine share; empty where it is unavailable."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:
@@ -19,10 +19,10 @@ def clock_id() -> str:
 
 
 def unix_ahead_ns() -> int:
-    """Unix time less the monotonic clock.
+    """Measure Unix time minus the monotonic clock.
 
-    Each reading stands between two of the monotonic clock, and the quickest of a few counts: a thread that has to wait
-    between the two clocks would be wrong by as long.
+    Reads Unix time between two readings of the monotonic clock and uses the fastest of `READINGS` attempts, because an
+    interruption between the readings is an error of its length.
     """
     readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(READINGS)]
     before, unix, after = min(readings, key=lambda reading: reading[2] - reading[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a camera says over Zenoh: MessagePack maps, their arrays little-endian binary columns. Keys stand in `Keys`."""
+"""Defines the messages of a camera: MessagePack maps with arrays as little-endian binary columns, and Zenoh keys."""
 
 import math
 from typing import TypeVar
@@ -10,17 +10,17 @@ import numpy as np
 from camera_node.detection.roundels import Roundels
 
 VERSION = 1
-MAX_ROUNDELS = 4096  # in one frame; a message that claims more is not one of ours
-MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate: what is known no better tells nothing
+MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
+MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Keys:
-    """Zenoh keys of one arena (`docs/messages.md` lists who publishes what on them)."""
+    """Zenoh keys of one arena; `docs/messages.md` lists their publishers and messages."""
 
     def __init__(self, arena: str) -> None:
         self.arena = arena
-        self.clock = f"{arena}/clock"  # queryable of the server: its time
+        self.clock = f"{arena}/clock"  # queryable of the server: the server's time
         self.rig = f"{arena}/rig"
         self.markers = f"{arena}/markers"
         self.fusion_status = f"{arena}/fusion/status"
@@ -46,15 +46,15 @@ class Keys:
 
 
 class MessageError(ValueError):
-    """Bytes that are no message of ours. Whoever receives them counts them and goes on."""
+    """Invalid bytes in place of a message. Receivers count them and continue."""
 
 
 class Detections(msgspec.Struct, frozen=True, kw_only=True):
     """All roundels of one frame. `t_ns` is the middle of the exposure in the server's time (Unix, nanoseconds).
 
-    Columns, one row a roundel: `uv` (N, 2) <f8 raw pixels; `cov` (N, 3) <f4 uu, uv, vv, square pixels;
+    Columns with one row for each roundel: `uv` (N, 2) <f8 raw pixels; `cov` (N, 3) <f4 uu, uv, vv, square pixels;
     `axes_px` (N, 2) <f4 full major and minor axis; `angle_rad`, `ratio`, `contrast` (N,) <f4;
-    `id` and `track` (N,) <i4, -1 for none. A value that the sender does not know is NaN.
+    `id` and `track` (N,) <i4, -1 for none. Unknown values are NaN.
     """
 
     version: int = VERSION
@@ -62,9 +62,9 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     seq: int
     t_ns: int
     exposure_us: float = 0.0
-    detect_us: float = 0.0  # from the frame in memory to the roundels
-    sent_ns: int = 0  # when the message was handed to Zenoh, server's time
-    clock_error_us: float = 0.0  # that clocks put `t_ns` off, at most; NaN before a server answered
+    detect_us: float = 0.0  # duration of detection
+    sent_ns: int = 0  # time of publication, server's time
+    clock_error_us: float = 0.0  # bound of the clock error in `t_ns`; NaN before the server's first answer
     width: int
     height: int
     uv: bytes
@@ -78,7 +78,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def pack(cls, roundels: Roundels, **header) -> "Detections":
-        """A message of `roundels`; `header` holds the fields that are no columns."""
+        """Build a message from `roundels`; `header` contains the fields that are not columns."""
         cov = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
         return cls(
             uv=roundels.uv.astype("<f8").tobytes(),
@@ -95,9 +95,9 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     def __len__(self) -> int:
         return len(self.uv) // 16
 
-    @np.errstate(invalid="ignore")  # a signalling NaN becomes a quiet one
+    @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
     def unpack(self) -> Roundels:
-        """The columns as arrays."""
+        """Convert the columns to arrays."""
         cov = _column(self.cov, "<f4", 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         return Roundels(
             _column(self.uv, "<f8", 2),
@@ -107,9 +107,9 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             *(np.frombuffer(c, "<i4").astype(np.int32) for c in (self.id, self.track)),
         )
 
-    @np.errstate(invalid="ignore")  # likewise
+    @np.errstate(invalid="ignore")  # as in `unpack`
     def check(self) -> None:
-        """Raise MessageError unless sizes agree, centres are finite and covariances positive and small."""
+        """Raise MessageError unless sizes agree, centres are finite and covariances positive definite and small."""
         n, rest = divmod(len(self.uv), 16)
         if rest or n > MAX_ROUNDELS:
             raise MessageError(f"column uv of {len(self.uv)} bytes")
@@ -120,17 +120,17 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
         if not (self.camera and 0 < self.width <= 32768 and 0 < self.height <= 32768):
             raise MessageError("no camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
-            raise MessageError("an impossible time")
+            raise MessageError("an impossible t_ns, exposure_us or detect_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
-            raise MessageError("an impossible bound of a time")
-        uu, uv, vv = _column(self.cov, "<f4", 3).T  # what is no number is in no range
-        known = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
-        if not (known.all() and (np.abs(np.frombuffer(self.uv, "<f8")) < 1e5).all()):
-            raise MessageError("a centre or a covariance that is no number or out of range")
+            raise MessageError("an impossible clock_error_us")
+        uu, uv, vv = _column(self.cov, "<f4", 3).T  # comparisons with NaN are False
+        valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
+        if not (valid.all() and (np.abs(np.frombuffer(self.uv, "<f8")) < 1e5).all()):
+            raise MessageError("a centre or a covariance is NaN or out of range")
 
 
 class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """How a camera does, once a second."""
+    """Condition of a camera, published once per second."""
 
     version: int = VERSION
     camera: str
@@ -139,26 +139,27 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     height: int
     fps: float
     frames: int  # since the node started
-    dropped: int  # frames that the source delivered late, or that were skipped to keep up
+    dropped: int  # frames skipped since the start because a newer one was available
     detect_ms: float  # mean over the last second
-    roundels: float  # mean number in a frame over the last second
-    threshold: float  # grey level of the paper's theta; NaN where the detector has none
-    saturated: float  # share of pixels at the upper end, 0 to 1
+    roundels: float  # mean number in each frame over the last second
+    saturated: float  # share of pixels at the upper end of the grey levels, 0 to 1
+    threshold: float | None = None  # theta of `--detector paper`, grey levels; None with other detectors
     exposure_us: float | None = None
     gain: float | None = None
-    # The server's time less this machine's, and a bound of its error; None until a round trip succeeded.
+    # The server's time minus this machine's, and a bound of its error; None until a round trip succeeds.
     clock_offset_ms: float | None = None
     clock_error_ms: float | None = None
     temperature_c: float | None = None
-    advice: str = ""  # "saturated" or "too dark" with what to change by how much, or nothing
-    refused: int = 0  # requests for a snapshot or settings that were refused since the node started
+    advice: str = ""  # "saturated" or "too dark" with the change to make, or empty
+    refused: int = 0  # refused requests for a snapshot or settings since the node started
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be changed while a camera runs. A field that is None is left as it is, or is not known to the camera.
+    """Settings that can be changed while a camera runs.
 
-    `mask` lists polygons of three or more [u, v], raw pixels, in which roundels are ignored; exposure and gain are a
-    camera's, the others `Detector`'s settings of these names.
+    None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us` and `gain` belong
+    to the camera, the other settings to `Detector`; `mask` lists polygons of three or more [u, v], raw pixels, in which
+    roundels are ignored.
     """
 
     version: int = VERSION
@@ -173,22 +174,22 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     search_share: float | None = None
 
     def check(self) -> None:
-        """Raises MessageError where no camera can be set so."""
+        """Raise MessageError where no camera can have these settings."""
         if not all(x is None or math.isfinite(x) for x in (self.exposure_us, self.gain)):
             raise MessageError("exposure and gain must be finite")
         if self.exposure_us is not None and not 0 < self.exposure_us <= 1e7:
-            raise MessageError(f"an exposure of {self.exposure_us} us is not possible")
+            raise MessageError(f"exposure_us is {self.exposure_us}; give a number in (0, 1e7]")
 
 
 class ClockReply(msgspec.Struct, frozen=True):
-    """The server's time, in answer to a query on `<arena>/clock`, and its clock's name: who shares it is done."""
+    """The server's time, in answer to a query on `<arena>/clock`, and the name of its clock."""
 
     t_ns: int
-    clock: str = ""  # empty where the server can't tell
+    clock: str = ""  # empty where the server can't name it
 
 
 def encode(message: msgspec.Struct) -> bytes:
-    """The message as MessagePack."""
+    """Encode a message as MessagePack."""
     return msgspec.msgpack.encode(message)
 
 
@@ -196,14 +197,14 @@ def decode(data: bytes, kind: type[T]) -> T:
     """Decode and check bytes from the network.
 
     Raises:
-        MessageError: they are no message of this kind and version, or its content is impossible.
+        MessageError: the bytes are not a message of this kind and version, or a value is invalid.
     """
     try:
         message = msgspec.msgpack.decode(data, type=kind)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError(str(error)) from None
     if getattr(message, "version", VERSION) != VERSION:
-        raise MessageError(f"version {getattr(message, 'version', None)}, this program speaks {VERSION}")
+        raise MessageError(f"version {getattr(message, 'version', None)}; this program supports {VERSION}")
     check = getattr(message, "check", None)
     if check:
         check()

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How queries are answered, and what a camera node is asked for: its settings, and a picture.
-
-A bad request gets an error in reply, nothing else.
-"""
+"""Parses the requests in Zenoh queries and sends the replies. An invalid request gets an error reply of one line."""
 
 import logging
 from collections.abc import Callable
@@ -18,38 +15,38 @@ from camera_node.protocol.messages import MessageError, decode, encode
 
 log = logging.getLogger("camera_node.requests")
 
-QUALITY = 85  # of a JPEG
-MAX_PAYLOAD = 1 << 20
+QUALITY = 85  # JPEG quality unless the request gives one
+MAX_PAYLOAD = 1 << 20  # bytes
 T = TypeVar("T", bound=msgspec.Struct)
 
 
 class RequestError(RoundelError):
-    """A request that makes no sense, told to whoever asked."""
+    """An invalid request; the message goes to its sender."""
 
 
 def payload_of(query: zenoh.Query) -> bytes:
-    """What came with a query, or nothing."""
+    """The payload of a query, empty where it has none."""
     return query.payload.to_bytes() if query.payload else b""
 
 
 def parse_request(payload: bytes, kind: type[T]) -> T:
-    """What a request asks for: a map in MessagePack or, starting with `{`, in JSON.
+    """Decode a request: a map in MessagePack or, where it starts with `{`, in JSON.
 
     Raises:
-        RequestError: the payload is neither, names what is unknown, or asks for what is impossible.
+        RequestError: the payload is neither, has an unknown field or has an invalid value.
     """
     if len(payload) > MAX_PAYLOAD:
-        raise RequestError(f"{len(payload)} bytes are no {kind.__name__}")
+        raise RequestError(f"{kind.__name__} of {len(payload)} bytes; send at most {MAX_PAYLOAD}")
     try:
         return decode(
             msgspec.msgpack.encode(msgspec.json.decode(payload)) if _is_json(payload) else payload, kind
         )
     except (msgspec.DecodeError, MessageError, RecursionError) as error:
-        raise RequestError(f"no {kind.__name__}: {error}") from None
+        raise RequestError(f"invalid {kind.__name__}: {error}") from None
 
 
 def encode_reply(payload: bytes, message: msgspec.Struct) -> bytes:
-    """A message in the encoding in which it was asked for."""
+    """Encode a reply as its request was encoded: in JSON or MessagePack."""
     return msgspec.json.encode(message) if _is_json(payload) else encode(message)
 
 
@@ -58,10 +55,10 @@ def _is_json(payload: bytes) -> bool:
 
 
 def respond(query: zenoh.Query, answer: Callable[[zenoh.Query], bytes]) -> bool:
-    """Reply with what `answer` returns; a fault that the asker can mend goes back as an error of one line.
+    """Reply with the bytes that `answer` returns, or with its RoundelError as an error reply of one line.
 
     Returns:
-        Whether the request was granted.
+        Whether `answer` succeeded.
     """
     with query:
         try:
@@ -70,25 +67,25 @@ def respond(query: zenoh.Query, answer: Callable[[zenoh.Query], bytes]) -> bool:
             query.reply_err(str(error))
             return False
         except zenoh.ZError as error:
-            log.debug("no reply: %s", error)
+            log.debug("the reply could not be sent: %s", error)
     return True
 
 
 def encode_jpeg(image: Grey, quality: int) -> bytes:
-    """A JPEG of an image, grey or BGR, at a quality of 1 to 100."""
+    """Encode an image, grey or BGR, as JPEG with a quality of 1 to 100."""
     ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:
-        raise RequestError("the picture could not be written as JPEG")
+        raise RequestError("the image could not be encoded as JPEG; try another quality")
     return data.tobytes()
 
 
 def parse_draw(parameters: zenoh.Parameters) -> bool:
-    """Whether a snapshot's request asks for the roundels to be drawn: `draw`, or `draw=1`."""
+    """Whether a snapshot request asks for the roundels to be drawn: `draw` or `draw=1`."""
     return "draw" in parameters and parameters.get("draw") not in ("0", "false")
 
 
 def parse_quality(parameters: zenoh.Parameters) -> int:
-    """The JPEG quality that a snapshot's request asks for."""
+    """The JPEG quality of a snapshot request."""
     text = parameters.get("quality") or str(QUALITY)
     if not (text.isdecimal() and len(text) < 4 and 1 <= int(text) <= 100):
         raise RequestError(f"quality={text}: give a number from 1 to 100")

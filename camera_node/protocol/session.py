@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Zenoh sessions with explicit endpoints: the server is a router that listens, everybody else connects to it."""
+"""Opens Zenoh sessions with explicit endpoints: the server is a router that listens, other programs connect to it."""
 
 import json
 import logging
@@ -14,66 +14,96 @@ from camera_node.errors import ConfigError, NetworkError
 
 log = logging.getLogger("camera_node.network")
 
-PATIENCE_S = 3.0  # how long the server may take to be seen before its absence is told
+REPORT_S = 5.0  # timeout of the query for a router's endpoints
+PATIENCE_S = 3.0  # time without a server after which its absence is logged
+ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
-    """The session of a server, which is the arena's Zenoh router.
+    """Open the server's session, which is the arena's Zenoh router.
+
+    The operating system chooses the port of an endpoint such as tcp/127.0.0.1:0; `listening_endpoints` reads it.
 
     Raises:
-        NetworkError: an endpoint is taken or is none.
-        ConfigError: the Zenoh configuration is missing or broken.
+        NetworkError: an endpoint is taken or invalid.
+        ConfigError: the Zenoh configuration is missing or invalid.
     """
-    # A listening timeout other than 0 would hide that the port is taken.
+    # With a listening timeout other than 0, opening succeeds although the port is taken.
     options = {"listen/endpoints": list(listen), "listen/timeout_ms": 0, "listen/exit_on_failure": True}
+    if has_assigned_port(listen):
+        options |= {"adminspace/enabled": True, "adminspace/permissions/read": True}
     try:
         return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"can't listen on {' '.join(listen)}: is another server running there? Stop it or choose another "
-            f"port with --listen, written as tcp/0.0.0.0:7447 ({_brief(error)})"
+            f"can't listen on {' '.join(listen)}: another server may use the port; stop it or choose another port "
+            f"with --listen, such as tcp/0.0.0.0:7447 ({_brief(error)})"
         ) from None
 
 
-def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
-    """A session that opens at once and keeps trying to reach the router, now and after every loss.
+def has_assigned_port(listen: Sequence[str]) -> bool:
+    """Whether the port of one of the endpoints is 0, so that the operating system chooses it."""
+    return any(ASSIGNED_PORT.search(endpoint) for endpoint in listen)
 
-    It is a Zenoh router that listens nowhere. A Zenoh client does not open while no router answers, and what a Zenoh
-    peer publishes is not relayed by a router to other peers (measured with 1.10). What is put while the router is
-    away is dropped at once.
+
+def listening_endpoints(router: zenoh.Session, listen: Sequence[str]) -> tuple[str, ...]:
+    """The endpoints of a router that `open_router` opened with `listen`.
+
+    They are `listen` itself unless a port in it is 0. In that case they are read from the router's admin space, because
+    Zenoh's Python API 1.10 does not report locators.
 
     Raises:
-        NetworkError: an endpoint is none.
-        ConfigError: the Zenoh configuration is missing or broken.
+        NetworkError: the router does not report them.
+    """
+    if not has_assigned_port(listen):
+        return tuple(listen)
+    for reply in router.get(f"@/{router.info.zid()}/router", timeout=REPORT_S):
+        if reply.ok is not None and (locators := json.loads(reply.ok.payload.to_bytes()).get("locators")):
+            return tuple(locators)
+    raise NetworkError(
+        f"the Zenoh router does not report the ports of {' '.join(listen)}; give a port instead of 0 in --listen"
+    )
+
+
+def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
+    """Open a session that connects to the router as soon as it can, and reconnects after every loss.
+
+    The session is a Zenoh router without listeners. A Zenoh client does not open while no router answers, and a router
+    does not relay the publications of a Zenoh peer to other peers (measured with 1.10). Publications are dropped while
+    the session is not connected.
+
+    Raises:
+        NetworkError: an endpoint is invalid.
+        ConfigError: the Zenoh configuration is missing or invalid.
     """
     options = {
         "listen/endpoints": [],
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": -1,  # 0 would mean one attempt
+        "connect/timeout_ms": -1,  # no limit; 0 is a single attempt
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
-        "transport/unicast/open_timeout": 2000,  # of a listener that is no Zenoh: closing waits for it
+        "transport/unicast/open_timeout": 2000,  # `close` waits this long for a listener that is not Zenoh
     }
     try:
         return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"can't connect to {' '.join(connect)}: write an endpoint as tcp/host:7447 ({_brief(error)})"
+            f"can't connect to {' '.join(connect)}: give an endpoint such as tcp/host:7447 ({_brief(error)})"
         ) from None
 
 
 def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
-    """The user's Zenoh configuration or the default, with the program's own options over it.
+    """The user's Zenoh configuration or the default one, overridden by the program's own options.
 
-    Scouting stays off unless the user's file turns it on.
+    Scouting is off unless the user's file enables it.
     """
     config = _read(path) if path else zenoh.Config()
     for key in ("scouting/multicast/enabled", "scouting/gossip/enabled"):
         if config.get_json(key) == "null":
             config.insert_json5(key, "false")
     if config.get_json("scouting/delay") == "null":
-        config.insert_json5("scouting/delay", "0")  # opening would wait for what scouting finds
+        config.insert_json5("scouting/delay", "0")  # otherwise opening waits for scouting
     for key, value in {"mode": "router", **options}.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -85,30 +115,30 @@ def _read(path: Path) -> zenoh.Config:
     try:
         return zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
-        raise ConfigError(f"{path} is no Zenoh configuration: {_brief(error)}") from None
+        raise ConfigError(f"{path} is not a valid Zenoh configuration: {_brief(error)}") from None
 
 
 def _brief(error: Exception) -> str:
-    """Zenoh's message without the places in its sources."""
+    """Zenoh's error message without the locations in its source code."""
     return " ".join(re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).split())[:160]
 
 
 class ServerWatch:
-    """Tells once that the server is away, and once that it is back; by its liveliness token."""
+    """Logs once that the server is away and once that it is back, according to its liveliness token."""
 
     def __init__(self, session: zenoh.Session, key: str, patience_s: float = PATIENCE_S) -> None:
         self._key, self._patience_s = key, patience_s
-        self._present, self._told = False, False
+        self._present, self._reported = False, False
         self._since = time.monotonic()
         self._subscriber = session.liveliness().declare_subscriber(key, self._change, history=True)
 
-    def tell_absence(self) -> None:
-        """Called now and then: a server that was not seen since the start is told of once."""
-        if not self._present and not self._told and time.monotonic() - self._since >= self._patience_s:
-            self._told = True
+    def report_absence(self) -> None:
+        """Log that the server is away, once for each absence longer than `patience_s`; to be called periodically."""
+        if not self._present and not self._reported and time.monotonic() - self._since >= self._patience_s:
+            self._reported = True
             log.warning(
-                "the server is away; what is seen meanwhile is lost, and it is tried on. "
-                "Does python -m fusion run, and are --connect and --arena right? (no %s)",
+                "the server is away; detections are dropped until it returns; retrying. "
+                "Check that python -m fusion runs and that --connect and --arena are right (no %s)",
                 self._key,
             )
 
@@ -117,7 +147,7 @@ class ServerWatch:
 
     def _change(self, sample: zenoh.Sample) -> None:
         self._present = sample.kind == zenoh.SampleKind.PUT
-        if self._present and self._told:
-            log.warning("the server is there again")
-            self._told = False
+        if self._present and self._reported:
+            log.warning("the server is back")
+            self._reported = False
         self._since = time.monotonic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m camera_node.simulation`: renders a simulated arena into a folder."""
+"""`python -m camera_node.simulation`: renders a simulated recording into a folder."""
 
 import math
 from pathlib import Path
@@ -13,7 +13,7 @@ from camera_node.simulation.scene import Scene
 
 
 def main() -> None:
-    """Render a simulated arena into a folder of frames, with its truth beside it."""
+    """The entry point of the command."""
     run(lambda: tyro.cli(_render, prog="python -m camera_node.simulation"))
 
 
@@ -28,15 +28,15 @@ def _render(
 
     Args:
         scene: the scene's YAML file, such as configs/demo/scene.yaml.
-        out: the folder to write to; it is made where it is missing.
-        start: first instant, seconds since the epoch. The wand is waved first, then the robots come.
-        seconds: how long.
-        cameras: render these cameras only.
+        out: the folder to write to; it is created if necessary.
+        start: time of the beginning, seconds since the epoch. The wand moves first, the robots after it.
+        seconds: duration of the recording.
+        cameras: the cameras to render; all unless given.
     """
     if not (math.isfinite(start) and 0 < seconds < math.inf):
-        raise ConfigError(f"--start {start} --seconds {seconds} is no span of time; give seconds above 0")
+        raise ConfigError(f"--start {start} --seconds {seconds} is not a time span; give seconds above 0")
     render_recording(Scene.load(scene), out, start, start + seconds, cameras or None)
-    print(f"{out}: frames by camera, truth.json, and rig.yaml with the intrinsics alone")
+    print(f"{out}: frames of each camera, truth.json, and rig.yaml with the intrinsics")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a simulated camera sees behind the roundels: a floor with tiles, tape, letters, dark discs and uneven light."""
+"""Renders the background of a simulated arena: a floor with tiles, tape, letters, dark discs and uneven light."""
 
 import cv2
 import numpy as np
@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array
 
 Picture = NDArray[np.float32]
-SIZE_M = 10.0  # the floor is a square around the world's origin
-PIXEL_M = 0.005
+SIZE_M = 10.0  # side of the square floor around the world's origin
+PIXEL_M = 0.005  # side of a pixel of the floor's image
 FLOOR = 128.0
-WALL = 120.0  # grey level of all that is not floor
+WALL = 120.0  # grey level outside the floor
 SUBSAMPLES = 3
 _TO_PIXELS = np.array([1, -1], np.float32) / np.float32(PIXEL_M)
 
@@ -23,9 +23,9 @@ def plain_floor() -> Picture:
 
 
 def paint_floor(seed: int) -> Picture:
-    """Grey levels of the floor, (n, n); columns grow with the world's x, rows against its y.
+    """Grey levels of a cluttered floor, (n, n); columns run along the world's x axis, rows against its y axis.
 
-    None of its marks is a roundel, though discs, letters and sheets of paper come close.
+    Its discs, letters and sheets of paper resemble roundels but are none.
     """
     rng = np.random.default_rng(seed)
     floor = plain_floor().astype(np.uint8)
@@ -42,18 +42,18 @@ def paint_floor(seed: int) -> Picture:
 
 
 def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
-    """The floor (z = 0) as a camera sees it, (h, w).
+    """Render a camera's view (h, w) of the floor z = 0.
 
     Args:
-        floor: its grey levels, from `paint_floor`.
+        floor: grey levels from `paint_floor`.
         rays: (h, w, 2) x/z and y/z of each pixel's viewing ray.
         T_world_cam: (4, 4) pose of the camera.
     """
     h, w = rays.shape[:2]
     T = T_world_cam.astype(np.float32)
     fine = cv2.resize(rays, (w * SUBSAMPLES, h * SUBSAMPLES), interpolation=cv2.INTER_LINEAR)
-    directions = cv2.transform(fine, T[:3, :3])  # of a point (x, y) it takes (x, y, 1)
-    down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # a ray that rises goes far out
+    directions = cv2.transform(fine, T[:3, :3])  # cv2.transform extends (x, y) to (x, y, 1)
+    down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # rays above the horizon end far away
     xy = T[:2, 3] - directions[..., :2] * (T[2, 3] / down)
     where = (xy * _TO_PIXELS + np.float32(SIZE_M / 2 / PIXEL_M)).clip(-10, 32000)
     columns, rows = cv2.split(where)

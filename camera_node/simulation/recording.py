@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A simulated recording: frames of all cameras, with the true poses beside them."""
+"""Renders a simulated recording: the frames of all cameras, and the true poses."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import msgspec
 from camera_node.config import write_atomically
 from camera_node.errors import CameraError, ConfigError
 from camera_node.geometry.pose import invert
-from camera_node.simulation.camera import exposure_middle_s
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import WAND, Scene, SceneCamera
 from camera_node.terminal import track
@@ -26,49 +24,39 @@ def render_recording(
     cameras: Sequence[str] | None = None,
     epoch_ns: int = 0,
 ) -> None:
-    """Write `<folder>/<camera>/<t_ns>.png` for every exposure from `start_s` until before `stop_s`.
+    """Write `<folder>/<camera>/<t_ns>.png` for every exposure in [start_s, stop_s), seconds since `epoch_ns`.
 
-    Beside them go `truth.json` and `rig.yaml`, which holds the intrinsics alone: what a calibration starts from.
+    Also writes `truth.json`, and `rig.yaml` with the intrinsics alone, from which a calibration starts.
 
     Raises:
         ConfigError: the scene lacks one of the cameras, or the folder can't be written to.
+        CameraError: a frame can't be written.
     """
     names = list(scene.cameras) if cameras is None else list(cameras)
-    exposures = {name: list_exposures(scene.camera(name), start_s, stop_s) for name in names}
+    exposures = {name: scene.camera(name).exposures(start_s, stop_s) for name in names}
     for name in names:
-        try:
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"{folder / name} can't be made: {error.strerror}; choose another folder"
-            ) from None
+        _make_folder(folder / name)
     write_atomically(folder / "truth.json", json.dumps(describe_truth(scene, exposures, epoch_ns), indent=1))
     entries = {name: entry for name, entry in scene.rig_entries().items() if name in names}
     write_atomically(folder / "rig.yaml", msgspec.yaml.encode({"cameras": entries}).decode())
     for name, indices in exposures.items():
         renderer = Renderer(scene, name)
         for index in track(indices, f"rendering {name}"):
-            t_s = exposure_middle_s(scene.camera(name), index)
+            t_s = scene.camera(name).exposure_middle_s(index)
             path = folder / name / f"{epoch_ns + round(t_s * 1e9):015d}.png"
             if not cv2.imwrite(str(path), renderer.render(t_s, index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-                raise CameraError(f"{path} can't be written: is the disk full?")
-
-
-def list_exposures(camera: SceneCamera, start_s: float, stop_s: float) -> range:
-    """Indices of a camera's exposures whose middle lies in [start_s, stop_s); none before its first."""
-    first, end = (math.ceil((t - camera.phase_ms * 1e-3) * camera.fps - 1e-9) for t in (start_s, stop_s))
-    return range(max(first, 0), max(end, 0))
+                raise CameraError(f"{path} can't be written; check the free space on the disk")
 
 
 def describe_truth(scene: Scene, exposures: dict[str, range], epoch_ns: int) -> dict:
-    """What is true of a recording: cameras, bodies, and their poses at the stamps of the first camera.
+    """The truth of a recording: cameras, bodies, and poses at the stamps of the first camera.
 
-    Matrices are (4, 4) and times Unix seconds. `outer_diameter_m` of the robots is that of the smallest.
+    Matrices are (4, 4), and times are Unix seconds. `outer_diameter_m` of the robots is the smallest of them.
     """
-    name = next(iter(exposures))
-    times = [exposure_middle_s(scene.camera(name), index) for index in exposures[name]]
+    first = scene.camera(next(iter(exposures)))
     poses: dict[str, list] = {body: [] for body in (WAND, *scene.robots)}
-    for t_s in times:
+    for index in next(iter(exposures.values())):
+        t_s = first.exposure_middle_s(index)
         for body, (_, T) in scene.bodies_at(t_s).items():
             poses[body].append([epoch_ns * 1e-9 + t_s, T.tolist()])
     return {
@@ -96,3 +84,10 @@ def _describe_camera(camera: SceneCamera) -> dict:
         "fps": camera.fps,
         "phase_ms": camera.phase_ms,
     }
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder} can't be created: {error.strerror}; choose another folder") from None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Images of a simulated arena, by tracing the rays of a distorting lens onto printed discs.
+"""Renders images of a simulated arena by tracing the viewing rays of a distorting lens onto printed discs.
 
-The truth that detectors are measured against, so it shares no model with them: no ellipse and no model of an edge
-stands in here. Each sub-sample of a pixel is a viewing ray that meets a disc's plane at some radius.
+The images test detectors, so the renderer shares no model with them: it contains no ellipse and no edge model. The
+viewing ray of each sub-sample of a pixel is intersected with a disc's plane, at some distance from the disc's centre.
 """
 
 import math
@@ -11,47 +11,44 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
-from camera_node.simulation.background import paint_floor, plain_floor, view_floor
+from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene
 
-Picture = NDArray[np.float32]
-WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print where the lens lets all light through
-SUBSAMPLES = 3  # each pixel is traced at 3 x 3 places; edges come out right to 0.5 % of the contrast
-NEAR_M = 0.05
-EDGE_ON = 0.02  # flatter views, less than half a pixel high, would bring the plane's horizon into the picture
+WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print without vignetting
+SUBSAMPLES = 3  # each pixel has 3 x 3 sub-samples; the error at edges is then below 0.5 % of the contrast
+NEAR_M = 0.05  # discs that come nearer to the camera's plane are not drawn
+EDGE_ON = 0.02  # rad; discs seen at smaller angles are not drawn: they are less than half a pixel high
 CORNERS = np.linspace(0, math.tau, 12, endpoint=False)
-POLYGON = np.column_stack([np.cos(CORNERS), np.sin(CORNERS)]) / math.cos(
-    math.pi / 12
-)  # around the unit circle
-NOISE_SHIFTS = 128  # one field of noise serves all frames, shifted at random by up to so many pixels
+# A polygon around the unit circle.
+POLYGON = np.column_stack([np.cos(CORNERS), np.sin(CORNERS)]) / math.cos(math.pi / 12)
+NOISE_SHIFTS = 128  # pixels; all frames use one noise image, shifted at random by less than this
 
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A printed roundel before a camera: T_cam_disc (4, 4), and its radii: card, black disc, white disc; metres."""
+    """A printed roundel in front of a camera: T_cam_disc (4, 4), and radii of card, black and white disc, metres."""
 
     T: Array
     radii: tuple[float, float, float]
 
     @property
     def faces_camera(self) -> bool:
-        """Whether the camera sees the printed side, from more than EDGE_ON radians above its plane."""
+        """Whether the camera sees the printed side at an angle of more than EDGE_ON radians."""
         t = self.T[:3, 3]
         return float(self.T[:3, 2] @ t) < -EDGE_ON * float(np.linalg.norm(t))
 
     def outline(self) -> Array:
-        """(12, 3) corners, camera frame, of a polygon around the card."""
+        """(12, 3) corners of a polygon around the card, camera frame, metres."""
         return self.radii[0] * POLYGON @ self.T[:3, :2].T + self.T[:3, 3]
 
 
-def discs_of(body: Body, T_cam_body: Array) -> list[Disc]:
-    """The roundels of a body at T_cam_body (4, 4), seen or not."""
+def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
+    """The roundels of a body at T_cam_body (4, 4), visible or not."""
     outer = body.diameter_m / 2
     radii = (outer * body.surround_ratio, outer, outer * body.inner_ratio)
     discs = []
@@ -63,16 +60,16 @@ def discs_of(body: Body, T_cam_body: Array) -> list[Disc]:
 
 
 class Renderer:
-    """What one camera of a scene sees at any time."""
+    """Renders the images of one camera of a scene."""
 
     def __init__(self, scene: Scene, name: str) -> None:
         """Raises ConfigError where the scene has no camera `name`."""
         self.scene, self.camera = scene, scene.camera(name)
         self._T_cam_world = invert(self.camera.T_world_cam)
-        self._reach = math.ceil(4 * self.camera.blur_px)  # pixels over which the blur spreads
+        self._reach = math.ceil(4 * self.camera.blur_px)  # pixels to which the blur extends
         self._margin = self._reach + 2
         self._rays = map_rays(self.camera, self._margin)
-        # Outside this radius x/z, y/z nothing is seen: the corners' with room for a disc that is cut there.
+        # No disc beyond this radius in x/z, y/z is visible: that of the corners, plus a margin for clipped discs.
         self._limit = 1.15 * float(np.linalg.norm(self._rays, axis=2).max())
         self._gain = vignette(self.camera)
         self._seed = zlib.crc32(f"{scene.seed} {name}".encode())
@@ -80,47 +77,47 @@ class Renderer:
         self._backdrop = self._view_backdrop()
 
     def render(self, t_s: float, frame: int = 0) -> Grey:
-        """The image (h, w), uint8, of an exposure whose middle is `t_s`; `frame` alone decides its noise."""
+        """Render the image (h, w), uint8, of an exposure with its middle at `t_s`; `frame` seeds its noise."""
         image = self._backdrop.copy()
-        for instants in self._visible_discs(t_s):
-            self._paint(image, instants)
+        for samples in self._visible_discs(t_s):
+            self._paint(image, samples)
         return self._add_noise(image, frame)
 
     def _visible_discs(self, t_s: float) -> list[list[Disc]]:
-        """Roundels that face the camera, the farthest first; of each its disc at all instants of the exposure."""
+        """The roundels that face the camera, farthest first, each as its discs at all sample times of the exposure."""
         n, exposure_s = self.camera.motion_samples, self.camera.exposure_us * 1e-6
-        instants = [self._discs_at(t_s + ((k + 0.5) / n - 0.5) * exposure_s) for k in range(n)]
-        middle = {key: disc for key, disc in instants[n // 2].items() if disc.faces_camera}
+        samples = [self._discs_at(t_s + ((k + 0.5) / n - 0.5) * exposure_s) for k in range(n)]
+        middle = {key: disc for key, disc in samples[n // 2].items() if disc.faces_camera}
         farthest_first = sorted(middle, key=lambda key: -float(np.linalg.norm(middle[key].T[:3, 3])))
-        return [[discs.get(key, middle[key]) for discs in instants] for key in farthest_first]
+        return [[discs.get(key, middle[key]) for discs in samples] for key in farthest_first]
 
     def _discs_at(self, t_s: float) -> dict[tuple[str, int], Disc]:
-        """Every roundel in the arena, by its body and number."""
+        """Every roundel in the arena, by the name of its body and its number."""
         bodies = self.scene.bodies_at(t_s).items()
-        discs = ((name, discs_of(body, self._T_cam_world @ T)) for name, (body, T) in bodies)
+        discs = ((name, place_discs(body, self._T_cam_world @ T)) for name, (body, T) in bodies)
         return {(name, k): disc for name, own in discs for k, disc in enumerate(own)}
 
-    def _paint(self, image: Picture, instants: list[Disc]) -> None:
-        """Put one roundel over what is there: its card hides it in proportion to the card's part of the pixel."""
-        box = self._bound(instants)
+    def _paint(self, image: Picture, samples: list[Disc]) -> None:
+        """Draw one roundel; it replaces the light of each pixel in proportion to the card's share of the pixel."""
+        box = self._bound(samples)
         if box is None:
             return
         u0, v0, u1, v1 = box
-        layers = [self._trace(disc, box) for disc in instants]
+        layers = [self._trace(disc, box) for disc in samples]
         card, light = cv2.split(sum(layers[1:], layers[0]) / len(layers))
         seen = (slice(max(v0, 0), v1), slice(max(u0, 0), u1))
         h, w = image[seen].shape
         inside = (slice(max(-v0, 0), max(-v0, 0) + h), slice(max(-u0, 0), max(-u0, 0) + w))
         image[seen] += light[inside] * self._gain[seen] - card[inside] * image[seen]
 
-    def _bound(self, instants: list[Disc]) -> tuple[int, int, int, int] | None:
-        """Columns and rows u0, v0, u1, v1 that the discs can touch, within the rays that are known; or None."""
-        points = np.concatenate([disc.outline() for disc in instants])
+    def _bound(self, samples: list[Disc]) -> tuple[int, int, int, int] | None:
+        """Columns and rows u0, v0, u1, v1 that the discs may cover, within the range of `_rays`; None without any."""
+        points = np.concatenate([disc.outline() for disc in samples])
         z, radii = points[:, 2], np.hypot(points[:, 0], points[:, 1])
         if z.min() < NEAR_M or (radii > self._limit * z).all():
             return None
         size, known = np.array((self.camera.width, self.camera.height)), self._reach + 1
-        if (radii > self._limit * z).any():  # out there a lens model may fold back: anywhere in the image
+        if (radii > self._limit * z).any():  # the lens model may project such points anywhere
             return (-known, -known, *(size + known).tolist())
         uv = self.camera.project(points)
         low = np.floor(uv.min(0)).astype(int) - self._reach
@@ -130,14 +127,14 @@ class Renderer:
         return (*np.maximum(low, -known).tolist(), *np.minimum(high, size + known).tolist())
 
     def _trace(self, disc: Disc, box: tuple[int, int, int, int]) -> Picture:
-        """(h, w, 2) of a box: how much of each pixel the card covers, and the light from there, both blurred."""
+        """(h, w, 2) of a box: the card's share of each pixel and the light from that share, both blurred."""
         u0, v0, u1, v1 = box
-        m = self._margin - 1  # one pixel more on each side for the slope
+        m = self._margin - 1  # one more pixel on each side for the gradient
         rays = self._rays[v0 + m : v1 + m + 2, u0 + m : u1 + m + 2]
         fine = cv2.resize(rays, None, fx=SUBSAMPLES, fy=SUBSAMPLES, interpolation=cv2.INTER_LINEAR)
         radius = trace_radius(disc, np.asarray(fine, np.float32))
         rim = SUBSAMPLES - 1
-        card, black, white = cover(radius[rim:-rim, rim:-rim], disc.radii)
+        card, black, white = covered_shares(radius[rim:-rim, rim:-rim], disc.radii)
         layers = cv2.merge([card, WHITE * card - (WHITE - BLACK) * (black - white)])
         blurred = cv2.GaussianBlur(
             layers, (0, 0), self.camera.blur_px * SUBSAMPLES, borderType=cv2.BORDER_CONSTANT
@@ -164,29 +161,33 @@ class Renderer:
 
 
 def trace_radius(disc: Disc, rays: Picture) -> Picture:
-    """Distance (h, w) from the disc's centre, metres, of where rays (h, w, 2: x/z, y/z) meet its plane."""
+    """Distances (h, w) from the disc's centre, metres, at which rays (h, w, 2: x/z, y/z) intersect its plane."""
     to_plane = np.linalg.inv(np.column_stack([disc.T[:3, :2], disc.T[:3, 3]]))  # p = [e1 e2 t] (a, b, 1) s
     points = cv2.perspectiveTransform(rays, to_plane)
     return np.asarray(cv2.magnitude(points[..., 0], points[..., 1]), np.float32)
 
 
-def cover(radius: Picture, radii: tuple[float, ...]) -> list[Picture]:
-    """What part of each cell (h, w) lies within each of the radii, from `radius` (h + 2, w + 2) at the cells' centres.
+def covered_shares(radius: Picture, radii: tuple[float, ...]) -> list[Picture]:
+    """The share of each cell (h, w) that lies within each of the radii.
 
-    Across an edge the part falls from 1 to 0 over one cell along the steeper axis: then the cells of a column (or row)
-    that an edge crosses add up to where it crosses that column's middle, whatever the edge's direction.
+    Across an edge, the share falls from 1 to 0 over one cell along the steeper axis. The shares of the cells in a
+    column (or row) then sum to the position at which the edge crosses its middle, for any direction of the edge.
+
+    Args:
+        radius: (h + 2, w + 2) distances of the cells' centres from the disc's centre, with one more cell on each side.
+        radii: the radii, in the unit of `radius`.
     """
     across = cv2.absdiff(radius[1:-1, 2:], radius[1:-1, :-2])
     down = cv2.absdiff(radius[2:, 1:-1], radius[:-2, 1:-1])
     cell = cv2.max(across, down) / 2 + np.float32(1e-9)
-    center = radius[1:-1, 1:-1]
-    return [(0.5 + (np.float32(r) - center) / cell).clip(0, 1) for r in radii]
+    middle = radius[1:-1, 1:-1]
+    return [(0.5 + (np.float32(r) - middle) / cell).clip(0, 1) for r in radii]
 
 
 def map_rays(lens: Lens, margin: int) -> Picture:
-    """(h + 2 margin, w + 2 margin, 2): x/z and y/z of each pixel's ray, of `margin` pixels around the image too.
+    """(h + 2 margin, w + 2 margin, 2): x/z and y/z of the rays of all pixels and of `margin` pixels around the image.
 
-    Far outside where the distortion has no inverse.
+    Rays of pixels without an inverse of the distortion are set to 1000, which is outside every image.
     """
     u, v = np.arange(-margin, lens.width + margin), np.arange(-margin, lens.height + margin)
     rays = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))
@@ -194,6 +195,6 @@ def map_rays(lens: Lens, margin: int) -> Picture:
 
 
 def vignette(lens: Lens) -> Picture:
-    """How much of the light arrives at each pixel (h, w): all at the centre, 70 % in the corners."""
+    """The share of the light that reaches each pixel (h, w): 100 % at the centre, 70 % in the corners."""
     u, v = np.meshgrid(np.linspace(-1, 1, lens.width), np.linspace(-1, 1, lens.height))
     return (1 - 0.15 * (u**2 + v**2)).astype(np.float32)

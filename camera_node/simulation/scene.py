@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A simulated arena as a pure function of time: cameras, a wand that is waved, then robots that drive and fly."""
+"""Describes a simulated arena as a function of time: its cameras, first a moving wand, then moving robots."""
 
 import math
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from camera_node.geometry.body import Body, Vector
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import look_at, rotation_from_vector
 
-WAND = "wand"  # its name among the bodies
+WAND = "wand"  # the name of the wand among the bodies
 
 
 class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One coordinate that swings: mean + amplitude sin(2 pi t / period_s + phase_deg)."""
+    """A sinusoidal coordinate: mean + amplitude sin(2 pi t / period_s + phase_deg)."""
 
     mean: float = 0.0
     amplitude: float = 0.0
@@ -35,7 +35,7 @@ class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.mean + self.amplitude * math.sin(self._angle(t_s))
 
     def rate(self, t_s: float) -> float:
-        """Its derivative by time, per second."""
+        """The derivative of the coordinate with respect to time, per second."""
         return self.amplitude * math.tau / self.period_s * math.cos(self._angle(t_s))
 
     def _angle(self, t_s: float) -> float:
@@ -43,10 +43,10 @@ class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SimulatedMotion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a body's origin goes (metres, world), and how the body turns (degrees: yaw, then pitch, then roll).
+    """The motion of a body: position of its origin (metres, world) and rotation (degrees: yaw, then pitch, then roll).
 
-    Two swings a quarter period apart draw a circle, one of half the other's period a figure eight. With
-    `faces_travel` the body's x axis points along its horizontal velocity, and `yaw_deg` adds to that.
+    Two swings a quarter period apart form a circle; with half the period in one of them, a figure eight. With
+    `faces_travel`, the body's x axis points along its horizontal velocity, and `yaw_deg` is relative to that.
     """
 
     x_m: Swing = Swing()
@@ -63,19 +63,19 @@ class SimulatedMotion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         if self.faces_travel:
             yaw += math.atan2(self.y_m.rate(t_s), self.x_m.rate(t_s))
         T = np.eye(4)
-        T[:3, :3] = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
+        T[:3, :3] = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
         T[:3, 3] = [swing.at(t_s) for swing in (self.x_m, self.y_m, self.z_m)]
         return T
 
 
 class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A lens, where it stands and looks, when it exposes, and how good its image is.
+    """A camera: its lens, pose, exposure times and image quality.
 
     Attributes:
-        fps: frames a second; cameras run free, so each has its own rate and phase.
-        phase_ms: middle of the first exposure, after the epoch.
-        exposure_us: how long the shutter is open.
-        motion_samples: instants of one exposure that are averaged; 1 leaves the image without motion blur.
+        fps: frames per second; cameras are free-running, so each has its own rate and phase.
+        phase_ms: time of the middle of the first exposure, after the epoch.
+        exposure_us: exposure time.
+        motion_samples: number of times within an exposure whose images are averaged; 1 gives no motion blur.
         blur_px: standard deviation of the lens's blur, pixels.
         noise: standard deviation of a pixel's noise, grey levels of 255.
     """
@@ -102,9 +102,18 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """(4, 4) pose of the camera."""
         return look_at(self.position_m, self.look_at_m)
 
+    def exposure_middle_s(self, index: int) -> float:
+        """Middle of the exposure `index`, seconds since the epoch."""
+        return self.phase_ms * 1e-3 + index / self.fps
+
+    def exposures(self, start_s: float, stop_s: float) -> range:
+        """Indices of the exposures whose middle lies in [start_s, stop_s); indices start at 0."""
+        first, end = (math.ceil((t - self.phase_ms * 1e-3) * self.fps - 1e-9) for t in (start_s, stop_s))
+        return range(max(first, 0), max(end, 0))
+
 
 class _Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The server's file is read here too; how a robot is tracked is not the scene's to judge."""
+    """A robot of the server's robots.yaml; the scene does not use the fields about tracking."""
 
     motion: object = None
     start_m: object = None
@@ -115,7 +124,7 @@ class _Robots(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scene's YAML file; without `clutter` the floor is plain grey."""
+    """A scene's YAML file; `wave_s` is the duration of the wand recording, and `clutter` adds marks to the floor."""
 
     wand: str
     robots: str
@@ -128,9 +137,9 @@ class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Scene:
-    """What stands in the arena, and where it is at every time `t_s`, seconds since the epoch.
+    """The bodies in the arena and their poses at any time `t_s`, seconds since the epoch.
 
-    While `t_s < wave_s` the wand is waved and no robot is there; after that the wand is gone.
+    While `t_s < wave_s` the arena contains the wand alone, afterwards the robots alone.
     """
 
     def __init__(self, file: _File, wand: Body, robots: Mapping[str, Body]) -> None:
@@ -141,19 +150,19 @@ class Scene:
 
     @classmethod
     def load(cls, path: Path) -> "Scene":
-        """Read a scene, and the wand and robots that it names by files beside it.
+        """Read a scene, and its wand and robots from the files that it names in the same folder.
 
         Raises:
-            ConfigError: a file is missing, broken or has an unknown key; a robot has no motion, or the reverse.
+            ConfigError: a file is missing, invalid or has an unknown key; a robot has no motion, or a motion no robot.
         """
         file = load_yaml(path, _File)
         wand = load_yaml(path.parent / file.wand, Body)
         robots = load_yaml(path.parent / file.robots, _Robots).robots
         if not file.cameras:
-            raise ConfigError(f"{path} names no camera; give at least one under cameras")
+            raise ConfigError(f"{path} has no camera; add at least one under cameras")
         if odd := set(robots) ^ set(file.robot_motions):
             raise ConfigError(
-                f"{path}: robot '{min(odd)}' must stand both in {file.robots} and under robot_motions"
+                f"{path}: robot '{min(odd)}' needs an entry both in {file.robots} and under robot_motions"
             )
         if WAND in robots:
             raise ConfigError(f"{path.parent / file.robots}: '{WAND}' is the wand's name; rename the robot")
@@ -174,7 +183,7 @@ class Scene:
         return self.camera(name).T_world_cam
 
     def rig_entries(self) -> dict[str, dict]:
-        """Each camera's intrinsics as plain values: `{"cameras": rig_entries()}` is a rig without poses."""
+        """The intrinsics of each camera as plain values; `{"cameras": rig_entries()}` is a rig file without poses."""
         return {
             name: {field: getattr(camera, field) for field in Lens.__struct_fields__}
             | {"distortion": list(camera.distortion)}
@@ -182,11 +191,11 @@ class Scene:
         }
 
     def wand_pose(self, t_s: float) -> Array | None:
-        """T_world_wand (4, 4), or None when the wave is over."""
+        """T_world_wand (4, 4), or None after the wand recording."""
         return self._wand_motion.pose(t_s) if t_s < self.wave_s else None
 
     def robot_pose(self, name: str, t_s: float) -> Array | None:
-        """T_world_robot (4, 4), or None while the wand is waved.
+        """T_world_robot (4, 4), or None during the wand recording.
 
         Raises:
             ConfigError: the scene has no such robot.
@@ -195,25 +204,12 @@ class Scene:
             raise ConfigError(f"the scene has no robot '{name}'; it has {', '.join(sorted(self._motions))}")
         return None if t_s < self.wave_s else self._motions[name].pose(t_s)
 
-    def robot_twist(self, name: str, t_s: float) -> tuple[Array, Array] | None:
-        """Linear (3,) m/s and angular (3,) rad/s velocity of a robot in the world, or None while it is absent.
-
-        Central differences over 1 ms: errors are of the order 1e-6 of the figures for motions of seconds.
-        """
-        if self.robot_pose(name, t_s) is None:
-            return None
-        h = 5e-4
-        before, after = (self._motions[name].pose(t_s + dt) for dt in (-h, h))
-        dR = after[:3, :3] @ before[:3, :3].T
-        turn = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]]) / 2
-        return (after[:3, 3] - before[:3, 3]) / (2 * h), turn / (2 * h)
-
     def bodies_at(self, t_s: float) -> dict[str, tuple[Body, Array]]:
-        """Every body in the arena by name, the wand under "wand", with its T_world_body (4, 4)."""
+        """The bodies in the arena with their T_world_body (4, 4), by name; the wand has the name "wand"."""
         if t_s < self.wave_s:
             return {WAND: (self.wand, self._wand_motion.pose(t_s))}
         return {name: (body, self._motions[name].pose(t_s)) for name, body in self.robots.items()}
 
 
-def _turn(axis: int, angle: float) -> Array:
+def _rotation(axis: int, angle: float) -> Array:
     return rotation_from_vector(np.eye(3)[axis] * angle)

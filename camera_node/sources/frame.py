@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a source of frames is: the frame, its source, and how one is opened."""
+"""Frames, the interface of their sources, and the settings with which a source is opened."""
 
 import re
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from camera_node.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One image: grey (h, w) uint8; `t_ns` is the middle of its exposure on this machine's Unix clock."""
+    """One image: grey (h, w) uint8; `t_ns` is the middle of its exposure in this machine's Unix time."""
 
     image: Grey
     t_ns: int
@@ -21,25 +21,53 @@ class Frame:
 
 
 class Source(Protocol):
-    """A camera, a file or a simulation. Iterating ends where the source ends; a live camera's ends at `close`."""
+    """A camera, a recording or a simulation. Iterating yields its frames until it ends or is closed.
+
+    The defaults are those of a source that keeps up with its reader and has no exposure control.
+
+    Attributes:
+        is_recording: the frames were captured earlier, so that reading may start late without losing any.
+        dropped: frames since the start that were not delivered because a newer one was available.
+    """
+
+    is_recording: bool = False
+    dropped: int = 0
+
+    @property
+    def exposure_us(self) -> float | None:
+        """The exposure time that was set, microseconds; None where the camera chooses it."""
+        return None
+
+    @property
+    def gain(self) -> float | None:
+        """The gain that was set, in the driver's units; None where the camera chooses it."""
+        return None
 
     def __iter__(self) -> Iterator[Frame]: ...
 
+    def adjust(self, exposure_us: float | None = None, gain: float | None = None) -> None:
+        """Change exposure (microseconds) and gain from the next frame on; None leaves a value unchanged.
+
+        Raises:
+            ConfigError: the source has neither.
+        """
+        raise ConfigError("this source has no exposure or gain to set")
+
     def close(self) -> None:
-        """End the iteration, which may be another thread's, and release what is held."""
+        """End the iteration, also one in another thread, and release the camera or file."""
         ...
 
 
 @dataclass(frozen=True)
 class SourceSettings:
-    """How a source is opened; each kind of source takes what it knows."""
+    """Settings with which a source is opened; each kind of source uses those that apply to it."""
 
     width: int | None = None
     """Image width, pixels (cameras); the driver's choice unless given."""
     height: int | None = None
     """Image height, pixels (cameras)."""
     fps: float | None = None
-    """Frames a second (cameras, and videos without timestamps.csv)."""
+    """Frames per second (cameras, and videos without timestamps.csv)."""
     exposure_us: float | None = None
     """Exposure, microseconds (cameras); automatic unless given. Short exposures keep moving roundels sharp."""
     gain: float | None = None
@@ -47,15 +75,15 @@ class SourceSettings:
     fourcc: str | None = None
     """Pixel format, four letters such as MJPG, YUYV, GREY, "Y10 " or RGGB (cameras)."""
     scene: Path | None = None
-    """The simulated arena (--source sim)."""
+    """The scene file of the simulated arena (--source sim)."""
     epoch_ns: int | None = None
-    """Unix time of the simulation's, or with --stamps now the recording's, time 0; else it begins now."""
+    """Unix time of the simulation's time 0, or with --stamps now of the recording's; now unless given."""
     pace: Literal["recorded", "fast"] = "recorded"
-    """Deliver recorded frames when they are due, or as fast as they are read."""
+    """Deliver recorded frames at their recorded rate, or as fast as they can be read."""
     stamps: Literal["recorded", "now"] = "recorded"
-    """Keep recorded times as they are, or move them to now, as if the recording were a camera."""
+    """Publish recorded times unchanged, or shift them so that the recording starts now, as a live camera would."""
 
     def check(self) -> None:
-        """Raise ConfigError where a setting can't be."""
+        """Raise ConfigError where a setting is invalid."""
         if self.fourcc is not None and not re.fullmatch("[ -~]{4}", self.fourcc):
-            raise ConfigError(f"--fourcc {self.fourcc} is no pixel format; give four letters such as MJPG")
+            raise ConfigError(f"--fourcc {self.fourcc} is not a pixel format; give four letters such as MJPG")

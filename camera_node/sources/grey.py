@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What cameras and files give, as the 8-bit grey that the detector works on; copied only where it must be.
+"""Converts images of cameras and files to 8-bit grey, without a copy where the image is already 8-bit grey.
 
-Why 8 bits are enough of 10 to 16: rounding to 8 adds noise of 1 / sqrt(12) = 0.29 levels. A sensor's own is 1 level or
-more wherever a roundel can be read: a full well of 10,000 electrons that fills 255 levels has shot noise of 1 level at
-the dark end of the print (level 10) and 1.8 in the middle. In squares, 0.29 on 1 widens every error by 4 % at most.
+8 of 10 to 16 bits are enough. Rounding to 8 bits adds noise of 1 / sqrt(12) = 0.29 grey levels. The sensor's own noise
+is at least 1 level wherever a roundel can be detected: with a full well of 10,000 electrons at 255 levels, the shot
+noise is 1 level at the dark end of the print (level 10) and 1.8 in the middle. The sum of squares shows that rounding
+enlarges every error by at most 4 %.
 """
 
 import cv2
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 
 from camera_node.arrays import Grey
 
-DEPTHS = (8, 10, 12, 14, 16)  # bits that sensors have
+DEPTHS = (8, 10, 12, 14, 16)  # bits per pixel of image sensors
 
-# V4L2's names of raw formats. Mosaics go by the colours of their first row; OpenCV names them by the second's.
+# V4L2's names of raw formats. V4L2 names mosaics by the colours of their first row, OpenCV by those of the second.
 LUMA = {"YUYV": 0, "UYVY": 1}  # the channel that holds the grey level
 BAYER = {
     "RGGB": cv2.COLOR_BayerBG2GRAY,
@@ -25,13 +26,13 @@ BAYER = {
 RAW = (*LUMA, *BAYER, "GREY", "Y10 ", "Y12 ", "Y16 ")
 
 
-def grey(image: NDArray, fourcc: str | None = None) -> Grey:
-    """The grey levels (h, w), uint8, of an image of any of these kinds; an 8-bit grey image comes back as it is.
+def to_grey(image: NDArray, fourcc: str | None = None) -> Grey:
+    """Convert an image to grey levels (h, w), uint8; an 8-bit grey image is returned as it is.
 
     Args:
-        image: (h, w) grey or a mosaic, (h, w, 2) YUV, (h, w, 3) BGR; 8 bits, or grey of 10 to 16 bits in 16.
-        fourcc: the format of what V4L2 delivered, where the shape does not tell: one of `RAW`. A mosaic is
-            interpolated, which joins the noise of neighbours: covariances are then a little too small.
+        image: (h, w) grey or Bayer mosaic, (h, w, 2) YUV, (h, w, 3) BGR; 8 bits, or grey of 10 to 16 bits in uint16.
+        fourcc: one of `RAW` for an image from V4L2 whose shape does not determine its format. Demosaicing correlates
+            the noise of neighbouring pixels, so that the detector's covariances are slightly too small.
     """
     if image.ndim == 3 and image.shape[2] == 2:
         return cv2.extractChannel(image, LUMA.get(fourcc or "", 0)).astype(np.uint8, copy=False)
@@ -45,9 +46,10 @@ def grey(image: NDArray, fourcc: str | None = None) -> Grey:
 
 
 def narrow(image: NDArray[np.uint16]) -> Grey:
-    """Grey of 10 to 16 bits (h, w) as 8 bits, rounded: the full scale becomes 255.
+    """Scale grey of 10 to 16 bits (h, w) to 8 bits, rounded; full scale becomes 255.
 
-    The scale is the least of 8, 10, 12, 14 and 16 bits that holds the brightest pixel: containers don't tell it.
+    Full scale is that of the smallest of 8, 10, 12, 14 and 16 bits that holds the brightest pixel, because uint16
+    arrays and image files do not state their depth.
     """
     if not image.size:
         return np.empty(image.shape, np.uint8)

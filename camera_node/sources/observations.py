@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Recorded detections: out of folders of frames, or out of `observations.csv`, as the messages of a camera."""
+"""Reads recorded detections as `Detections` messages: from folders of frames, or from `observations.csv`."""
 
 import csv
 from collections.abc import Iterable, Iterator
@@ -11,36 +11,36 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
 from camera_node.errors import CameraError, ConfigError
 from camera_node.protocol.messages import Detections
-from camera_node.sources.replay import FolderSource
+from camera_node.sources.replay import FrameFolder
 from camera_node.terminal import track
 
-SIGMA_PX = 0.3  # of a centre whose file does not say better
+SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 Rows = dict[tuple[int, str], list[tuple[float, float, int]]]
 
 
 def detect_frames(folder: Path, **settings) -> list[Detections]:
-    """Detect roundels in `<folder>/<camera>/<t_ns>.png|jpg`, all cameras, in order of time.
+    """Detect roundels in `<folder>/<camera>/<t_ns>.png|jpg` of all cameras; the messages are in order of time.
 
     Args:
-        folder: one folder a camera inside it, named like the camera.
-        settings: those of `Detector`.
+        folder: contains one folder for each camera, with the camera's name.
+        settings: keyword arguments of `Detector`.
 
     Raises:
-        CameraError: the folder is missing or holds no frames, or a frame is no image.
+        CameraError: the folder is missing or holds no frames, or a frame is not an image.
     """
     if not folder.is_dir():
         raise CameraError(
-            f"{folder} is no folder; frames are expected as {folder}/<camera>/<t_ns>.png or .jpg"
+            f"{folder} is not a folder; frames are expected as {folder}/<camera>/<t_ns>.png or .jpg"
         )
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())
     if not names:
         raise CameraError(
-            f"{folder} holds no folder of a camera; frames are expected as {folder}/<camera>/<t_ns>.png"
+            f"{folder} contains no camera's folder; frames are expected as {folder}/<camera>/<t_ns>.png"
         )
-    sources = {name: FolderSource(folder / name) for name in names}
+    sources = {name: FrameFolder(folder / name) for name in names}
     frames = ((name, seq, frame) for name, source in sources.items() for seq, frame in enumerate(source))
     detectors = {name: Detector(**settings) for name in names}
-    found = [
+    messages = [
         Detections.pack(
             detectors[name].detect(frame.image),
             camera=name,
@@ -51,21 +51,21 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
         )
         for name, seq, frame in track(frames, f"detecting in {folder}", sum(map(len, sources.values())))
     ]
-    return sorted(found, key=lambda message: message.t_ns)
+    return sorted(messages, key=lambda message: message.t_ns)
 
 
 def read_observations(path: Path, sizes: dict[str, tuple[int, int]] | None = None) -> list[Detections]:
-    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker, one row a centre.
+    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker, one row for each centre.
 
     Args:
         path: the file.
-        sizes: (width, height) of each camera's image, where known; else the extent of its observations.
+        sizes: (width, height) of each camera's image; the extent of the observations where it is not given.
 
     Returns:
-        one message a camera and time, in order of time; `marker` becomes `id`.
+        one message for each camera and time, in order of time; `marker` becomes `id`.
 
     Raises:
-        ConfigError: the file is missing, lacks a column, or a row of it holds no numbers.
+        ConfigError: the file is missing, lacks a column, or has a row with invalid values.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -74,10 +74,10 @@ def read_observations(path: Path, sizes: dict[str, tuple[int, int]] | None = Non
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
     except UnicodeDecodeError:
         raise ConfigError(
-            f"{path} is no text; it needs the columns t_ns,camera,u,v and optionally marker"
+            f"{path} is not a text file; it needs the columns t_ns,camera,u,v and optionally marker"
         ) from None
     if not rows:
-        raise ConfigError(f"{path} holds no observations")
+        raise ConfigError(f"{path} holds no observations; add rows of t_ns,camera,u,v")
     extent: dict[str, tuple[int, int]] = {}
     for (_, camera), points in rows.items():
         w, h = extent.get(camera, (1, 1))
@@ -92,7 +92,7 @@ def write_observations(path: Path, messages: Iterable[Detections]) -> None:
     """Write detections as `observations.csv`.
 
     Raises:
-        ConfigError: the folder can't be written to.
+        ConfigError: the file can't be written.
     """
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
@@ -100,7 +100,7 @@ def write_observations(path: Path, messages: Iterable[Detections]) -> None:
             writer.writerow(["t_ns", "camera", "u", "v", "marker"])
             writer.writerows(_flatten(messages))
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; is its folder there?") from None
+        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
 
 
 def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:
@@ -118,13 +118,13 @@ def _read_rows(file: Iterable[str], path: Path) -> Rows:
     for row in reader:
         try:
             u, v, number = float(row["u"]), float(row["v"]), int(row.get("marker") or -1)
-            t_ns, in_range = int(row["t_ns"]), abs(u) < 1e5 and abs(v) < 1e5  # and no NaN
+            t_ns, in_range = int(row["t_ns"]), abs(u) < 1e5 and abs(v) < 1e5  # False for NaN
             if not (in_range and row["camera"] and 0 <= t_ns < 2**63 and -1 <= number < 2**31):
                 raise ValueError
             rows.setdefault((t_ns, row["camera"]), []).append((u, v, number))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"{path}, line {reader.line_num}: not t_ns,camera,u,v in whole ns and pixels"
+                f"{path}, line {reader.line_num}: invalid values; t_ns must be an integer, u and v pixels"
             ) from None
     return rows
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Frames of a folder or a video, and their replay as if they came from a camera."""
+"""Recorded frames in a folder or a video file, and their replay at the recorded rate."""
 
 import csv
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -14,22 +14,22 @@ import numpy as np
 from camera_node.arrays import Grey
 from camera_node.errors import CameraError
 from camera_node.sources.frame import Frame, Source, SourceSettings
-from camera_node.sources.grey import grey
+from camera_node.sources.grey import to_grey
 
-IMAGES = (".png", ".jpg", ".jpeg")  # files that hold one frame
+IMAGES = (".png", ".jpg", ".jpeg")  # suffixes of files that hold one frame
 
 
-class FolderSource:
-    """A folder of frames `<t_ns>.png|jpg` in the order of their times."""
+class FrameFolder:
+    """A folder of frames `<t_ns>.png|jpg`; iterating yields them in order of time."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises CameraError where the folder is missing, or holds no frames named by their capture time."""
+        """Raises CameraError where the folder is missing or holds no frames named by their capture time."""
         if not folder.is_dir():
-            raise CameraError(f"{folder} is no folder; frames are expected as {folder}/<t_ns>.png or .jpg")
+            raise CameraError(f"{folder} is not a folder; frames are expected as {folder}/<t_ns>.png or .jpg")
         files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
         if bad := [path.name for path in files if not re.fullmatch(r"[0-9]{1,19}", path.stem)]:
             raise CameraError(
-                f"{folder / min(bad)} is not named by its capture time in nanoseconds, as <t_ns>.png"
+                f"{folder / min(bad)} is not named by its capture time in nanoseconds; rename it to <t_ns>.png"
             )
         if not files:
             raise CameraError(f"{folder} holds no frames; they are expected as {folder}/<t_ns>.png or .jpg")
@@ -41,28 +41,30 @@ class FolderSource:
     def __iter__(self) -> Iterator[Frame]:
         return (Frame(read_grey(path), int(path.stem)) for path in self.files)
 
-    def close(self) -> None:
-        pass
 
+class VideoFile:
+    """A video file; iterating yields its frames.
 
-class VideoSource:
-    """A video file. Its times are those of `timestamps.csv` beside it, else the frames come at a steady rate."""
+    The capture times come from `timestamps.csv` in the same folder, otherwise from the frame rate.
+    """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        """Raises CameraError where OpenCV can't read the file, or its times are unknown or don't fit."""
+        """Raises CameraError where OpenCV can't read the file, or `timestamps.csv` or the frame rate is invalid."""
         self.path = path
         video = self._open()
         fps = fps or video.get(cv2.CAP_PROP_FPS)
         video.release()
         self.times = read_timestamps(path)
         if self.times is None and not 0 < fps < 1e6:
-            raise CameraError(f"{path} does not say its frames a second; give --fps")
+            raise CameraError(f"{path} does not state its frame rate; give --fps")
         self.period_ns = 1e9 / fps if fps > 0 else 0.0
 
     def _open(self) -> cv2.VideoCapture:
         video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not video.isOpened():
-            raise CameraError(f"{self.path} is no video that OpenCV reads, no folder of frames and no camera")
+            raise CameraError(
+                f"{self.path} is not a video that OpenCV can read; give a video, a folder of frames or a camera"
+            )
         return video
 
     def __iter__(self) -> Iterator[Frame]:
@@ -70,7 +72,7 @@ class VideoSource:
         try:
             k = 0
             while (image := video.read()[1]) is not None:
-                yield Frame(grey(image), self._time(k))
+                yield Frame(to_grey(image), self._time(k))
                 k += 1
         finally:
             video.release()
@@ -82,78 +84,76 @@ class VideoSource:
             raise CameraError(f"{self.path} has more than the {len(self.times)} frames in its timestamps.csv")
         return self.times[k]
 
-    def close(self) -> None:
-        pass
-
 
 def read_timestamps(video: Path) -> list[int] | None:
-    """The times (ns) of a video's frames from `timestamps.csv` beside it; None where there is no such file.
+    """Read the capture times (ns) of a video's frames from `timestamps.csv` in its folder; None without that file.
 
-    The columns `frame_time` (seconds) and `cam_id` (the video's name, or the number it ends with) are used; without
-    a `cam_id` the file speaks of one camera.
+    Uses the columns `frame_time` (seconds) and `cam_id` (the video's name, or the number at its end). Without `cam_id`,
+    all rows belong to the video.
 
     Raises:
-        CameraError: the file is broken or has no row of this video's.
+        CameraError: the file lacks a column or a number, or has no row for this video.
     """
     path = video.with_name("timestamps.csv")
     if not path.is_file():
         return None
     number = re.search(r"\d*$", video.stem)
-    ours = {video.stem, number.group() if number else "", None}
+    ids = {video.stem, number.group() if number else "", None}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             times = [
                 round(float(row["frame_time"]) * 1e9)
                 for row in csv.DictReader(file)
-                if row.get("cam_id") in ours
+                if row.get("cam_id") in ids
             ]
     except (KeyError, TypeError, ValueError, OverflowError):
         raise CameraError(f"{path} needs the columns cam_id and frame_time, in seconds") from None
     if not times:
-        raise CameraError(f"{path} has no row whose cam_id is that of {video.name}")
+        raise CameraError(f"{path} has no row whose cam_id is that of {video.name}; add its frame times")
     return sorted(times)
 
 
-class PacedSource:
-    """A recording delivered at its own pace or as fast as it is read, with its own times or moved to now."""
+class PacedSource(Source):
+    """Replays a recording at its recorded rate or as fast as possible, with its own times or shifted to now."""
 
-    def __init__(self, recording: Source, settings: SourceSettings) -> None:
-        self.recording, self.settings = recording, settings
+    is_recording = True
+
+    def __init__(self, recording: Iterable[Frame], settings: SourceSettings) -> None:
+        self._recording, self._settings = recording, settings
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
-        begun, lead = time.time_ns(), None
-        for frame in self.recording:
-            if lead is None:
-                lead = self._lead(frame.t_ns, begun)
-            due = lead + frame.t_ns
-            wait_s = (due - time.time_ns()) / 1e9
-            if self._closed.wait(max(0.0, wait_s) if self.settings.pace == "recorded" else 0.0):
+        begun_ns, shift_ns = time.time_ns(), None
+        for frame in self._recording:
+            if shift_ns is None:
+                shift_ns = self._shift(frame.t_ns, begun_ns)
+            due_ns = shift_ns + frame.t_ns
+            wait_s = (due_ns - time.time_ns()) / 1e9
+            if self._closed.wait(max(0.0, wait_s) if self._settings.pace == "recorded" else 0.0):
                 return
-            stamp = due if self.settings.stamps == "now" else frame.t_ns
-            yield Frame(frame.image, stamp, frame.exposure_us)
+            stamp_ns = due_ns if self._settings.stamps == "now" else frame.t_ns
+            yield Frame(frame.image, stamp_ns, frame.exposure_us)
 
-    def _lead(self, first_ns: int, now_ns: int) -> int:
-        """What to add to a recorded time to have the time at which the frame is due."""
-        if self.settings.stamps == "now" and self.settings.epoch_ns is not None:
-            return self.settings.epoch_ns
+    def _shift(self, first_ns: int, now_ns: int) -> int:
+        """Nanoseconds from a frame's recorded time to the time at which it is due."""
+        if self._settings.stamps == "now" and self._settings.epoch_ns is not None:
+            return self._settings.epoch_ns
         return now_ns - first_ns
 
     def close(self) -> None:
         self._closed.set()
-        self.recording.close()
 
 
 def read_grey(path: Path) -> Grey:
-    """The grey image (h, w) uint8 of a file of 8 to 16 bits.
+    """Read an image file of 8 to 16 bits as grey levels (h, w), uint8.
 
     Raises:
-        CameraError: the file is missing or is no image.
+        CameraError: the file is missing or is not an image.
     """
     if not path.is_file():
         raise CameraError(f"{path} does not exist; check the path")
     depth = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     image = cv2.imdecode(np.fromfile(path, np.uint8), depth) if path.stat().st_size else None
     if image is None:
-        raise CameraError(f"{path} is no image that OpenCV reads; give a PNG or JPEG file")
-    return grey(image)
+        raise CameraError(f"{path} is not an image that OpenCV can read; give a PNG or JPEG file")
+    return to_grey(image)

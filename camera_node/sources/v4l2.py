@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Cameras on this machine, by Video4Linux."""
+"""Cameras of this machine, read through Video4Linux."""
 
 import logging
 import os
@@ -14,26 +14,26 @@ import cv2
 
 from camera_node.errors import CameraError
 from camera_node.protocol.host_clock import unix_ahead_ns
-from camera_node.sources.frame import Frame, SourceSettings
-from camera_node.sources.grey import RAW, grey
+from camera_node.sources.frame import Frame, Source, SourceSettings
+from camera_node.sources.grey import RAW, to_grey
 
 log = logging.getLogger("camera_node.device")
 
 SYS = Path("/sys/class/video4linux")
 REOPEN_S = 1.0
-PATIENCE_S = 5.0  # how long an opened camera may take to its first frame
-MANUAL_EXPOSURE, AUTOMATIC_EXPOSURE = 1, 3  # V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY
+CLOSE_S = 5.0  # longest wait for the thread, which may be waiting for a frame
+MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 
 
 def find_device(text: str, sys: Path = SYS) -> Path:
-    """The device file of a camera that is given by its number, its path or its name.
+    """Find a camera's device file from its number, path or name.
 
     Args:
         text: `2`, `/dev/video2`, or a name as in `<sys>/video2/name`.
-        sys: where the kernel lists cameras.
+        sys: the folder in which the kernel lists cameras.
 
     Raises:
-        CameraError: no camera has this name, or several have.
+        CameraError: no camera or several cameras have this name.
     """
     if text.isdecimal():
         return Path(f"/dev/video{text}")
@@ -45,13 +45,13 @@ def find_device(text: str, sys: Path = SYS) -> Path:
         return matching[0]
     if matching:
         raise CameraError(
-            f"several cameras are called '{text}'; give a path: {', '.join(map(str, matching))}"
+            f"several cameras have the name '{text}'; give a path: {', '.join(map(str, matching))}"
         )
     raise CameraError(f"no folder, video or camera '{text}'; {_present(names)}")
 
 
 def camera_names(sys: Path = SYS) -> dict[Path, str]:
-    """The cameras of this machine: device file and name. A camera's metadata devices (index > 0) are left out."""
+    """Device files and names of this machine's cameras, without their metadata devices (index > 0)."""
     found = sorted(sys.glob("video*"), key=lambda entry: (len(entry.name), entry.name))
     return {
         Path("/dev") / entry.name: _read(entry / "name")
@@ -73,7 +73,7 @@ def _present(names: dict[Path, str]) -> str:
 
 
 def exposure_properties(exposure_us: float | None, gain: float | None) -> list[tuple[int, float]]:
-    """OpenCV's (property, value) pairs for an exposure (microseconds) and a gain; V4L2 counts in 100 us."""
+    """OpenCV's (property, value) pairs for an exposure (microseconds) and a gain; V4L2's unit is 100 us."""
     pairs: list[tuple[int, float]] = []
     if exposure_us is not None:
         pairs.append((cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE))
@@ -84,12 +84,12 @@ def exposure_properties(exposure_us: float | None, gain: float | None) -> list[t
 
 
 def properties(settings: SourceSettings) -> list[tuple[int, float]]:
-    """All of a camera's (property, value) pairs in the order V4L2 needs: format, size, rate, exposure."""
+    """(property, value) pairs of all settings, in the order that V4L2 requires: format, size, rate, exposure."""
     pairs: list[tuple[int, float]] = []
     if settings.fourcc is not None:
         pairs.append((cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc)))
         if settings.fourcc in RAW:
-            pairs.append((cv2.CAP_PROP_CONVERT_RGB, 0))  # else OpenCV makes colours of the grey, 8 bits each
+            pairs.append((cv2.CAP_PROP_CONVERT_RGB, 0))  # otherwise OpenCV converts grey to 8-bit BGR
     for name in ("width", "height", "fps"):
         if (value := getattr(settings, name)) is not None:
             pairs.append((PROPERTY[name], value))
@@ -114,12 +114,12 @@ NAMES = {
 
 
 def capture_time(stamp_ms: float, monotonic_ns: int, unix_ns: int, exposure_us: float) -> int:
-    """The middle of an exposure in Unix nanoseconds.
+    """Compute the middle of an exposure, Unix nanoseconds.
 
     Args:
-        stamp_ms: the buffer's time stamp, CLOCK_MONOTONIC; taken when it lies within the last second.
-        monotonic_ns, unix_ns: both clocks at one instant just after the frame was grabbed.
-        exposure_us: how long the exposure was; the stamp is taken to be its end.
+        stamp_ms: the buffer's time stamp, CLOCK_MONOTONIC; ignored unless it lies within the last second.
+        monotonic_ns, unix_ns: both clocks, read at the same time just after the frame was grabbed.
+        exposure_us: the exposure time; the stamp is assumed to be its end.
     """
     age = monotonic_ns - stamp_ms * 1e6
     end = unix_ns - age if 0 <= age < 1e9 else unix_ns
@@ -127,7 +127,7 @@ def capture_time(stamp_ms: float, monotonic_ns: int, unix_ns: int, exposure_us: 
 
 
 class Capture(Protocol):
-    """What is used of `cv2.VideoCapture`."""
+    """The methods of `cv2.VideoCapture` that `V4l2Source` uses."""
 
     def read(self) -> tuple[bool, Any]: ...
     def get(self, propId: int, /) -> float: ...
@@ -136,36 +136,38 @@ class Capture(Protocol):
 
 
 def open_capture(device: Path, settings: SourceSettings) -> cv2.VideoCapture:
-    """A V4L2 camera with its settings applied; what it refuses is logged.
+    """Open a V4L2 camera and apply its settings; settings that it refuses are logged.
 
     Raises:
-        CameraError: there is no such device, or it does not open.
+        CameraError: the device does not exist or does not open.
     """
     if not device.exists():
         raise CameraError(f"{device} does not exist; {_present(camera_names())}")
     if not os.access(device, os.R_OK | os.W_OK):
-        raise CameraError(f"{device} may not be opened; add this user to the group video and log in again")
-    os.environ.setdefault(
-        "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2"
-    )  # seconds until a silent camera is noticed
+        raise CameraError(
+            f"no permission to open {device}; add this user to the group video and log in again"
+        )
+    # Seconds after which a read of a camera that delivers nothing fails.
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")
     capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
     if not capture.isOpened():
-        raise CameraError(f"{device} is no camera, or another program uses it")
+        raise CameraError(f"{device} is not a camera, or another program uses it; close that program")
     apply(capture, properties(settings), device)
     return capture
 
 
 def apply(capture: Capture, pairs: list[tuple[int, float]], device: Path) -> None:
-    """Set properties of a camera; log what it refuses."""
+    """Set properties of a camera; log those that it refuses."""
     for key, value in pairs:
         if not capture.set(key, value):
-            log.warning("%s does not take %s = %g", device, NAMES[key], value)
+            log.warning("%s does not support %s = %g; its setting is unchanged", device, NAMES[key], value)
 
 
-class V4l2Source:
-    """A camera of which always the newest frame is taken; frames that nobody took in time are counted in `dropped`.
+class V4l2Source(Source):
+    """Delivers the newest frame of a camera; older frames that were not read in time are counted in `dropped`.
 
-    A thread grabs. A camera that stops delivering is reported once and reopened until it is back.
+    A thread of its own grabs the frames. When the camera stops delivering, the thread logs that once and tries to
+    reopen the camera until it delivers again.
     """
 
     def __init__(
@@ -176,17 +178,26 @@ class V4l2Source:
         reopen_s: float = REOPEN_S,
     ) -> None:
         """Raises CameraError where the camera does not open."""
-        self.device, self.settings = device, settings
+        self.device = device
         self.dropped = 0
+        self._settings = settings
         self._open, self._reopen_s = open, reopen_s
         self._lost = False
         self._capture: Capture | None = open(device, settings)
-        self._adjust: list[tuple[int, float]] = []
+        self._pending: list[tuple[int, float]] = []  # properties to set before the next frame
         self._latest: Frame | None = None
         self._arrived = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"grab {device}", daemon=True)
         self._thread.start()
+
+    @property
+    def exposure_us(self) -> float | None:
+        return self._settings.exposure_us
+
+    @property
+    def gain(self) -> float | None:
+        return self._settings.gain
 
     def __iter__(self) -> Iterator[Frame]:
         while True:
@@ -199,18 +210,18 @@ class V4l2Source:
                 yield frame
 
     def adjust(self, exposure_us: float | None = None, gain: float | None = None) -> None:
-        """Change exposure (microseconds) and gain from the next frame on; None leaves one as it is."""
+        """See `Source.adjust`."""
         with self._arrived:
             given = {"exposure_us": exposure_us, "gain": gain}
-            self.settings = replace(self.settings, **{k: v for k, v in given.items() if v is not None})
-            self._adjust += exposure_properties(exposure_us, gain)
+            self._settings = replace(self._settings, **{k: v for k, v in given.items() if v is not None})
+            self._pending += exposure_properties(exposure_us, gain)
 
     def close(self) -> None:
         self._closed.set()
         with self._arrived:
             self._arrived.notify_all()
         if threading.current_thread() is not self._thread:
-            self._thread.join(PATIENCE_S)
+            self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -222,29 +233,29 @@ class V4l2Source:
     def _grab(self) -> bool:
         assert self._capture
         with self._arrived:
-            pairs, self._adjust = self._adjust, []
+            pairs, self._pending = self._pending, []
         apply(self._capture, pairs, self.device)
         ok, image = self._capture.read()
         if not ok or image is None:
-            self._lose(self._capture)
+            self._report_loss(self._capture)
             return False
-        exposure_us = self.settings.exposure_us or 0.0
+        exposure_us = self._settings.exposure_us or 0.0
         stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC)
         now_ns = time.monotonic_ns()
         t_ns = capture_time(stamp, now_ns, now_ns + unix_ahead_ns(), exposure_us)
-        self._keep(Frame(grey(image, self.settings.fourcc), t_ns, exposure_us))
+        self._deliver(Frame(to_grey(image, self._settings.fourcc), t_ns, exposure_us))
         return True
 
-    def _lose(self, capture: Capture) -> None:
+    def _report_loss(self, capture: Capture) -> None:
         capture.release()
         self._capture = None
         if not self._lost:
-            log.warning("%s stopped delivering; trying to reopen it", self.device)
+            log.warning("%s stopped delivering frames; reopening it every %g s", self.device, self._reopen_s)
         self._lost = True
 
-    def _keep(self, frame: Frame) -> None:
+    def _deliver(self, frame: Frame) -> None:
         if self._lost:
-            log.warning("%s delivers again", self.device)
+            log.warning("%s delivers frames again", self.device)
         self._lost = False
         with self._arrived:
             self.dropped += self._latest is not None
@@ -253,7 +264,7 @@ class V4l2Source:
 
     def _reopen(self) -> bool:
         try:
-            self._capture = self._open(self.device, self.settings)
+            self._capture = self._open(self.device, self._settings)
         except CameraError as error:
             log.debug("%s", error)
             return False

@@ -97,13 +97,13 @@ def load_robots(path: Path) -> dict[str, Robot]:
         ConfigError: the file is missing or broken, or declares no robot.
         FusionError: a constellation is symmetric, or two robots are too alike to be told apart.
     """
-    robots = load_kept_robots(path)
+    robots = load_saved_robots(path)
     if not robots:
         raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
     return robots
 
 
-def load_kept_robots(path: Path) -> dict[str, Robot]:
+def load_saved_robots(path: Path) -> dict[str, Robot]:
     """As `load_robots`; there may be none, where all were removed over the network."""
     robots = load_yaml(path, _Robots).robots
     require_trackable(robots, str(path))

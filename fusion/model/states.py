@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Mask
-from camera_node.geometry.pose import exp_so3
+from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -53,7 +53,7 @@ class States:
     def moved(self, delta: Array) -> "States":
         """The states displaced by errors (N, 12)."""
         return States(
-            self.R @ exp_so3(delta[:, THETA]),
+            self.R @ rotation_from_vector(delta[:, THETA]),
             self.p + delta[:, POSITION],
             self.omega + delta[:, OMEGA],
             self.v + delta[:, VELOCITY],

@@ -13,7 +13,7 @@ import numpy as np
 
 from camera_node.arrays import Index
 from camera_node.errors import ConfigError
-from camera_node.geometry.pose import exp_so3, rotation_from_wxyz, wxyz_of
+from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
 from fusion.model.states import States
 from fusion.protocol.messages import ShardPoses, TrackingState
 
@@ -51,7 +51,7 @@ def told_of(
 ) -> ShardPoses:
     """What a shard tells the others of robots `rows`, each of which has a status."""
     of_each = states.select(rows)
-    motion = np.column_stack([of_each.p, wxyz_of(of_each.R), of_each.v, of_each.omega])
+    motion = np.column_stack([of_each.p, wxyz_from_rotation(of_each.R), of_each.v, of_each.omega])
     return ShardPoses(
         t_ns=t_ns,
         robots=tuple(names[k] for k in rows.tolist()),
@@ -65,4 +65,6 @@ def states_of(told: ShardPoses, t_ns: int) -> States:
     """The robots that another shard told of, carried to `t_ns` by their speeds."""
     dt = (t_ns - told.t_ns) * 1e-9
     p, wxyz, v, omega = np.split(told.motions(), [3, 7, 10], axis=1)
-    return States(exp_so3(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, told.covariances())
+    return States(
+        rotation_from_vector(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, told.covariances()
+    )

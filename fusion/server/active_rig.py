@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The rig in force: where it comes from, what corrects it, and how that is taken back and kept."""
+"""The active rig: loads, replaces, corrects and saves it, and undoes corrections."""
 
 from pathlib import Path
 
@@ -13,56 +13,66 @@ from fusion.server.persistence import PersistedFile
 
 
 class ActiveRig:
-    """The rig in force, None until there is one; its corrections can be undone one by one."""
+    """The rig in use, None before there is one. Its corrections can be undone one by one.
 
-    def __init__(self, rig: Path | None, kept: PersistedFile[Rig]) -> None:
-        """The newer of the file that a person gave and the one in which a published rig was kept.
+    Args:
+        path: the rig file of the configuration, if there is one.
+        saved: the file that saves a rig that was published or corrected; the newer of both files is used.
 
-        Raises:
-            ConfigError, CalibrationError: the file is missing or broken; of the kept one it is only told.
-        """
-        self._kept = kept
-        self._corrected: list[tuple[str, Camera]] = []  # cameras before their corrections
-        self.rig = kept.newer_than(rig)
-        if self.rig is None and rig is not None:
-            self.rig = load_rig(rig)
+    Raises:
+        ConfigError, CalibrationError: the file at `path` is missing or broken. A broken saved file is only logged.
+    """
+
+    def __init__(self, path: Path | None, saved: PersistedFile[Rig]) -> None:
+        self._saved = saved
+        self._before_corrections: list[tuple[str, Camera]] = []
+        self.rig = saved.load_if_newer(path)
+        if self.rig is None and path is not None:
+            self.rig = load_rig(path)
 
     def replace(self, rig: Rig) -> str | None:
-        """Another rig is in force, and kept; the camera in which alone it differs from the old one, if it does."""
+        """Activate and save another rig.
+
+        Returns:
+            The only camera that differs from the old rig; None if several differ, or the placed cameras are others.
+        """
         old, self.rig = self.rig, rig
-        self._corrected.clear()
-        self._kept.keep(rig)
+        self._before_corrections.clear()
+        self._saved.save(rig)
         if old is None or rig.placed().keys() != old.placed().keys():
             return None
-        moved = [name for name in rig.cameras if rig.cameras[name] != old.cameras.get(name)]
-        return moved[0] if len(moved) == 1 else None
+        changed = [name for name in rig.cameras if rig.cameras[name] != old.cameras.get(name)]
+        return changed[0] if len(changed) == 1 else None
 
     def message(self) -> RigMessage:
-        """The rig in force, of which there is one, as a message."""
+        """The active rig, which must exist, as a message."""
         assert self.rig is not None
         return RigMessage.of(self.rig)
 
     def correct(self, name: str, camera: Camera) -> None:
-        """A camera stands elsewhere."""
+        """Set a new pose of a camera that was moved."""
         assert self.rig is not None
-        self._corrected.append((name, self.rig.cameras[name]))
-        self._place(name, camera)
+        self._before_corrections.append((name, self.rig.cameras[name]))
+        self._set_camera(name, camera)
 
     def undo(self) -> tuple[str, Camera]:
-        """Take the last correction back; the camera and where it stood before.
+        """Undo the last correction.
+
+        Returns:
+            The camera's name, and the camera as it was before.
 
         Raises:
-            FusionError: there is none.
+            FusionError: there is no correction.
         """
-        if not self._corrected:
+        if not self._before_corrections:
             raise FusionError(
-                "no camera was placed anew since the rig came into force; there is nothing to undo"
+                "no camera was recalibrated since the active rig was loaded; there is nothing to undo"
             )
-        name, camera = self._corrected.pop()
-        self._place(name, camera)
+        name, camera = self._before_corrections.pop()
+        self._set_camera(name, camera)
         return name, camera
 
-    def _place(self, name: str, camera: Camera) -> None:
+    def _set_camera(self, name: str, camera: Camera) -> None:
         assert self.rig is not None
         self.rig = msgspec.structs.replace(self.rig, cameras={**self.rig.cameras, name: camera})
-        self._kept.keep(self.rig)
+        self._saved.save(self.rig)

@@ -15,14 +15,14 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     Attributes:
         arena: its name, the first part of all Zenoh keys.
-        listen: Zenoh endpoints on which the server is the router.
+        listen: Zenoh endpoints on which the server is the router; the operating system chooses port 0.
         zenoh: a Zenoh configuration (JSON5) for TLS, access control or scouting.
         rig: rig.yaml; without one the server waits for a calibration to be published.
-        kept_rig: where a rig that was published, or corrected after a bump, is kept over a restart; the newer of this
-            file and `rig` is in force. Not kept unless given.
+        saved_rig: the file that saves a rig that was published, or corrected after a camera was moved; after a
+            restart the newer of this file and `rig` is used. Nothing is saved unless given.
         robots: robots.yaml.
-        kept_robots: the same for robots that were defined, renamed or removed while the server ran.
-        rate_hz: instants a second; without it those of the fastest camera.
+        saved_robots: the same for robots that were defined, renamed or removed while the server ran.
+        rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
         shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
     """
@@ -31,9 +31,9 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     zenoh: str | None = None
     rig: str | None = None
-    kept_rig: str | None = None
+    saved_rig: str | None = None
     robots: str = "robots.yaml"
-    kept_robots: str | None = None
+    saved_robots: str | None = None
     rate_hz: float | None = None
     limits: Limits = Limits()
     shard: str = "1/1"
@@ -48,22 +48,26 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def load_arena(path: Path) -> ArenaConfig:
-    """Read `arena.yaml`; the paths in it count from its folder.
+    """Read `arena.yaml`; relative paths in it start from its folder.
 
     Raises:
-        ConfigError: the file is missing, broken, or has a field that no arena has.
+        ConfigError: the file is missing or broken, or has an unknown field.
     """
     config = load_yaml(path, ArenaConfig)
-    found = {
+    paths = {
         name: str(path.parent / value)
-        for name in ("rig", "kept_rig", "robots", "kept_robots", "zenoh")
+        for name in ("rig", "saved_rig", "robots", "saved_robots", "zenoh")
         if (value := getattr(config, name))
     }
-    return override(config, **found)
+    return override(config, **paths)
 
 
-def override(config: ArenaConfig, **settings) -> ArenaConfig:
-    """The config with those settings that are not None."""
+def override(config: ArenaConfig, **settings: object) -> ArenaConfig:
+    """The config with the settings that are not None.
+
+    Raises:
+        ConfigError: a setting is invalid.
+    """
     given = {k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v is not None}
     try:
         return msgspec.structs.replace(config, **given)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What cameras send, judged before it is used: it comes from a network, and may be anything.
+"""Decides which received frames are admitted. They come from a network and may contain anything.
 
-What can't be used is counted by its reason. Whatever comes, time and memory stay bounded.
+Refused frames are counted by their reason. Time and memory stay bounded for any input.
 """
 
 from collections import deque
@@ -15,82 +15,102 @@ from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.model.frames import CalibratedFrame
 from fusion.server.status import ServerStatistics
 
-FAR_NS = 5_000_000_000  # a capture time so far before now is a fault
-AHEAD_NS = 200_000_000  # and one so far after now: clocks are aligned to milliseconds
-REMEMBERED = 64  # frames of a camera
-STEPS_BACK = 4  # of a frame's number among those remembered, which one node that was restarted does not make
-SIZES_PX = 0.5, 1e5  # of an outline's axes
+MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
+MAX_AHEAD_NS = 200_000_000  # as is one in the future: clocks are aligned to milliseconds
+MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a fault of the publisher
+HISTORY = 64  # frames of a camera
+MIN_STEPS_BACK = 4  # of sequence numbers in the history, for two publishers: a restarted node makes one
+AXES_PX = 0.5, 1e5  # plausible axes of an outline
 
 
 @dataclass(slots=True)
-class _Sender:
-    """The last frames of a camera: their times, and whether each one's number was not above the last."""
+class _FrameHistory:
+    """The last frames of a camera: their times, and whether each sequence number was not above the previous one."""
 
-    times: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    steps_back: deque[bool] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    times: deque[int] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    steps_back: deque[bool] = field(default_factory=lambda: deque(maxlen=HISTORY))
     seq: int = -1
 
 
 class Ingest:
-    """Turns messages into frames.
+    """Decodes detections, and admits the frames of placed cameras.
 
     Args:
         keys: the arena's.
-        health: counts what is refused.
+        statistics: counts what arrives and what is refused.
     """
 
-    def __init__(self, keys: Keys, health: ServerStatistics) -> None:
-        self._keys, self._health = keys, health
-        self._senders: dict[str, _Sender] = {}
+    def __init__(self, keys: Keys, statistics: ServerStatistics) -> None:
+        self._keys, self._statistics = keys, statistics
+        self._histories: dict[str, _FrameHistory] = {}
+        self._calibrated: set[str] = set()
+        self._uncalibrated: set[str] = set()
 
     def receive(
         self, data: bytes, key: str, received_ns: int, cameras: dict[str, Camera]
     ) -> CalibratedFrame | None:
-        """The frame of a message that a placed camera sent, or None."""
+        """The frame of a message, or None if it is refused.
+
+        Args:
+            data: the message.
+            key: on which it arrived.
+            received_ns: when it arrived.
+            cameras: the placed ones.
+        """
         try:
             message = decode(data, Detections)
             if key != self._keys.detections(message.camera):
-                raise MessageError("of another camera than its key")
+                raise MessageError("the key is another camera's")
         except MessageError:
-            return self._refuse("detections that are no message")
-        if not -AHEAD_NS <= received_ns - message.t_ns <= FAR_NS:
+            return self._refuse("undecodable detections")
+        if not -MAX_AHEAD_NS <= received_ns - message.t_ns <= MAX_AGE_NS:
             return self._refuse("implausible time")
         camera = cameras.get(message.camera)
-        if not self._health.arrived(message.camera, message.t_ns, received_ns, camera is not None):
-            return None
+        if not self._is_admitted(message.camera, camera is not None):
+            return self._refuse("too many cameras")
+        self._statistics.count_arrival(message.camera, message.t_ns, received_ns)
         if camera is None:
             return self._refuse("unknown camera") if cameras else None
         if (message.width, message.height) != (camera.width, camera.height):
             return self._refuse("wrong image size")
         if not self._is_new(message):
-            return self._refuse("frame that came twice")
+            return self._refuse("duplicate frame")
         frame = CalibratedFrame.of(message, camera, received_ns)
-        return replace(frame, roundels=_plausible(frame.roundels))
+        return replace(frame, roundels=_with_plausible_outlines(frame.roundels))
 
     def _refuse(self, reason: str) -> None:
-        self._health.count(reason)
+        self._statistics.count_fault(reason)
+
+    def _is_admitted(self, name: str, is_calibrated: bool) -> bool:
+        """Whether the camera is in the rig, or there is room for another one that is not."""
+        if is_calibrated:
+            self._calibrated.add(name)
+            self._uncalibrated.discard(name)
+        elif name not in self._calibrated and name not in self._uncalibrated:
+            if len(self._uncalibrated) >= MAX_UNCALIBRATED:
+                return False
+            self._uncalibrated.add(name)
+        return True
 
     def _is_new(self, message: Detections) -> bool:
-        """Whether the frame is not known yet. Two nodes of one name are noticed by numbers that go back and forth."""
-        sender = self._senders.setdefault(message.camera, _Sender())
-        if message.t_ns in sender.times:
+        """Whether the frame is no duplicate. Sequence numbers that alternate show two publishers of one name."""
+        history = self._histories.setdefault(message.camera, _FrameHistory())
+        if message.t_ns in history.times:
             return False
-        sender.times.append(message.t_ns)
-        sender.steps_back.append(message.seq <= sender.seq)
-        sender.seq = message.seq
-        self._health.shared(message.camera, sum(sender.steps_back) >= STEPS_BACK)
+        history.times.append(message.t_ns)
+        history.steps_back.append(message.seq <= history.seq)
+        history.seq = message.seq
+        has_two_publishers = sum(history.steps_back) >= MIN_STEPS_BACK
+        self._statistics.note_publishers(message.camera, has_two_publishers)
         return True
 
 
-def _plausible(roundels: Roundels) -> Roundels:
-    """The roundels, of which no outline is told that can't be one."""
-    low, high = SIZES_PX
+def _with_plausible_outlines(roundels: Roundels) -> Roundels:
+    """The roundels, with NaN for the axes and the angle of each impossible outline."""
+    low, high = AXES_PX
     minor, major = roundels.axes_px[:, 1], roundels.axes_px[:, 0]
     good = (minor > low) & (minor <= major * 1.001) & (major < high) & np.isfinite(roundels.angle_rad)
     if good.all():
         return roundels
-    axes, angle = (
-        np.where(good[:, None], roundels.axes_px, np.nan),
-        np.where(good, roundels.angle_rad, np.nan),
-    )
-    return replace(roundels, axes_px=axes, angle_rad=angle)
+    axes_px = np.where(good[:, None], roundels.axes_px, np.nan)
+    return replace(roundels, axes_px=axes_px, angle_rad=np.where(good, roundels.angle_rad, np.nan))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What was told over the network and outlives a restart: a file beside the one that a person gave."""
+"""Files that the server writes, so that changes made over the network survive a restart."""
 
 import logging
 from collections.abc import Callable
@@ -13,40 +13,41 @@ T = TypeVar("T")
 
 
 class PersistedFile(Generic[T]):
-    """A file that the server writes; faults with it are told and never fatal.
+    """A file that the server writes, beside the one that the user writes. Its faults are logged and never fatal.
 
     Args:
-        what: the word for it, as in "the kept rig".
-        path: the file; None keeps nothing.
-        load, save: read and write it, raising RoundelError.
+        content: the word for the content in messages, as in "the saved rig".
+        path: the file; None saves nothing.
+        load: reads it; raises RoundelError.
+        save: writes it; raises RoundelError.
     """
 
     def __init__(
-        self, what: str, path: str | None, load: Callable[[Path], T], save: Callable[[T, Path], object]
+        self, content: str, path: str | None, load: Callable[[Path], T], save: Callable[[T, Path], object]
     ) -> None:
-        self._what, self._path = what, Path(path) if path else None
+        self._content, self._path = content, Path(path) if path else None
         self._load, self._save = load, save
 
-    def newer_than(self, given: Path | None) -> T | None:
-        """What was kept, unless it is not there, broken, or older than the file that a person gave."""
+    def load_if_newer(self, given: Path | None) -> T | None:
+        """The saved content; None if there is none, if it is broken, or if the user's file `given` is newer."""
         if self._path is None or not self._path.exists():
             return None
         if given is not None and given.exists() and given.stat().st_mtime >= self._path.stat().st_mtime:
-            log.info("%s is newer than %s, which is left alone", given, self._path)
+            log.info("using %s, which is newer than %s", given, self._path)
             return None
         try:
-            kept = self._load(self._path)
+            saved = self._load(self._path)
         except RoundelError as error:
-            log.warning("the kept %s is not used: %s", self._what, error)
+            log.warning("the saved %s is not used: %s", self._content, error)
             return None
-        log.info("the %s that was last told over the network is in force: %s", self._what, self._path)
-        return kept
+        log.info("using the %s that was last changed over the network: %s", self._content, self._path)
+        return saved
 
-    def keep(self, now: T) -> None:
-        """Let it be in force after a restart, too."""
+    def save(self, value: T) -> None:
+        """Write the file."""
         if self._path is None:
             return
         try:
-            self._save(now, self._path)
+            self._save(value, self._path)
         except RoundelError as error:
-            log.warning("the %s is in force, but is not kept over a restart: %s", self._what, error)
+            log.warning("the %s is used, but not saved for a restart: %s", self._content, error)

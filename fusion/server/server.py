@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The live server: the arena's router and clock; detections in, robot poses out.
+"""The live server: the arena's router and clock. Receives detections and publishes robot poses.
 
-Zenoh's callbacks only enqueue; one thread, that of `Server.run`, decodes, fuses and publishes.
+Zenoh's callbacks only enqueue. One thread, that of `Server.run`, decodes, tracks and publishes.
 """
 
 import contextlib
@@ -9,24 +9,18 @@ import gc
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
-import msgspec
 import numpy as np
 import zenoh
 
-from calib.rig.camera import Camera
 from calib.rig.messages import RigMessage
-from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
 from camera_node.protocol.requests import encode_reply, parse_request, payload_of
+from camera_node.protocol.session import listening_endpoints
 from fusion.model.frames import FrameSet
-from fusion.model.robots import changed, load_kept_robots, load_robots, save_robots
 from fusion.protocol.messages import (
-    Latency,
-    RobotPose,
     Robots,
     RobotsRequest,
     ShardPoses,
@@ -36,59 +30,59 @@ from fusion.protocol.messages import (
     undo_key,
 )
 from fusion.protocol.shards import Shard
-from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
-from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.ingest import FAR_NS, Ingest
-from fusion.server.persistence import PersistedFile
-from fusion.server.status import ServerStatistics
+from fusion.server.ingest import MAX_AGE_NS, Ingest
+from fusion.server.pipeline import TrackingPipeline
+from fusion.server.publisher import ArenaPublisher
+from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.server.transport import Transport, open_session
 from fusion.tracking.result import Move, latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
-TICK_S = 0.005  # how finely the end of a wait is met
-BEHIND_NS = 500_000_000  # by which the server may be behind before it drops what it can't do
-BACK_NS = 1_000_000_000  # by which this machine's clock may be set back without anything being begun anew
+TICK_S = 0.005  # resolution at which a wait for frames ends
+MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
+MAX_CLOCK_STEP_NS = (
+    1_000_000_000  # by which this machine's clock may be set back without a restart of tracking
+)
 
 
 class Server:
     """One arena's server; a context manager. `run` serves until `stop` or an exception such as Ctrl-C.
 
+    `endpoints` are those at which it is reached; after entry a port in `listen` that was 0 is the real one.
+
     Raises, at entry:
         NetworkError: an endpoint is taken.
-        ConfigError, FusionError, CalibrationError: a file is missing, broken, or declares what can't be tracked.
+        ConfigError, FusionError, CalibrationError: a file is missing or broken, or declares robots that can't be
+            tracked.
     """
 
     def __init__(self, config: ArenaConfig) -> None:
         self.config = config
         self.keys = Keys(config.arena)
+        self.endpoints = config.listen
         self.shard = Shard.parse(config.shard)
-        self._own_key = shard_key(config.arena, self.shard.index)
-        given = Path(config.robots)
-        self._kept_robots = PersistedFile("robots", config.kept_robots, load_kept_robots, save_robots)
-        kept = self._kept_robots.newer_than(given)
-        self.robots = load_robots(given) if kept is None else kept
-        self.health = ServerStatistics(config.limits.lateness_ms)
-        self._intake = Ingest(self.keys, self.health)
-        kept_rig = PersistedFile("rig", config.kept_rig, load_rig, save_rig)
-        self.calibration = ActiveRig(Path(config.rig) if config.rig else None, kept_rig)
-        self._tracker: Tracker | None = None
+        self.statistics = ServerStatistics(config.limits.lateness_ms)
+        self.pipeline = TrackingPipeline(config, self.shard)
+        self._ingest = Ingest(self.keys, self.statistics)
         self._now_ns = 0
-        self._start()
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
             self.session = stack.enter_context(open_session(self.config, self.shard))
-            self.link = Transport(self.session, self.health.count, stack)
+            if self.shard.leads:
+                self.endpoints = listening_endpoints(self.session, self.config.listen)
+            self.transport = Transport(self.session, self.statistics.count_fault, stack)
+            self._publisher = ArenaPublisher(self.transport, self.keys, self.shard)
             self._declare()
             self._closing = stack.pop_all()
-        verb = "listens on" if self.shard.leads else f"has its shard {self.config.shard} at"
-        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.config.listen))
-        if self._tracker is None:
-            log.warning("no camera has a place yet: wave the wand, python -m calib wand --live --help")
+        verb = "listens on" if self.shard.leads else f"connects its shard {self.config.shard} to"
+        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.endpoints))
+        if self.pipeline.tracker is None:
+            log.warning("no camera has a pose yet; calibrate with python -m calib wand --live, see --help")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -99,201 +93,160 @@ class Server:
         self._stopped.set()
 
     def run(self) -> None:
-        """Serve."""
-        with collecting_between_instants() as collect:
+        """Serve: receive, synchronize, track and publish, report the status."""
+        with collecting_between_frame_sets() as collect_garbage:
             while not self._stopped.is_set():
-                more = self.link.work(TICK_S)
-                now_ns = self._tell_time()
-                # What waits in the queue is not late, unless more is asked than this machine can do.
-                heard_ns = max(self.link.reached_ns, now_ns - BEHIND_NS) if more else now_ns
-                for instant in self._instants.take(heard_ns):
-                    self._fuse(instant)
-                if not more:
-                    self._anticipate()
-                if self._tell_status(now_ns):
-                    collect()
+                is_backlogged = self.transport.receive(TICK_S)
+                now_ns = self._read_clock()
+                for frame_set in self._synchronize(now_ns, is_backlogged):
+                    self._track(frame_set)
+                if not is_backlogged:
+                    self.pipeline.associate_early()
+                if self._report_status(now_ns):
+                    collect_garbage()
 
-    def _tell_time(self) -> int:
-        """Now. Once the clock was set back, what was followed lies in the future: everything begins anew."""
+    def _declare(self) -> None:
+        keys, transport = self.keys, self.transport
+        transport.subscribe(keys.detections(), self._receive_detections)
+        transport.subscribe(keys.rig, self._receive_rig)
+        transport.answer_on_server_thread(robots_key(keys.arena), self._change_robots)
+        if self.shard.count > 1:
+            transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
+        if self.shard.leads:
+            transport.answer(keys.clock, self._answer_clock)
+            transport.answer(keys.rig, self._answer_rig)
+            transport.answer_on_server_thread(undo_key(keys.arena), self._undo_correction)
+            transport.declare_alive(keys.fusion_alive)
+
+    # The steps of the loop.
+
+    def _read_clock(self) -> int:
+        """The present time. Tracking restarts if the clock was set back, since all tracks are in its future then."""
         now_ns = time.time_ns()
-        if now_ns < self._now_ns - BACK_NS:
-            log.warning(
-                "this machine's clock was set back by %.0f s; robots are found anew",
-                (self._now_ns - now_ns) * 1e-9,
-            )
-            self._start()
+        if now_ns < self._now_ns - MAX_CLOCK_STEP_NS:
+            step_s = (self._now_ns - now_ns) * 1e-9
+            log.warning("this machine's clock was set back by %.0f s; all robots are acquired again", step_s)
+            self.pipeline.restart()
         self._now_ns = now_ns
         return now_ns
 
-    def _declare(self) -> None:
-        keys, link = self.keys, self.link
-        link.subscribe(keys.detections(), self._take_detections)
-        link.subscribe(keys.rig, self._take_rig)
-        link.answer_later(robots_key(keys.arena), self._change_robots)
+    def _synchronize(self, now_ns: int, is_backlogged: bool) -> list[FrameSet]:
+        """The frame sets that are due. Queued frames count as on time unless the server lags by more than 0.5 s."""
+        if is_backlogged:
+            now_ns = max(self.transport.received_ns, now_ns - MAX_LAG_NS)
+        return self.pipeline.synchronizer.take(now_ns)
+
+    def _track(self, frame_set: FrameSet) -> None:
+        """Track and publish. A frame set without a solution costs the tracks, not the server."""
+        if self.pipeline.tracker is None:
+            return
+        try:
+            self._track_and_publish(self.pipeline.tracker, frame_set)
+        except (np.linalg.LinAlgError, RuntimeError):  # NumPy's and GTSAM's, of a singular system
+            self.statistics.count_fault("frame set without a solution")
+            log.exception("a frame set has no solution; all robots are acquired again")
+            self.pipeline.restart()
+
+    def _track_and_publish(self, tracker: Tracker, frame_set: FrameSet) -> None:
+        """Publish the poses that acquisition can't change first, then everything else."""
+        start_ns = time.time_ns()
+        first = tracker.advance(frame_set)
+        latency = latency_of(frame_set, start_ns, time.time_ns())
+        self._publisher.publish_poses(first, latency)
         if self.shard.count > 1:
-            link.subscribe(shard_key(keys.arena, "*"), self._take_shard)
-        if self.shard.leads:
-            link.answer(keys.clock, self._answer_clock)
-            link.answer(keys.rig, self._answer_rig)
-            link.answer_later(undo_key(keys.arena), self._undo)
-            link.show_alive(keys.fusion_alive)
+            self._publisher.publish_shard(tracker.tell())
+        fused = tracker.complete()
+        published = {pose.robot for pose in first}
+        self._publisher.publish_poses([p for p in fused.poses if p.robot not in published], latency)
+        self._publisher.publish_markers(fused.markers)
+        for move in tracker.inspect():
+            self._report_move(move)
+        states: dict[str, TrackingState] = {pose.robot: pose.state for pose in fused.poses}
+        self.statistics.count_frame_set(fused.cameras, states, latency.total_ms if latency else None)
 
-    # What arrives.
+    def _report_move(self, move: Move) -> None:
+        """Log a moved camera; publish the rig once the camera is recalibrated, by the leading shard."""
+        if move.camera is None:
+            log.warning("camera %s was moved: excluded until robots show its new pose", move.name)
+            return
+        self.pipeline.correct_rig(move)
+        self._publisher.publish_rig(self.pipeline.active_rig.message())
+        undo = undo_key(self.keys.arena)
+        log.warning("camera %s is recalibrated and used again; a query on %s undoes that", move.name, undo)
 
-    def _take_detections(self, data: bytes, key: str, received_ns: int) -> None:
-        frame = self._intake.receive(data, key, received_ns, self._cameras())
+    def _report_status(self, now_ns: int) -> bool:
+        """Publish the status once a second; return whether it was due."""
+        if not self.statistics.is_due(now_ns):
+            return False
+        pipeline = PipelineStatus(
+            calibrated=frozenset(self.pipeline.cameras),
+            late=self.pipeline.synchronizer.late,
+            excluded=frozenset(self.pipeline.excluded_cameras()),
+            geometry_residuals_px=self.pipeline.geometry_residuals_px(),
+        )
+        self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
+        return True
+
+    # Received messages.
+
+    def _receive_detections(self, data: bytes, key: str, received_ns: int) -> None:
+        frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
         if frame is not None:
-            self.health.noted(frame.camera, self._instants.add(frame), (time.time_ns() - frame.t_ns) * 1e-6)
+            is_on_time = self.pipeline.synchronizer.add(frame)
+            self.statistics.note_lateness(frame.camera, is_on_time, (time.time_ns() - frame.t_ns) * 1e-6)
 
-    def _take_rig(self, data: bytes, key: str, received_ns: int) -> None:
+    def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:
             rig = decode(data, RigMessage).rig()
         except MessageError as error:
-            self.health.count("rig that is no rig")
-            log.warning("a published rig is refused, the old one stays: %s", error)
+            self.statistics.count_fault("undecodable rig")
+            log.warning("a published rig is refused, the active one stays: %s", error)
             return
-        if rig == self.calibration.rig:  # our own, or one that came twice
-            return
-        moved = self.calibration.replace(rig)
-        if moved is not None and self._tracker is not None:
-            self._tracker.place(moved, rig.cameras[moved])  # robots stay as they are
-            self._tracker.watch.trust(moved)
-        else:
-            self._start()
+        if rig != self.pipeline.active_rig.rig:  # neither our own nor a duplicate
+            self.pipeline.replace_rig(rig)
 
-    def _take_shard(self, data: bytes, key: str, received_ns: int) -> None:
-        """Another shard's robots."""
-        if key == self._own_key:
+    def _receive_shard(self, data: bytes, key: str, received_ns: int) -> None:
+        """Receive the poses of another shard's robots."""
+        if key == shard_key(self.keys.arena, self.shard.index):
             return
         try:
-            told = decode(data, ShardPoses)
+            poses = decode(data, ShardPoses)
         except MessageError:
-            self.health.count("poses that are no message")
+            self.statistics.count_fault("undecodable shard poses")
             return
-        if abs(told.t_ns - received_ns) > FAR_NS:
-            self.health.count("implausible time")
-        elif self._tracker is not None:
-            self._tracker.follow(told)
+        if abs(poses.t_ns - received_ns) > MAX_AGE_NS:
+            self.statistics.count_fault("implausible time")
+        else:
+            self.pipeline.add_shard_poses(poses)
 
-    def _start(self) -> None:
-        """Begin with the rig in force; robots are found anew."""
-        placed = self._cameras()
-        self._tracker = Tracker(placed, self.robots, self.config.limits, self.shard) if placed else None
-        rate_hz, lateness_ms = self.config.rate_hz, self.config.limits.lateness_ms
-        self._instants = FrameSynchronizer(
-            round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6)
-        )
-        if placed:
-            log.info("calibration in force: %s", ", ".join(placed))
-
-    def _cameras(self) -> dict[str, Camera]:
-        return self.calibration.rig.placed() if self.calibration.rig else {}
-
-    # What is answered.
+    # Answered queries.
 
     def _answer_clock(self, query: zenoh.Query) -> None:
         query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns(), clock=clock_id())))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
-        if self.calibration.rig is not None:
-            query.reply(self.keys.rig, encode(self.calibration.message()))
+        if self.pipeline.active_rig.rig is not None:
+            query.reply(self.keys.rig, encode(self.pipeline.active_rig.message()))
 
-    def _undo(self, _: zenoh.Query) -> bytes:
-        """Take the last correction back; that camera is not doubted again until another rig comes."""
-        name, camera = self.calibration.undo()
-        log.warning("camera %s is back where it stood, as was asked; it is not watched any more", name)
-        if self._tracker is not None:
-            self._tracker.place(name, camera)
-            self._tracker.watch.hold(name)
-        message = self.calibration.message()
-        self.link.publish(self.keys.rig, message)
+    def _undo_correction(self, _: zenoh.Query) -> bytes:
+        name = self.pipeline.undo_correction()
+        log.warning("camera %s has its previous pose again, as requested; it is no longer monitored", name)
+        message = self.pipeline.active_rig.message()
+        self._publisher.publish_rig(message)
         return encode(message)
 
     def _change_robots(self, query: zenoh.Query) -> bytes:
-        """Rename, remove and define robots, all or none; what they are then."""
         payload = payload_of(query)
         request = parse_request(payload, RobotsRequest) if payload else RobotsRequest()
-        robots = changed(self.robots, request.rename, request.remove, request.define)
-        if robots != self.robots:
-            for name in self.robots.keys() - robots.keys():
-                self.link.forget(self.keys.robot_pose(name))
-            self.robots = robots
-            self._kept_robots.keep(robots)
-            log.info("robots: %s", ", ".join(robots) or "none")
-            if self._tracker is not None:
-                self._tracker = self._tracker.with_robots(robots, request.rename)
-        return encode_reply(payload, Robots(robots=self.robots))
-
-    # What is told.
-
-    def _tell_status(self, now_ns: int) -> bool:
-        tracker, late = self._tracker, self._instants.late
-        aside, misfits = (tracker.watch.bumped, tracker.shapes.misfits) if tracker else (set(), dict)
-        status = self.health.status(now_ns, set(self._cameras()), late, aside, misfits)
-        if status is not None:
-            own = "" if self.shard.leads else f"/{self.shard.index}"
-            self.link.publish(self.keys.fusion_status + own, status)
-        return status is not None
-
-    def _anticipate(self) -> None:
-        """Use the wait for the last frames of an instant."""
-        instant, owed = self._instants.open()
-        if self._tracker is not None and instant is not None:
-            self._tracker.anticipate(instant, owed)
-
-    def _fuse(self, instant: FrameSet) -> None:
-        if self._tracker is None:
-            return
-        try:
-            self._follow(self._tracker, instant)
-        except (np.linalg.LinAlgError, RuntimeError):  # NumPy's and GTSAM's, of a system that has no solution
-            self.health.count("instant that could not be solved")
-            log.exception("an instant could not be solved; robots are found anew")
-            self._start()
-
-    def _follow(self, tracker: Tracker, instant: FrameSet) -> None:
-        begun_ns = time.time_ns()
-        first = tracker.advance(instant)
-        latency = latency_of(instant, begun_ns, time.time_ns())
-        self._tell_poses(first, latency)
-        if self.shard.count > 1:
-            self.link.publish(self._own_key, tracker.tell())
-        fused = tracker.complete()
-        told = {pose.robot for pose in first}
-        self._tell_poses([pose for pose in fused.poses if pose.robot not in told], latency)
-        if self.shard.leads:
-            self.link.publish(self.keys.markers, fused.markers)
-        for move in tracker.inspect():
-            self._tell(move)
-        states: dict[str, TrackingState] = {pose.robot: pose.state for pose in fused.poses}
-        self.health.fused(fused.cameras, states, latency.total_ms if latency else None)
-
-    def _tell_poses(self, poses: Iterable[RobotPose], latency: Latency | None) -> None:
-        for pose in poses:
-            told = msgspec.structs.replace(pose, latency=latency)
-            self.link.publish(self.keys.robot_pose(pose.robot), told)
-
-    def _tell(self, move: Move) -> None:
-        """Say that a camera was moved, or where it stands now."""
-        if move.camera is None:
-            log.warning(
-                "camera %s was moved: its detections are set aside until robots show where it is", move.name
-            )
-            return
-        self.calibration.correct(move.name, move.camera)  # only the leading shard gets here
-        self.link.publish(self.keys.rig, self.calibration.message())
-        log.warning(
-            "camera %s is placed anew and used again; a query on %s takes that back",
-            move.name,
-            undo_key(self.keys.arena),
-        )
+        self._publisher.stop_robots(self.pipeline.change_robots(request))
+        return encode_reply(payload, Robots(robots=self.pipeline.robots))
 
 
 @contextlib.contextmanager
-def collecting_between_instants() -> Iterator[Callable[[], object]]:
-    """No garbage is collected but when the function is called that this gives: between instants, once a second."""
+def collecting_between_frame_sets() -> Iterator[Callable[[], object]]:
+    """Collect garbage only when the yielded function is called: between frame sets, once a second."""
     gc.collect()
-    gc.freeze()  # what was imported is not looked through again and again
+    gc.freeze()  # imported modules are not searched again
     gc.disable()
     try:
         yield gc.collect

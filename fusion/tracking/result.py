@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from camera_node.arrays import Array, Index, Mask
-from camera_node.geometry.pose import wxyz_of
+from camera_node.geometry.pose import wxyz_from_rotation
 from fusion._core import ExpectedMarkers
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
@@ -128,7 +128,7 @@ def tell_poses(tracker: Told, t_ns: int, seen: Seen, rows: list[int]) -> dict[in
         return {}
     states, names, status = tracker.states, tracker.optics.names, tracker.status
     p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
-    wxyz, residual = wxyz_of(states.R).tolist(), seen.residual_px.tolist()
+    wxyz, residual = wxyz_from_rotation(states.R).tolist(), seen.residual_px.tolist()
     P, markers = states.P.astype("<f4").tobytes(), seen.n_markers.tolist()
     owned, by_robot = tracker.owned.tolist(), seen.by_robot.tolist()
     return {

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from camera_node.arrays import Array, Mask
-from camera_node.geometry.pose import log_so3, wxyz_of
+from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.result import Fused
@@ -59,7 +59,7 @@ class Smoother:
 
     def _told(self, fused: Fused, states: States) -> Fused:
         row = {name: k for k, name in enumerate(self._tracker.names)}
-        wxyz = wxyz_of(states.R)
+        wxyz = wxyz_from_rotation(states.R)
         poses = tuple(
             msgspec.structs.replace(
                 pose,
@@ -91,6 +91,6 @@ def _smooth(states: States, prediction: Prediction, after: States, followed: Mas
 def _difference(a: States, b: States) -> Array:
     """(N, 12) the errors that bring b to a."""
     error = np.empty((len(a), 12))
-    error[:, THETA] = log_so3(b.R.transpose(0, 2, 1) @ a.R)
+    error[:, THETA] = vector_from_rotation(b.R.transpose(0, 2, 1) @ a.R)
     error[:, POSITION], error[:, OMEGA], error[:, VELOCITY] = a.p - b.p, a.omega - b.omega, a.v - b.v
     return error

@@ -22,7 +22,6 @@ import tyro
 import zenoh
 
 from camera_node.protocol.messages import CameraStatus, Detections, decode
-from camera_node.simulation.camera import exposure_middle_s
 from camera_node.simulation.scene import Scene
 from tests.conftest import free_port, wait_for_port
 from tests.web.test_view import CHROMIUM, FLAGS
@@ -51,7 +50,7 @@ class Stamps:
         camera = self._scene.camera(message.camera)
         since_s = (message.t_ns - self._epoch_ns) * 1e-9 - camera.phase_ms * 1e-3
         index = round(since_s * camera.fps)
-        true_ns = self._epoch_ns + round(exposure_middle_s(camera, index) * 1e9)
+        true_ns = self._epoch_ns + round(camera.exposure_middle_s(index) * 1e9)
         self._frames.append((message.camera, index, (message.t_ns - true_ns) / 1e3))
 
     def _take_status(self, sample: zenoh.Sample) -> None:

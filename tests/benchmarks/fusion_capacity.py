@@ -22,7 +22,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.protocol.messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.server import collecting_between_instants
+from fusion.server.server import collecting_between_frame_sets
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import Load
 
@@ -50,7 +50,7 @@ class Capacity:
 
 def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
     """Of a load that runs for `seconds`; of several shards, each a core of its own, the worst of each figure."""
-    with collecting_between_instants():
+    with collecting_between_frame_sets():
         queues = [Queue(load, seconds, Shard(k + 1, shards)) for k in range(shards)]
         for message in load.messages(seconds):
             data, arrival_ns = encode(message), message.t_ns + DELAY_NS
@@ -64,7 +64,7 @@ def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
 
 def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
     """Of several loads, which take turns: what else the machine does meets all of them alike."""
-    with collecting_between_instants():
+    with collecting_between_frame_sets():
         queues = [Queue(load, seconds) for load in loads]
         streams = [load.messages(seconds) for load in loads]
         for _ in range(math.ceil(seconds / TURN_S)):

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.pose import Pose, exp_so3, look_at
+from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from fusion.errors import FusionError
 from fusion.model.camera_array import CameraArray, Exposures
@@ -128,7 +128,7 @@ class Paths:
         p = np.column_stack([self.centre + self.size * np.sin(angle), self.height])
         v = np.column_stack([self.size * self.rate * np.cos(angle), np.zeros(n)])
         up = np.column_stack([np.zeros((n, 2)), np.ones(n)])
-        R = exp_so3(up * (self.heading + self.turn * t_s)[:, None])
+        R = rotation_from_vector(up * (self.heading + self.turn * t_s)[:, None])
         return States(R, p, up * self.turn[:, None], v, np.zeros((n, 12, 12)))
 
 

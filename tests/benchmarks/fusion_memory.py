@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from camera_node.protocol.messages import encode
-from fusion.server.server import collecting_between_instants
+from fusion.server.server import collecting_between_frame_sets
 from fusion.server.status import memory_mb
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series
 from tests.benchmarks.fusion_load import START_NS, Load
@@ -30,7 +30,7 @@ def main(seconds: float = 600.0, robots: int = 50) -> None:
     """
     load, room = Load(robots=robots), round(seconds / EVERY_S) + 1
     times_s, memory, blocks = Series(room), Series(room), Series(room)
-    with collecting_between_instants():
+    with collecting_between_frame_sets():
         queue = Queue(load, seconds)
         for message in load.messages(seconds):
             at_s = (message.t_ns - START_NS) * 1e-9

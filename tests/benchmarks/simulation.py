@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a simulated frame costs: `python -m tests.benchmarks.simulation [SCENE]`, processor time of one thread."""
+"""Processor time of rendering a frame, in one thread: `python -m tests.benchmarks.simulation [SCENE]`."""
 
 import sys
 import time
@@ -15,18 +15,18 @@ FRAMES = 200
 
 
 def main(path: Path) -> None:
-    """Print start-up and time a frame, by camera, while the wand waves and while the robots drive."""
+    """Print the start-up time and the time for each frame of every camera, with the wand and with the robots."""
     scene = Scene.load(path)
     for name in scene.cameras:
         start = time.process_time()
         renderer = Renderer(scene, name)
         print(f"{name}: start-up {time.process_time() - start:.2f} s", end="")
-        for what, first_s in (("wand", 0.0), ("robots", scene.wave_s)):
+        for body, first_s in (("wand", 0.0), ("robots", scene.wave_s)):
             times = np.linspace(first_s, first_s + min(scene.wave_s, 15.0) * 0.99, FRAMES)
             start = time.process_time()
             for k, t_s in enumerate(times):
                 renderer.render(float(t_s), k)
-            print(f"; {what} {(time.process_time() - start) / FRAMES * 1e3:.2f} ms a frame", end="")
+            print(f"; {body} {(time.process_time() - start) / FRAMES * 1e3:.2f} ms per frame", end="")
         print()
 
 

@@ -3,7 +3,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -14,7 +13,7 @@ from calib.wand.quality.agreement import Placed, compare
 from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
-from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector
+from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector, vector_from_rotation
 from camera_node.protocol.messages import Detections
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
@@ -193,8 +192,8 @@ def camera_errors(found: Rig, truth: Rig) -> tuple[Array, Array]:
     U, _, Vt = np.linalg.svd(cross + (b - b.mean(0)).T @ (a - a.mean(0)))
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     shift = np.asarray(np.linalg.norm((a - a.mean(0)) @ R.T - (b - b.mean(0)), axis=1), float)
-    turns = [cv2.Rodrigues(y[:3, :3].T @ R @ x[:3, :3])[0] for x, y in zip(A, B, strict=True)]
-    return np.asarray(shift, float), np.array([float(np.linalg.norm(turn)) for turn in turns])
+    turns = vector_from_rotation(B[:, :3, :3].mT @ R @ A[:, :3, :3])
+    return np.asarray(shift, float), np.linalg.norm(turns, axis=1)
 
 
 def joint_error(result: WandCalibration, truth: Rig) -> tuple[float, int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Zenoh routers on loopback, and waiting with a deadline."""
+"""Fixtures: Zenoh routers and clients on loopback, and waiting with a deadline."""
 
 import threading
 import time
@@ -12,11 +12,11 @@ from camera_node.errors import NetworkError
 from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port
 
-DEADLINE_S = 15.0  # generous: a loaded machine; nothing waits for it unless a test fails
+DEADLINE_S = 15.0  # enough for a loaded machine; only a failing test waits this long
 
 
 class Inbox:
-    """What a Zenoh callback gave, and a wait for more of it."""
+    """Collects the arguments of a Zenoh callback, and waits for them."""
 
     def __init__(self) -> None:
         self.items: list = []
@@ -28,13 +28,13 @@ class Inbox:
             self._changed.notify_all()
 
     def until(self, happened: Callable[[list], object]) -> bool:
-        """Wait until `happened(items)`; whether it did within the deadline."""
+        """Wait until `happened(items)` is true; return False after the deadline."""
         with self._changed:
             return bool(self._changed.wait_for(lambda: happened(self.items), DEADLINE_S))
 
 
 def eventually(happened: Callable[[], object], act: Callable[[], object] = lambda: None) -> bool:
-    """Act every 10 ms until it has happened; whether it did within the deadline. For what tells nobody."""
+    """Call `act` every 10 ms until `happened()` is true; return False after the deadline."""
     pause, end = threading.Event(), time.monotonic() + DEADLINE_S
     while not happened() and time.monotonic() < end:
         act()
@@ -50,22 +50,22 @@ class Network:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
 
     def router(self) -> zenoh.Session:
-        """A router on a port that nobody else took in the meantime; on the known endpoint while it is free."""
+        """Open a router at `endpoint`, or at a new endpoint where another process has taken the port."""
         for _ in range(20):
             try:
-                return self._keep(open_router([self.endpoint]))
+                return self._register(open_router([self.endpoint]))
             except NetworkError:
                 self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        raise AssertionError("twenty ports were taken one after another")
+        raise AssertionError("twenty consecutive ports were taken")
 
     def router_again(self) -> zenoh.Session:
-        """A router where clients already look for one."""
-        return self._keep(open_router([self.endpoint]))
+        """Open a router at the endpoint to which the clients connect."""
+        return self._register(open_router([self.endpoint]))
 
     def client(self) -> zenoh.Session:
-        return self._keep(open_client([self.endpoint]))
+        return self._register(open_client([self.endpoint]))
 
-    def _keep(self, session: zenoh.Session) -> zenoh.Session:
+    def _register(self, session: zenoh.Session) -> zenoh.Session:
         self._sessions.append(session)
         return session
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files that people write: an error names the file and the place in it."""
+"""YAML files: an error names the file and the place in it."""
 
 import stat
 from pathlib import Path
@@ -20,16 +20,16 @@ from camera_node.geometry.body import Body
         ("diameter_m: 0.1\nmarkers: [[0, 0]]", r"\$\.markers\[0\]"),
         ("diameter_m: -1", "diameter"),
         ("diameter_m: 0.1\nmarker: [[0, 0, 0]]", "did you mean `markers`"),
-        ("diameter_m: 0.1\nzzz: 1", "it may hold diameter_m, markers, inner_ratio, surround_ratio"),
+        ("diameter_m: 0.1\nzzz: 1", "diameter_m, markers, inner_ratio, surround_ratio"),
         ("{}", "diameter_m"),
         ("[1, 2", "not valid YAML"),
-        ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' is there twice, in lines 1 and 2"),
+        ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' .*twice, in lines 1 and 2"),
         ("", "object"),
         ("a: \xff\x00", "YAML"),
         ("diameter_m: 1\nmarkers: [[.nan, 0, 0]]", "finite"),
     ],
 )
-def test_a_broken_file_is_named_with_the_place(tmp_path: Path, text: str, says: str):
+def test_an_error_names_the_file_and_the_place(tmp_path: Path, text: str, says: str):
     path = tmp_path / "wand.yaml"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ConfigError, match=says) as caught:
@@ -38,14 +38,14 @@ def test_a_broken_file_is_named_with_the_place(tmp_path: Path, text: str, says: 
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_folder_are_named(tmp_path: Path):
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"none\.yaml does not exist"):
         load_yaml(tmp_path / "none.yaml", Body)
     with pytest.raises(ConfigError, match="can't be read"):
         load_yaml(tmp_path, Body)
 
 
-def test_writing_replaces_the_whole_file_and_leaves_nothing_else(tmp_path: Path):
+def test_writing_replaces_the_file_and_leaves_no_other_file(tmp_path: Path):
     path = tmp_path / "rig.yaml"
     write_atomically(path, "old " * 1000)
     write_atomically(path, "new: ä\n")
@@ -54,13 +54,13 @@ def test_writing_replaces_the_whole_file_and_leaves_nothing_else(tmp_path: Path)
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
-def test_writing_into_a_missing_folder_says_so(tmp_path: Path):
-    with pytest.raises(ConfigError, match="is its folder there"):
+def test_writing_into_a_missing_folder_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"rig\.yaml can't be written"):
         write_atomically(tmp_path / "no" / "rig.yaml", "")
 
 
-def test_the_entry_of_a_mapping_is_named(tmp_path: Path):
-    """Of a rig with many cameras, the one with the fault."""
+def test_an_error_names_the_entry_of_a_mapping(tmp_path: Path):
+    """In a file with several entries, the one with the fault."""
     path = tmp_path / "scene.yaml"
     good, bad = "{diameter_m: 0.1}", "{diameter: 0.1}"
     path.write_text(f"robots: {{a: {good}, b: {bad}, c: {good}}}")

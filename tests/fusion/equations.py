@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from camera_node.arrays import Array, Index, Mask
-from camera_node.geometry.pose import exp_so3, turns
+from camera_node.geometry.pose import rotation_from_vector
 from fusion.model.camera_array import CameraArray, Discs, Exposures, Views
 from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.states import (
@@ -49,7 +49,8 @@ def pose(optics: CameraArray, states: States, exposures: Exposures) -> Poses:
     """Bodies at each frame's own time."""
     tau, R_cw, B = exposures.tau[:, None], optics.R_cam_world[exposures.camera], len(states)
     R, v, omega = states.R.transpose(1, 2, 0), states.v.T, states.omega.T
-    turn = turns(omega[:, None] * tau)  # (3, 3, F, B)
+    vectors = np.moveaxis(omega[:, None] * tau, 0, -1)
+    turn = np.moveaxis(rotation_from_vector(vectors), (-2, -1), (0, 1))  # (3, 3, F, B)
     R_world = (
         turn[:, 0, None] * R[0, :, None] + turn[:, 1, None] * R[1, :, None] + turn[:, 2, None] * R[2, :, None]
     )
@@ -231,7 +232,7 @@ def candidates(
 
 def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[States, Transition]:
     """See `fusion.model.states.predict`."""
-    half = exp_so3(states.omega * dt[:, None] / 2)
+    half = rotation_from_vector(states.omega * dt[:, None] / 2)
     R_half = half @ states.R
     turn = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
     motion = Transition(turn, dt)

@@ -86,7 +86,6 @@ class Said:
             dropped=2,
             detect_ms=0.71,
             roundels=8.0,
-            threshold=float("nan"),
             saturated=0.0,
             clock_offset_ms=0.02,
             advice=advice,

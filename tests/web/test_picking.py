@@ -12,7 +12,7 @@ from playwright.sync_api import Page, TimeoutError
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from tests.conftest import free_port
-from tests.fusion.client.test_measure import DEADLINE_S, STANDS, running, until
+from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
 from tests.fusion.synthetic import WIDE
 from tests.web.conftest import wait_for
 from tests.web.test_view import browsing, drawing
@@ -30,7 +30,7 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     """
     monkeypatch.setattr("web.view.PERIOD_S", 0.2)
     monkeypatch.setattr("web.view.PANEL_EVERY", 2)
-    with running(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
         subscription = Subscription(session, Feed("test"))
         view = View(subscription.feed, port=free_port())
         picking = Picking(view.server, subscription)
@@ -42,7 +42,7 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
 
 def places() -> np.ndarray:
     """(3, 3) where its markers are, world."""
-    R, p = STANDS(0.0)
+    R, p = WIDE_MOTION(0.0)
     return p + WIDE.points @ R.T
 
 

@@ -52,7 +52,6 @@ def test_a_camera_that_does_not_count_is_told():
         dropped=0,
         detect_ms=0.5,
         roundels=0.0,
-        threshold=128.0,
         saturated=0.0,
         advice="too dark",
     )

@@ -1,138 +1,141 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""GTSAM's part of a wand's bundle adjustment, the steps: knots are eliminated first, then cameras."""
+"""Solves for a Levenberg-Marquardt step with GTSAM, which eliminates the knots first, then the cameras."""
 
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
-from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, Problem
+from calib.rig.camera import PER_CAMERA
+from calib.wand.bundle_adjustment.linear_system import LinearSystem
+from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Index
 
-NUMBERS = 24  # of one variable, at the least: fewer and larger factors, though most of their entries are zero
+GROUP_SIZE = 24  # scalars in one variable, at least: few large factors are faster, though mostly zero
 
-# Information that holds the first camera and its clock, about what observations give: of what all share, none tells.
+# Information that fixes the gauge at the first camera and its clock: about the information of the observations.
 ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
-# Of the best known direction of a knot's place, and of its velocity: what holds the others. GTSAM takes pivots for
-# singular that are 2^12 apart.
-HELD = 2.0**-22
+# Damping of a knot's position and velocity, of the information in the best observed direction of each: GTSAM takes
+# pivots that are 2^12 apart for singular.
+MIN_RELATIVE_INFORMATION = 2.0**-22
 
 
 @dataclass(frozen=True, slots=True)
-class _Spans:
-    """A linearisation with some neighbouring knots as one variable, the last ones filled up with knots that are held.
+class _KnotGroups:
+    """A linear system with consecutive knots grouped into one variable, padded with fixed knots at the end.
 
-    `views`, `rows`, `ends` and `chain` are those of `Linearisation`, by span in place of knot; `grown` (N, m) is what
-    diagonals grow by.
+    `views`, `rows`, `bounds` and `chain` are those of `LinearSystem`, by group in place of knot; `damping` (N, m) is
+    added to the diagonal.
     """
 
     views: Index
     rows: Array
-    ends: Index
+    bounds: Index
     chain: Array
-    grown: Array
+    damping: Array
 
     @classmethod
-    def of(cls, linear: Linearisation, grown: Array) -> "_Spans":
-        """With diagonals that grow by (K, 6 B)."""
-        half, cameras = grown.shape[1], len(linear.problem.lenses)
-        knots = -(-NUMBERS // half)
-        m, count = knots * half, -(-len(linear.chain) // knots)
-        link, camera = np.divmod(np.repeat(linear.views, np.diff(linear.ends)), cameras)
-        view = link // knots * cameras + camera
+    def of(cls, system: LinearSystem, damping: Array) -> "_KnotGroups":
+        """Group the knots of a system, with `damping` (K, 6 B)."""
+        half, cameras = damping.shape[1], len(system.problem.lenses)
+        knots = -(-GROUP_SIZE // half)
+        m, count = knots * half, -(-len(system.chain) // knots)
+        interval, camera = np.divmod(np.repeat(system.views, np.diff(system.bounds)), cameras)
+        view = interval // knots * cameras + camera
         order = np.argsort(view, kind="stable")
         first = np.flatnonzero(np.diff(view[order], prepend=-1))
-        narrow, at = linear.rows[order], half * (link[order, None] % knots) + np.arange(2 * half)
+        narrow, at = system.rows[order], half * (interval[order, None] % knots) + np.arange(2 * half)
         rows = np.zeros((len(view), 2 * m + narrow.shape[1] - 2 * half))
         np.put_along_axis(rows, at, narrow[:, : 2 * half], axis=1)
         rows[:, 2 * m :] = narrow[:, 2 * half :]
         chain = np.zeros((count, 2 * m + 1, 2 * m + 1))
         for k in range(knots):
-            part = linear.chain[k::knots]
+            part = system.chain[k::knots]
             inner = np.append(np.arange(half * k, half * (k + 2)), 2 * m)
             chain[: len(part), inner[:, None], inner] += part
-        filled = np.ones(((count + 1) * knots, half))
-        filled[: len(grown)] = grown
-        return cls(view[order][first], rows, np.append(first, len(view)), chain, filled.reshape(-1, m))
+        padded = np.ones(((count + 1) * knots, half))
+        padded[: len(damping)] = damping
+        return cls(view[order][first], rows, np.append(first, len(view)), chain, padded.reshape(-1, m))
 
 
-def solve(linear: Linearisation, damping: float) -> tuple[Array, Array]:
-    """Levenberg-Marquardt's step: (C, 12) of cameras and (K, 6 B) of the motion. Where all cameras are sought, the
-    first and its clock stay, as nothing observes the world and the time that all share.
+def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
+    """Solve for the step of Levenberg-Marquardt: (C, 12) of the cameras and (K, 6 B) of the motion.
 
-    The Hessian's diagonal is grown (Marquardt), and where one camera alone saw a knot, held along its ray.
+    The Hessian's diagonal is multiplied by 1 + `damping` (Marquardt); a knot that only one camera observed is damped
+    along its viewing ray. Where all cameras are estimated, the first camera and its clock are fixed (gauge).
 
     Raises:
-        RuntimeError: the system is too near to singular; more damping helps.
+        RuntimeError: the system is nearly singular; more damping helps.
     """
     import gtsam
 
-    of_knots, of_cameras = linear.diagonal()
+    problem = system.problem
+    of_knots, of_cameras = system.diagonal()
     parts = of_knots.reshape(len(of_knots), 2, -1)
-    held = (HELD * parts.max(axis=2, keepdims=True) * np.ones_like(parts)).reshape(of_knots.shape)
-    spans = _Spans.of(linear, damping * of_knots + held)
-    graph, count, free = gtsam.GaussianFactorGraph(), len(spans.grown), list(linear.problem.free)
-    _add_views(graph, linear.problem, spans)
-    _add_motion(graph, spans)
-    _add_rig(graph, linear, count)
-    for camera in linear.problem.cameras():
-        grown = damping * of_cameras[camera]
-        graph.push_back(gtsam.HessianFactor(count + camera, np.diag(grown), 0 * grown, 0.0))
-    if linear.problem.sought is None:
+    least = MIN_RELATIVE_INFORMATION * parts.max(axis=2, keepdims=True) * np.ones_like(parts)
+    groups = _KnotGroups.of(system, damping * of_knots + least.reshape(of_knots.shape))
+    graph, count, free = gtsam.GaussianFactorGraph(), len(groups.damping), list(problem.free)
+    _add_views(graph, problem, groups)
+    _add_motion(graph, groups)
+    _add_priors(graph, system, count)
+    for camera in problem.estimated_cameras():
+        added = damping * of_cameras[camera]
+        graph.push_back(gtsam.HessianFactor(count + camera, np.diag(added), 0 * added, 0.0))
+    if problem.estimated is None:
         graph.push_back(gtsam.HessianFactor(count, np.diag(ANCHOR[free]), 0 * ANCHOR[free], 0.0))
-    step = graph.optimize(_ordering(linear.problem, count))
-    by = np.zeros((len(linear.problem.lenses), PER_CAMERA))
-    for camera in linear.problem.cameras():
-        by[camera, free] = step.at(count + camera)
-    along = np.array([step.at(key) for key in range(count)])
-    return by, along.reshape(-1, of_knots.shape[1])[: len(of_knots)]
+    step = graph.optimize(_ordering(problem, count))
+    camera_step = np.zeros((len(problem.lenses), PER_CAMERA))
+    for camera in problem.estimated_cameras():
+        camera_step[camera, free] = step.at(count + camera)
+    motion_step = np.array([step.at(key) for key in range(count)])
+    return camera_step, motion_step.reshape(-1, of_knots.shape[1])[: len(of_knots)]
 
 
-def _add_views(graph: Any, problem: Problem, spans: _Spans) -> None:
-    """One factor a camera and span; a camera that is not sought is known."""
+def _add_views(graph: Any, problem: Problem, groups: _KnotGroups) -> None:
+    """Add one factor for each camera and group of knots; fixed cameras are no variables."""
     import gtsam
 
-    (count, m), rows = spans.grown.shape, spans.rows
+    (count, m), rows = groups.damping.shape, groups.rows
     J1, J2, J3, b = rows[:, :m], rows[:, m : 2 * m], rows[:, 2 * m : -1], rows[:, -1]
-    links, cameras = np.divmod(spans.views, len(problem.lenses))
+    first, cameras = np.divmod(groups.views, len(problem.lenses))
     factor = cast(Any, gtsam.JacobianFactor)
-    sought, ends = set(problem.cameras()), spans.ends.tolist()
-    units = {n: gtsam.noiseModel.Unit.Create(n) for n in set(np.diff(ends).tolist())}
-    for k, camera, i, j in zip(links.tolist(), cameras.tolist(), ends, ends[1:], strict=False):
-        of_camera = (count + camera, J3[i:j]) if camera in sought else ()
+    estimated, bounds = set(problem.estimated_cameras()), groups.bounds.tolist()
+    units = {n: gtsam.noiseModel.Unit.Create(n) for n in set(np.diff(bounds).tolist())}
+    for k, camera, i, j in zip(first.tolist(), cameras.tolist(), bounds, bounds[1:], strict=False):
+        of_camera = (count + camera, J3[i:j]) if camera in estimated else ()
         graph.push_back(factor(k, J1[i:j], k + 1, J2[i:j], *of_camera, b[i:j], units[j - i]))
 
 
-def _add_motion(graph: Any, spans: _Spans) -> None:
-    """What is known of the motion, with what diagonals grow by: span k stands in link k, the last one in the last."""
+def _add_motion(graph: Any, groups: _KnotGroups) -> None:
+    """Add the motion terms and the damping, group k's own with group k + 1's, the last group's with the last pair."""
     import gtsam
 
-    m, chain = spans.grown.shape[1], spans.chain.copy()
+    m, chain = groups.damping.shape[1], groups.chain.copy()
     diagonal = np.einsum("lii->li", chain)
-    diagonal[:, :m] += spans.grown[:-1]
-    diagonal[-1, m:-1] += spans.grown[-1]
+    diagonal[:, :m] += groups.damping[:-1]
+    diagonal[-1, m:-1] += groups.damping[-1]
     for k, H in enumerate(chain):
         G11, G12, g1 = H[:m, :m], H[:m, m:-1], H[:m, -1]
         graph.push_back(gtsam.HessianFactor(k, k + 1, G11, G12, g1, H[m:-1, m:-1], H[m:-1, -1], 0.0))
 
 
-def _add_rig(graph: Any, linear: Linearisation, count: int) -> None:
-    """What is known of the cameras, whose keys begin at `count`."""
+def _add_priors(graph: Any, system: LinearSystem, count: int) -> None:
+    """Add the priors of the estimated cameras, whose keys begin at `count`."""
     import gtsam
 
-    sought = set(linear.problem.cameras())
-    for keys, J, error in linear.rig:
-        if sought.issuperset(keys):
-            blocks = [part for key, block in zip(keys, J, strict=True) for part in (count + key, block)]
-            unit = gtsam.noiseModel.Unit.Create(len(error))
-            graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, error, unit))
+    estimated = set(system.problem.estimated_cameras())
+    for prior in system.priors:
+        if estimated.issuperset(prior.cameras):
+            pairs = zip(prior.cameras, prior.jacobians, strict=True)
+            blocks = [part for camera, block in pairs for part in (count + camera, block)]
+            unit = gtsam.noiseModel.Unit.Create(len(prior.error))
+            graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, prior.error, unit))
 
 
 def _ordering(problem: Problem, count: int) -> Any:
     import gtsam
 
     ordering = gtsam.Ordering()
-    for key in (*range(count), *(count + camera for camera in problem.cameras())):
+    for key in (*range(count), *(count + camera for camera in problem.estimated_cameras())):
         ordering.push_back(key)
     return ordering

@@ -1,129 +1,138 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How well a lens is known before the wand is waved: by its own calibration, or as lenses without figures are.
+"""The prior of each lens: its own calibration's standard deviations, or an estimate from the wand recording.
 
-Files without figures range from a data sheet to a careful calibration. How far off such lenses are, the wave itself
-tells, as it changes many of them (empirical Bayes: Efron and Morris 1973): by the marginal likelihood of the deviation
-that those of a kind share. Lenses are held as if they were exact in one file of two, else off by any order of
-magnitude (spike and slab; Mitchell and Beauchamp 1988): good ones cost nothing. Covariances do not believe that. For
-them the deviation is uniform between none and the usual before anything is seen (Gelman 2006): what a lens may be off
-by without the wave showing it counts in full.
+A lens file without standard deviations may come from a data sheet or from a careful calibration. The recording corrects
+many lenses and so estimates how far off they are (empirical Bayes: Efron and Morris 1973): the deviation that lenses
+share, by kind of parameter, has a marginal likelihood. In the estimate, its prior is a mixture (spike and slab;
+Mitchell and Beauchamp 1988): exact with probability 1/2, else of any order of magnitude, so exact lenses lose no
+accuracy. For the covariance, its prior is uniform between zero and the usual deviation (Gelman 2006), so errors that
+the recording cannot show count in full. docs/wand_adjustment.md has the equations.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from calib.rig.camera import Camera
+from calib.rig.camera import LENS, Camera
+from calib.wand.bundle_adjustment.covariance import inverse_information
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS, Problem
+from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 
-# Of log f, the principal point (part of the longer side) and k1, for a lens whose file says nothing: what lies between
-# a data sheet, or a sloppy board, and the lens that is there.
+# Usual standard deviations of log f, the principal point (share of the longer side) and k1 of a lens whose file has
+# none: between a data sheet, or a careless calibration, and the true lens.
 FOCAL, CENTRE, K1 = 0.03, 0.02, 0.1
-# No lens is as it was calibrated to better than this: focus, temperature, a camera that was taken off its mount.
-FLOOR = np.array([5e-4, 0.3, 0.3, 5e-4])
-WRONG = 1e-4  # probability below which a lens is not what its figures say
-PARTS = np.concatenate(
-    [[0.0], np.geomspace(1e-3, 1.0, 31)]
-)  # of the usual deviations, by which lenses may be off
-# Probabilities of these before anything is seen: to hold lenses by, and for covariances.
-SPIKE, UNIFORM = np.where(PARTS > 0, 0.5 / (len(PARTS) - 1), 0.5), PARTS / PARTS.sum()
-LEAST = 1e-5  # of the usual deviations: exact, and yet a number
-KINDS = np.array([0, 1, 1, 2])  # of the four, that are off alike: focal length, principal point, distortion
-SWEEPS = 4  # over the kinds, each given the others
+# Least standard deviations: focus, temperature, or remounting change every lens by more than its calibration claims.
+MIN_SIGMA = np.array([5e-4, 0.3, 0.3, 5e-4])
+CONTRADICTED = 1e-4  # probability below which the recording contradicts a lens's standard deviations
+# Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
+# the covariance.
+SHARES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
+SPIKE_AND_SLAB, UNIFORM = np.where(SHARES > 0, 0.5 / (len(SHARES) - 1), 0.5), SHARES / SHARES.sum()
+MIN_SHARE = 1e-5  # of the usual deviations: practically exact
+KINDS = np.array([0, 1, 1, 2])  # of the four parameters: focal length, principal point, distortion
+SWEEPS = 4  # over the kinds, each conditional on the others
 
 
 def usual_sigma(lens: Lens) -> Array:
-    """(4,) standard deviations of log f, cx, cy and k1 of a lens without figures."""
+    """(4,) standard deviations of log f, cx, cy and k1 of a lens whose file has none."""
     size = max(lens.width, lens.height)
     return np.array([FOCAL, CENTRE * size, CENTRE * size, K1])
 
 
-def told_sigma(lens: Lens) -> Array | None:
-    """(4,) those that stand with the lens; None where none do."""
+def calibrated_sigma(lens: Lens) -> Array | None:
+    """(4,) standard deviations of log f, cx, cy and k1 from the lens's file; None where it has none."""
     if not isinstance(lens, Camera) or lens.lens_sigma is None:
         return None
     fx, fy, cx, cy, *distortion = lens.lens_sigma
     focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
-    return np.maximum([focal, cx, cy, distortion[0] if distortion else K1], FLOOR)
+    return np.maximum([focal, cx, cy, distortion[0] if distortion else K1], MIN_SIGMA)
 
 
-def settle(problem: Problem, adjusted: Adjusted) -> Problem:
-    """The problem with lenses held by what a wave tells of them.
-
-    Figures that stand with a lens hold unless the wave contradicts them. Of all others the wave itself tells how far
-    off they are, by kind of parameter. Cameras that are not sought keep theirs.
+def parameter_sigma(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:
+    """`Camera.lens_sigma` of an adjusted lens.
 
     Args:
-        problem: to change.
-        adjusted: the wave, adjusted with lenses held by whatever there was.
+        lens: the adjusted lens.
+        before: `lens_sigma` of its file, which stays for parameters that are not adjusted; these count as exact
+            without it.
+        sigma: (4,) standard deviations of log f, cx, cy and k1.
     """
-    sought = list(adjusted.problem.cameras())
-    information, gradient = _told_by_wave(adjusted)
-    sigma, rough = _known(adjusted.problem, information, gradient)
-    held, doubt = problem.lens_sigma.copy(), problem.lens_sigma.copy()
-    held[sought] = sigma * _parts(information, gradient, sigma, rough, SPIKE)
-    doubt[sought] = np.maximum(sigma * _parts(information, gradient, sigma, rough, UNIFORM), held[sought])
-    return replace(problem, lens_sigma=held, lens_doubt=doubt)
-
-
-def _known(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
-    """(S, 4) deviations of the sought lenses, by their figures where these hold, else the usual ones, which are
-    `rough`."""
-    lenses = [problem.lenses[k] for k in problem.cameras()]
-    sigma, rough = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), 4), bool)
-    covariance = np.linalg.inv(information + np.diag(sigma.ravel() ** -2))
-    off = (covariance @ gradient).reshape(-1, 4)
-    for k, lens in enumerate(lenses):
-        mine, figures = slice(4 * k, 4 * k + 4), told_sigma(lens)
-        if figures is not None and _holds(off[k], covariance[mine, mine] + np.diag(figures**2)):
-            sigma[k], rough[k] = figures, False
-    return sigma, rough
-
-
-def _holds(off: Array, covariance: Array) -> bool:
-    from scipy.special import chdtrc
-
-    return bool(chdtrc(len(off), off @ np.linalg.solve(covariance, off)) > WRONG)
-
-
-def _parts(information: Array, gradient: Array, sigma: Array, rough: Mask, prior: Array) -> Array:
-    """(S, 4) what part of `sigma` the lenses are off by, those of a kind alike: the root of its square's posterior
-    mean, one kind after the other, by the `prior` of PARTS; 1 where they are not `rough`."""
-    parts = np.ones(len(KINDS))
-    for kind in np.tile(np.unique(KINDS), SWEEPS if rough.any() else 0):
-        tried = np.where(kind == KINDS, PARTS[:, None], parts)
-        trials = np.where(rough, tried[:, None], 1.0) * sigma
-        likely = _log_marginals(information, gradient, trials.reshape(len(PARTS), -1))
-        weight = prior * np.exp(likely - likely.max())
-        parts[kind == KINDS] = max(np.sqrt(weight @ PARTS**2 / weight.sum()), LEAST)
-    return np.where(rough, parts, 1.0)
-
-
-def _told_by_wave(adjusted: Adjusted) -> tuple[Array, Array]:
-    """(4S, 4S) information on the S sought lenses by what was seen alone, and (4S,) its product with their estimate."""
-    problem = adjusted.problem
-    sought, d = list(problem.cameras()), len(problem.free)
-    mine = np.ravel(np.arange(len(sought))[:, None] * d + [problem.free.index(p) for p in LENS])
-    noise = adjusted.scale**2 * adjusted.dependence
-    whole = np.linalg.inv(adjusted.inverse()[np.ix_(mine, mine)])
-    known = np.diag(problem.lens_sigma[sought].ravel() ** -2)
-    return (whole - known) / noise, whole @ adjusted.state.lenses[sought].ravel() / noise
-
-
-def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:
-    """(t,) log likelihoods of parameters' deviations (t, n), the parameters integrated out: with S = diag(sigma),
-    g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
-    root = np.linalg.cholesky(np.eye(len(gradient)) + sigma[:, :, None] * information * sigma[:, None])
-    pulled = np.linalg.solve(root, (sigma * gradient)[:, :, None])[:, :, 0]
-    return np.asarray((pulled**2).sum(axis=1) / 2 - np.log(np.einsum("tnn->tn", root)).sum(axis=1), float)
-
-
-def written(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:
-    """`Camera.lens_sigma` of an adjusted lens by `sigma` (4,); what is not adjusted stays as it was, or counts as
-    known."""
     focal, cx, cy, k1 = sigma.tolist()
     rest = (*(before or ()), *[0.0] * len(lens.parameters))[5 : len(lens.parameters)]
     return (focal * lens.fx, focal * lens.fy, cx, cy, k1, *rest)
+
+
+def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
+    """The problem with lens priors from an adjustment of the same recording.
+
+    Standard deviations from a lens's file hold unless the recording contradicts them. For all other lenses the
+    recording gives a deviation by kind of parameter. Fixed cameras keep their priors.
+
+    Args:
+        problem: to change.
+        adjusted: an adjustment of the recording with any lens priors.
+    """
+    estimated = list(adjusted.problem.estimated_cameras())
+    information, gradient = _lens_likelihood(adjusted)
+    sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
+    prior, claimed = problem.lens_sigma.copy(), problem.lens_sigma.copy()
+    prior[estimated] = sigma * _shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
+    uniform = sigma * _shares(information, gradient, sigma, unknown, UNIFORM)
+    claimed[estimated] = np.maximum(uniform, prior[estimated])
+    return replace(problem, lens_sigma=prior, lens_sigma_claimed=claimed)
+
+
+def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
+    """(4S, 4S) information of the observations alone on the S estimated lenses, and (4S,) its product with their
+    maximum-likelihood estimate."""
+    problem = adjusted.problem
+    estimated, d = list(problem.estimated_cameras()), len(problem.free)
+    rows = np.ravel(np.arange(len(estimated))[:, None] * d + [problem.free.index(p) for p in LENS])
+    variance = adjusted.scale**2 * adjusted.inflation
+    with_prior = np.linalg.inv(inverse_information(adjusted)[np.ix_(rows, rows)])
+    prior = np.diag(problem.lens_sigma[estimated].ravel() ** -2)
+    return (with_prior - prior) / variance, with_prior @ adjusted.state.lenses[estimated].ravel() / variance
+
+
+def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
+    """(S, 4) standard deviations of the estimated lenses: from their files where the recording does not contradict
+    them, else the usual ones; and which (S, 4) are the usual ones, of `unknown` size."""
+    lenses = [problem.lenses[k] for k in problem.estimated_cameras()]
+    sigma, unknown = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), 4), bool)
+    covariance = np.linalg.inv(information + np.diag(sigma.ravel() ** -2))
+    correction = (covariance @ gradient).reshape(-1, 4)
+    for k, lens in enumerate(lenses):
+        block, given = slice(4 * k, 4 * k + 4), calibrated_sigma(lens)
+        if given is not None and _plausible(correction[k], covariance[block, block] + np.diag(given**2)):
+            sigma[k], unknown[k] = given, False
+    return sigma, unknown
+
+
+def _plausible(correction: Array, covariance: Array) -> bool:
+    from scipy.special import chdtrc
+
+    squared = correction @ np.linalg.solve(covariance, correction)
+    return bool(chdtrc(len(correction), squared) > CONTRADICTED)
+
+
+def _shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:
+    """(S, 4) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
+    root of the posterior mean of its square under `prior`, one kind after the other; 1 for other lenses."""
+    shares = np.ones(len(KINDS))
+    for kind in np.tile(np.unique(KINDS), SWEEPS if unknown.any() else 0):
+        tried = np.where(kind == KINDS, SHARES[:, None], shares)
+        trials = np.where(unknown, tried[:, None], 1.0) * sigma
+        likelihood = _log_marginals(information, gradient, trials.reshape(len(SHARES), -1))
+        weight = prior * np.exp(likelihood - likelihood.max())
+        shares[kind == KINDS] = max(np.sqrt(weight @ SHARES**2 / weight.sum()), MIN_SHARE)
+    return np.where(unknown, shares, 1.0)
+
+
+def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:
+    """(t,) log marginal likelihoods of deviations `sigma` (t, n), with information L and gradient g, parameters
+    integrated out: with S = diag(sigma), g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
+    root = np.linalg.cholesky(np.eye(len(gradient)) + sigma[:, :, None] * information * sigma[:, None])
+    whitened = np.linalg.solve(root, (sigma * gradient)[:, :, None])[:, :, 0]
+    return np.asarray((whitened**2).sum(axis=1) / 2 - np.log(np.einsum("tnn->tn", root)).sum(axis=1), float)

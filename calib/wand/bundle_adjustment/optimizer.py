@@ -1,50 +1,51 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bundle adjustment of cameras, their clocks and a waved wand, every frame at its own capture time.
+"""Optimizes the cameras, their clocks and lenses, and the wand's motion, with Levenberg-Marquardt.
 
-Unknown are the cameras' poses and time offsets and the wand's motion (`trajectory`); measured are roundel centres, the
-wand's lengths and, weakly, that a hand moves smoothly. Each iteration linearises all observations in numpy, once; GTSAM
-eliminates the sparse system (`linearisation`). Robust by iteratively reweighted least squares: Cauchy's weights at a
-scale that the residuals themselves give, then plain least squares without what the statistics reject.
+A rough start is optimized robustly by iteratively reweighted least squares: Cauchy's weights at a scale that the
+residuals give. The final estimate is plain least squares without the observations that the statistics reject.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from calib.wand.bundle_adjustment.gtsam_step import solve
-from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations, unobserved
-from calib.wand.bundle_adjustment.schur_complement import marginalise
+from calib.wand.bundle_adjustment.gtsam_step import solve_step
+from calib.wand.bundle_adjustment.linear_system import LinearSystem, linearize
+from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
+from calib.wand.bundle_adjustment.residuals import (
+    ErrorNorms,
+    Weights,
+    error_norms,
+    find_weights,
+    reprojection_errors,
+)
+from calib.wand.bundle_adjustment.schur_complement import eliminate_motion
 from camera_node.arrays import Array, Mask
 
-CAUCHY = 2.3849  # 95 % efficient on normal residuals
-REJECT = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
-BREAK = 4.0  # sigmas, over all coordinates: the hand was knocked, or frames are missing from the count
-MAX_ITERATIONS = 60
-ROUNDS = 5
-MIN_DAMPING = 1e-9
-ROUGHLY, NOTHING = 5e-3, 1e-4  # of the cost: gained by a step that is the last
-TINY = 1e-4  # of half of chi-square
+CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
+REJECTED = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
+INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
+MAX_ITERATIONS, MAX_ROUNDS = 60, 5
+MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
+# The last step decreases the cost by less than this share, and this absolute amount.
+ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Adjusted:
-    """The best state.
+    """The optimal state, and what its covariance follows from (`covariance`).
 
     Attributes:
-        problem: what was adjusted, with the parameters that were sought.
+        problem: that was optimized.
         state: cameras, clocks, lenses and motion.
-        used: (n,) the observations that were not rejected.
-        residuals: (n, 2) seen less expected, pixels, of all observations.
-        scale: what the residuals are over what their covariances claim; all covariances are scaled by it.
-        information: (S d, S d) of the S sought cameras' free parameters, poses in their own frames, rotation then
-            translation, by what was seen at the noise it claims and by what was known before; its null space is the
-            choice of the world, and of the clock that all others are compared with.
-        scores: (L, S d) gradients, by interval between knots, of what was seen.
-        iterations: of all rounds together.
-        dependence: by what covariances, beside `scale`, are widened because errors of neighbouring moments are alike
-            (`calib.wand.bundle_adjustment.dependence`).
+        used: (n,) observations that were not rejected.
+        residuals: (n, 2) observed minus predicted pixels, of all observations.
+        scale: ratio of the residuals to their assumed standard deviations, the square root of the variance factor.
+        information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
+            space is the gauge: the choice of the world, and of the time that clocks are relative to.
+        scores: (L, S d) gradients by interval between knots, without priors.
+        iterations: of all rounds.
+        inflation: factor of the covariance for residuals that are correlated in time.
     """
 
     problem: Problem
@@ -55,93 +56,43 @@ class Adjusted:
     information: Array
     scores: Array
     iterations: int
-    dependence: float = 1.0
-
-    @cached_property
-    def joint_covariance(self) -> Array:
-        """(C, d, C, d) covariance of all free parameters, the world being where the cameras themselves are on average,
-        and the time what their clocks say on average (inner constraints; Triggs et al., Bundle Adjustment, section
-        9.3). Where only some cameras were sought, it is theirs in the world of the others, which are taken as known."""
-        by_prior = self.by_prior()
-        return np.asarray(self.by_noise() + np.einsum("cpm,eqm->cpeq", by_prior, by_prior), float)
-
-    def by_noise(self) -> Array:
-        """(C, d, C, d) the part of it that comes from the noise of what was seen, as this turned out."""
-        inverse, root = self.inverse(), self._prior_root()
-        pulled = inverse * root
-        return self._among_all(self.scale**2 * self.dependence * (inverse - pulled @ pulled.T), 2)
-
-    def by_prior(self) -> Array:
-        """(C, d, S d) the other part, P P^T: what each parameter is off by where another, which the last axis counts,
-        is off by its doubt from what was given, and is held there. More of the same waving would not change it."""
-        root, sought = self._prior_root(), list(self.problem.cameras())
-        doubts = np.where(root > 0, self.problem.doubt()[sought].ravel(), 0.0)
-        return np.asarray(self._among_all(self.inverse() * (root**2 * doubts), 1), float)
-
-    def inverse(self) -> Array:
-        """(S d, S d) inverse of the information on what is observed."""
-        if self.problem.sought is not None:
-            return np.asarray(np.linalg.inv(self.information), float)
-        gauge = unobserved(self.state, self.problem.free)
-        rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-        return np.asarray(rest @ np.linalg.inv(rest.T @ self.information @ rest) @ rest.T, float)
-
-    def fixed_by_data(self) -> float:
-        """The number of parameters that what was seen fixes; those that the prior alone fixes do not count."""
-        return float(np.trace(self.inverse() @ (self.information - np.diag(self._prior_root() ** 2))))
-
-    def _prior_root(self) -> Array:
-        """(S d,) square root of the information that was there before."""
-        return 1 / self.problem.prior_sigma()[list(self.problem.cameras())].ravel()
-
-    def _among_all(self, part: Array, axes: int) -> Array:
-        """Rows (and columns, of two `axes`) of the sought cameras among those of all; zero for the others."""
-        count, d, sought = len(self.state.cameras), len(self.problem.free), list(self.problem.cameras())
-        full = np.zeros((count, d, count, d)[: 2 * axes] + part.shape[axes:])
-        split = part.reshape((len(sought), d, len(sought), d)[: 2 * axes] + part.shape[axes:])
-        full[np.ix_(*[sought, range(d)] * axes)] = split
-        return full
-
-    def covariance(self, parameters: tuple[int, ...]) -> Array:
-        """(C, p, C, p) that of some of a camera's parameters; zero where they were not sought."""
-        full = np.zeros((len(self.state.cameras), len(parameters)) * 2)
-        held = [k for k, p in enumerate(parameters) if p in self.problem.free]
-        at = [self.problem.free.index(parameters[k]) for k in held]
-        joint = self.joint_covariance
-        full[np.ix_(range(len(full)), held, range(len(full)), held)] = joint[:, at][:, :, :, at]
-        return full
+    inflation: float = 1.0
 
 
-def find_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
-    """The state that most observations agree to, from a rough start."""
-    every = Linearisation(problem, observations)
-    every.weigh(start)
-    return _descend(every, start, robust=True)[0]
+def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
+    """Optimize from a rough start with Cauchy's kernel."""
+    weights = find_weights(problem, observations, start)
+    return _levenberg_marquardt(problem, observations, weights, start, robust=True)[0]
 
 
-def adjust(problem: Problem, observations: WandObservations, start: State, rounds: int = ROUNDS) -> Adjusted:
-    """Least squares from a `start` that is nearly right; gross outliers are rejected by the statistics of residuals,
-    until these are the same again, or in so many `rounds`."""
-    every, state, iterations = Linearisation(problem, observations), start, 0
-    used, broken = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
+def adjust(
+    problem: Problem, observations: WandObservations, start: State, rounds: int = MAX_ROUNDS
+) -> Adjusted:
+    """Optimize from a start that is nearly right, without outliers.
+
+    Each round rejects observations, and interrupts the motion prior, by the statistics of the residuals, and optimizes;
+    rounds end where these do not change.
+    """
+    state, iterations = start, 0
+    used, interrupted = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
     for _ in range(rounds):
-        every.weigh(state)
-        errors = every.errors(state)
-        keep = errors.seen < REJECT * max(_spread(errors.seen[used] if used.any() else errors.seen), 1.0)
-        torn = errors.strain > BREAK
-        if (keep == used).all() and (torn == broken).all():
+        weights = find_weights(problem, observations, state)
+        norms = error_norms(problem, observations, state, weights)
+        spread = _spread(norms.observation[used] if used.any() else norms.observation)
+        accepted, broken = norms.observation < REJECTED * max(spread, 1.0), norms.interval > INTERRUPTED
+        if (accepted == used).all() and (broken == interrupted).all():
             break
-        used, broken = keep, torn
-        state, more = _descend(every.select(used, broken), state, robust=False)
+        used, interrupted = accepted, broken
+        inliers, their_weights = observations.select(used), weights.select(used, interrupted)
+        state, more = _levenberg_marquardt(problem, inliers, their_weights, state, robust=False)
         iterations += more
     else:
-        every.weigh(state)
-    kept = every.select(used, broken)
-    kept.relinearise(state)
-    cameras, scale = marginalise(kept), _variance_factor(kept, state)
-    return Adjusted(
-        problem, state, used, every.residuals(state), scale, cameras.information, cameras.scores, iterations
-    )
+        weights = find_weights(problem, observations, state)
+    inliers, their_weights = observations.select(used), weights.select(used, interrupted)
+    cameras = eliminate_motion(linearize(problem, inliers, state, their_weights))
+    scale = _noise_scale(problem, inliers, state, their_weights)
+    residuals = reprojection_errors(problem, observations, state)
+    return Adjusted(problem, state, used, residuals, scale, cameras.information, cameras.scores, iterations)
 
 
 def _spread(norms: Array) -> float:
@@ -149,42 +100,80 @@ def _spread(norms: Array) -> float:
     return float(np.median(norms)) / 1.1774
 
 
-def _variance_factor(linearisation: Linearisation, state: State) -> float:
-    """Square root of chi-square by degrees of freedom: of all that is measured, and that is known of the motion, less
-    the parameters. Of the latter all but a few velocities at gaps are fixed."""
-    problem = linearisation.problem
-    B, knots, linked = len(problem.wand.basis), len(problem.knot_s), linearisation.linked()
-    equations = 2 * len(linearisation.observations) + 6 * B * linked + len(problem.wand.lengths) * knots
-    known = np.isfinite(problem.prior_sigma()).sum()
-    free = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6 - known
-    return float(
-        np.sqrt(2 * linearisation.errors(state).cost(np.inf, np.inf) / max(equations - free, equations / 10))
-    )
+def _noise_scale(problem: Problem, observations: WandObservations, state: State, weights: Weights) -> float:
+    """Square root of chi-square over its degrees of freedom: the equations of observations and motion, less the
+    parameters. Priors fix all parameters of the motion but a few velocities at gaps."""
+    B, knots = len(problem.wand.basis), len(problem.knot_s)
+    connected = int(weights.motion.any(axis=(1, 2)).sum())
+    equations = 2 * len(observations) + 6 * B * connected + len(problem.wand.lengths) * knots
+    with_prior = np.isfinite(problem.prior_sigma()).sum()
+    parameters = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6 - with_prior
+    chi2 = 2 * error_norms(problem, observations, state, weights).cost()
+    return float(np.sqrt(chi2 / max(equations - parameters, equations / 10)))
 
 
-def _descend(linearisation: Linearisation, state: State, robust: bool) -> tuple[State, int]:
-    """Levenberg-Marquardt; with `robust`, Cauchy's weights at the scale of the current residuals."""
-    damping, slack = (1e-4, CAUCHY) if robust else (1e-6, np.inf)
-    errors = linearisation.errors(state)
+@dataclass(frozen=True, slots=True)
+class _Objective:
+    """The cost of one iteration: Cauchy's kernel at these scales in sigmas, plain least squares where infinite."""
+
+    problem: Problem
+    observations: WandObservations
+    weights: Weights
+    observation_scale: float = np.inf
+    interval_scale: float = np.inf
+
+    def norms(self, state: State) -> ErrorNorms:
+        return error_norms(self.problem, self.observations, state, self.weights)
+
+    def cost(self, norms: ErrorNorms) -> float:
+        return norms.cost(self.observation_scale, self.interval_scale)
+
+    def linearize(self, state: State, norms: ErrorNorms) -> LinearSystem:
+        weights = norms.reweight(self.weights, self.observation_scale, self.interval_scale)
+        return linearize(self.problem, self.observations, state, weights)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A state, its residuals and cost, and the damping that led to it."""
+
+    state: State
+    norms: ErrorNorms
+    cost: float
+    damping: float
+
+
+def _levenberg_marquardt(
+    problem: Problem, observations: WandObservations, weights: Weights, state: State, robust: bool
+) -> tuple[State, int]:
+    """The optimum, and the number of iterations; where `robust`, Cauchy's scale follows the residuals."""
+    objective, damping = _Objective(problem, observations, weights), 1e-4 if robust else 1e-6
+    norms = objective.norms(state)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        scale = CAUCHY * max(_spread(errors.seen), 1.0) if robust else np.inf
-        before = errors.cost(scale, slack)
-        weights = (
-            1 / (1 + (part / limit) ** 2) for part, limit in ((errors.seen, scale), (errors.strain, slack))
-        )
-        linearisation.relinearise(state, *weights)
-        while True:
-            try:
-                trial = linearisation.problem.moved(state, *solve(linearisation, damping))
-                moved = linearisation.errors(trial)
-                if (after := moved.cost(scale, slack)) <= before:
-                    break
-            except (RuntimeError, ValueError):  # GTSAM's word for nearly singular, and a lens that none is
-                pass
-            damping *= 10
-            if damping > 1e6:
-                return state, iteration
-        state, errors, damping = trial, moved, max(damping / 10, MIN_DAMPING)
-        if before - after < (ROUGHLY if robust else NOTHING) * before + TINY:
+        if robust:
+            scale = CAUCHY_SCALE * max(_spread(norms.observation), 1.0)
+            objective = _Objective(problem, observations, weights, scale, CAUCHY_SCALE)
+        before = _Step(state, norms, objective.cost(norms), damping)
+        step = _descend(objective, before)
+        if step is None:
+            return state, iteration
+        state, norms, damping = step.state, step.norms, max(step.damping / 10, MIN_DAMPING)
+        tolerance = ROBUST_TOLERANCE if robust else TOLERANCE
+        if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
             return state, iteration
     return state, MAX_ITERATIONS
+
+
+def _descend(objective: _Objective, before: _Step) -> _Step | None:
+    """The first step that does not increase the cost, damping ever more; None where there is none."""
+    system, damping = objective.linearize(before.state, before.norms), before.damping
+    while damping <= MAX_DAMPING:
+        try:
+            state = objective.problem.retract(before.state, *solve_step(system, damping))
+            norms = objective.norms(state)
+            if (cost := objective.cost(norms)) <= before.cost:
+                return _Step(state, norms, cost, damping)
+        except (RuntimeError, ValueError):  # GTSAM: a nearly singular system; Lens: impossible parameters
+            pass
+        damping *= 10
+    return None

@@ -1,39 +1,36 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a wand's bundle adjustment is about: observations, unknowns, and what stays the same."""
+"""The data of the wand's bundle adjustment: observations, unknowns (`State`) and constants (`Problem`)."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import with_distortion
-from calib.wand.bundle_adjustment.trajectory import AffineWand
+from calib.rig.camera import PER_CAMERA, POSE, SHAPE, with_distortion
+from calib.wand.trajectory import AffineWand
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
-PER_CAMERA = 12  # rotation, translation, time offset, drift, log focal length, cx, cy, k1
-SHAKES = 4  # rounds in which lengths that depend on each other are set
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-# Taken for known, but tested: log fx / fy, and the three distortion numbers after k1.
-SHAPE = (12, 13, 14, 15)
-SHAPE_SIGMA = [0.02, 0.3, 0.02, 0.02]
-POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]  # before anything is seen
-SLEWED, CRYSTAL = 5e-4, 3e-5  # s/s by which clocks drift: while they are set, and left alone (50 ppm at most)
+# Prior standard deviations: of the pose, the time offset (s), and the shape of the lens.
+POSE_SIGMA, OFFSET_SIGMA, SHAPE_SIGMA = [np.inf] * 6, [0.5], [0.02, 0.3, 0.02, 0.02]
+# And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
+SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
+SHAKE_ITERATIONS = 4  # that satisfy several lengths together
 
 
 @dataclass(frozen=True, slots=True)
 class WandObservations:
-    """Marker centres, one row each.
+    """Observed marker centres, one row each.
 
     Attributes:
         camera: (n,) index of the camera.
-        knot: (n,) the instant they belong to.
+        knot: (n,) index of the frame set, and of its knot.
         label: (n,) marker of the wand.
-        t_s, stamp_sigma_s: (n,) stamp, seconds, and what it is off by beside its camera's clock.
-        uv: (n, 2) raw pixels, where the disc's own centre is seen.
-        cov: (n, 2, 2) covariance of `uv`.
-        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where not known.
+        t_s, stamp_sigma_s: (n,) stamp, seconds, and its standard deviation beside the offset of the camera's clock.
+        uv: (n, 2) raw pixels of the disc's own centre.
+        cov: (n, 2, 2) covariance of `uv`, square pixels.
+        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where unknown.
     """
 
     camera: Index
@@ -50,7 +47,7 @@ class WandObservations:
         return len(self.uv)
 
     def select(self, rows: NDArray) -> "WandObservations":
-        """The rows that a mask or an index array names."""
+        """The rows that a mask or an index array selects."""
         return WandObservations(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
@@ -61,8 +58,8 @@ class State:
     Attributes:
         cameras: (C, 4, 4) T_world_cam.
         clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
-        lenses: (C, 4) log of the focal lengths' factor, and what is added to cx, cy and k1.
-        motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots.
+        lenses: (C, 4) corrections of log focal length, cx, cy and k1.
+        motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
     """
 
     cameras: Array
@@ -72,21 +69,21 @@ class State:
 
     @classmethod
     def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
-        """Cameras and motion, clocks without drift, lenses as they are given."""
+        """The state with these cameras, time offsets and motion; no drift, and no correction of the lenses."""
         clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
         return cls(cameras, clocks, np.zeros((len(cameras), 4)), motion)
 
-    def moved(self, by: Array, along: Array) -> "State":
-        """Cameras changed by `by` (C, 12), turned and shifted in their own frames, the motion by `along` (K, 6 B)."""
+    def retract(self, camera_step: Array, motion_step: Array) -> "State":
+        """Add a step: (C, 12) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
         cameras = self.cameras.copy()
-        for T, xi in zip(cameras, by, strict=True):
+        for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        clocks, lenses = self.clocks + by[:, 6:8], self.lenses + by[:, 8:12]
-        return State(cameras, clocks, lenses, self.motion + along.reshape(self.motion.shape))
+        clocks, lenses = self.clocks + camera_step[:, 6:8], self.lenses + camera_step[:, 8:12]
+        return State(cameras, clocks, lenses, self.motion + motion_step.reshape(self.motion.shape))
 
     def lens(self, camera: int, lens: Lens) -> Lens:
-        """The camera's lens, as adjusted."""
+        """The given lens of a camera with this state's correction."""
         scale, cx, cy, k1 = self.lenses[camera].tolist()
         if not any((scale, cx, cy, k1)):
             return lens
@@ -98,21 +95,21 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What stays the same from iteration to iteration.
+    """The constants of an adjustment.
 
     Attributes:
-        lenses: of the C cameras.
+        lenses: given lenses of the C cameras.
         wand: in affine coordinates.
         knot_s: (K,) ascending, K >= 2.
-        gap_s: knots further apart say nothing of each other.
+        gap_s: longest interval between knots over which the motion prior holds.
         density: power spectral density of the wand's acceleration, m^2/s^3.
-        middle_s: the stamp to which time offsets refer.
-        lens_sigma: (C, 4) standard deviations that hold log f, cx, cy and k1 to what was given.
-        free: which of a camera's 12 parameters are sought.
-        fixed_distance: two cameras and their distance, where no wand length carries the scale.
-        sought: the cameras that are sought; the others stand where they stand. All, unless given.
-        lens_doubt: (C, 4) what covariances take these four to be off by, `lens_sigma` unless given.
-        drift_sigma: standard deviation of the clocks' drift before anything is seen, s/s.
+        middle_s: stamp at which time offsets are defined.
+        lens_sigma: (C, 4) prior standard deviations of log focal length, cx, cy and k1 in the estimate.
+        free: indices of the camera parameters that are estimated (`calib.rig.camera`).
+        fixed_distance: two cameras and their distance, where no wand length fixes the scale.
+        estimated: cameras that are estimated, the others are fixed; None for all.
+        lens_sigma_claimed: (C, 4) prior standard deviations for the covariance; `lens_sigma` if None.
+        drift_sigma: prior standard deviation of the clocks' drift, s/s.
     """
 
     lenses: list[Lens]
@@ -124,41 +121,51 @@ class Problem:
     lens_sigma: Array
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
-    sought: tuple[int, ...] | None = None
-    lens_doubt: Array | None = None
-    drift_sigma: float = SLEWED
+    estimated: tuple[int, ...] | None = None
+    lens_sigma_claimed: Array | None = None
+    drift_sigma: float = SLEWED_DRIFT
 
     def prior_sigma(self) -> Array:
-        """(C, d) what holds the free parameters before anything is seen; infinite for poses."""
-        return self._before(self.lens_sigma)
+        """(C, d) prior standard deviations of the free parameters in the estimate; infinite for poses."""
+        return self._prior_sigma(self.lens_sigma)
 
-    def doubt(self) -> Array:
-        """(C, d) what covariances take the free parameters to be off by before anything is seen."""
-        return self._before(self.lens_sigma if self.lens_doubt is None else self.lens_doubt)
+    def claimed_prior_sigma(self) -> Array:
+        """(C, d) prior standard deviations of the free parameters for the covariance."""
+        return self._prior_sigma(
+            self.lens_sigma if self.lens_sigma_claimed is None else self.lens_sigma_claimed
+        )
 
-    def _before(self, lenses: Array) -> Array:
-        rest = np.tile(POSE_SIGMA + OFFSET_SIGMA + [self.drift_sigma], (len(self.lenses), 1))
+    def _prior_sigma(self, lens_sigma: Array) -> Array:
+        others = np.tile(POSE_SIGMA + OFFSET_SIGMA + [self.drift_sigma], (len(self.lenses), 1))
         shapes = np.tile(SHAPE_SIGMA, (len(self.lenses), 1))
-        return np.concatenate([rest, lenses, shapes], axis=1)[:, self.free]
+        return np.concatenate([others, lens_sigma, shapes], axis=1)[:, self.free]
 
-    def cameras(self) -> tuple[int, ...]:
-        """The cameras that are sought."""
-        return tuple(range(len(self.lenses))) if self.sought is None else self.sought
+    def estimated_cameras(self) -> tuple[int, ...]:
+        """Indices of the S cameras that are estimated."""
+        return tuple(range(len(self.lenses))) if self.estimated is None else self.estimated
 
-    def moved(self, state: State, by: Array, along: Array) -> State:
-        """`State.moved` along the curve on which lengths change as they do along the tangent (a retraction): a turn
-        would lengthen a stiff wand, and a shift the distance that carries the scale, by the square of the step."""
-        trial = state.moved(by, along)
-        return self._to_scale(replace(trial, motion=self._unstretched(state.motion, trial.motion)))
+    def with_free(self, *parameters: tuple[int, ...]) -> "Problem":
+        """The problem with these groups of camera parameters free."""
+        return replace(self, free=tuple(sorted(sum(parameters, ()))))
 
-    def _unstretched(self, before: Array, after: Array) -> Array:
-        """The motion with the basis's lengths that its step has to first order (SHAKE: Ryckaert et al. 1977)."""
+    def retract(self, state: State, camera_step: Array, motion_step: Array) -> State:
+        """Add a step along the curve on which lengths change as along the tangent.
+
+        In a straight step, a rotation would lengthen a stiff wand, and a translation the distance that fixes the
+        scale, by the square of the step.
+        """
+        trial = state.retract(camera_step, motion_step)
+        return self._restore_scale(replace(trial, motion=self._restore_lengths(state.motion, trial.motion)))
+
+    def _restore_lengths(self, before: Array, after: Array) -> Array:
+        """The motion `after` a step, with the lengths of the basis that the step has to first order (SHAKE: Ryckaert
+        et al. 1977)."""
         after = after.copy()
         ends, moved = before[:, 0][:, self.wand.pairs], after[:, 0][:, self.wand.pairs]
         gap, step = ends[:, :, 0] - ends[:, :, 1], moved[:, :, 0] - moved[:, :, 1]
         length = np.linalg.norm(gap, axis=2)
         wanted = np.maximum((gap * step).sum(axis=2) / length, length / 2)
-        for _ in range(SHAKES if len(self.wand.pairs) > 1 else 1):
+        for _ in range(SHAKE_ITERATIONS if len(self.wand.pairs) > 1 else 1):
             for e, (i, j) in enumerate(self.wand.pairs):
                 gap = after[:, 0, i] - after[:, 0, j]
                 excess = (1 - wanted[:, e, None] / np.linalg.norm(gap, axis=1, keepdims=True)) / 2 * gap
@@ -166,8 +173,8 @@ class Problem:
                 after[:, 0, j] += excess
         return after
 
-    def _to_scale(self, state: State) -> State:
-        """The state with the fixed distance as it is: nothing that cameras see tells a world from a larger one."""
+    def _restore_scale(self, state: State) -> State:
+        """The state scaled to the fixed distance, if there is one: observations do not depend on the scale."""
         if self.fixed_distance is None:
             return state
         a, b, distance = self.fixed_distance
@@ -176,16 +183,22 @@ class Problem:
         cameras[:, :3, 3] *= factor
         return replace(state, cameras=cameras, motion=factor * state.motion)
 
-    def freeing(self, *parameters: tuple[int, ...]) -> "Problem":
-        """The same with other parameters sought."""
-        return replace(self, free=tuple(sorted(sum(parameters, ()))))
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A problem with its observations, and the current estimate of its unknowns."""
+
+    problem: Problem
+    state: State
+    observations: WandObservations
 
 
-def unobserved(state: State, free: tuple[int, ...]) -> Array:
-    """(C d, g) how the cameras' free parameters change when the world turns and shifts, or all clocks together."""
+def gauge_directions(state: State, free: tuple[int, ...]) -> Array:
+    """(C d, g) changes of the free camera parameters that no observation depends on: rotation and translation of the
+    world, and offset and drift that all clocks share."""
     columns = np.zeros((len(state.cameras), PER_CAMERA + len(SHAPE), 8))
     for T, rows in zip(state.cameras, columns, strict=True):
         rows[:6, :6] = adjoint(invert(T))
         rows[6, 6] = rows[7, 7] = 1.0
-    kept = [g for g in range(8) if g < 6 or g in free]
-    return columns[:, free][:, :, kept].reshape(-1, len(kept))
+    present = [g for g in range(8) if g < 6 or g in free]
+    return columns[:, free][:, :, present].reshape(-1, len(present))

@@ -4,13 +4,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from camera_node.arrays import Array
-from camera_node.geometry.pose import adjoint, invert, rigid_motions
+from camera_node.geometry.pose import adjoint, invert, rigid_motions, vector_from_rotation
 
 DOUBT = 1e-3  # probability below which chance is no explanation
 
@@ -189,5 +188,5 @@ def _differences(a: Placed, b: Placed, T_a_b: Array) -> Array:
     out = []
     for here, there in zip(a.cameras, b.cameras, strict=True):
         D = invert(here) @ T_a_b @ there
-        out.append(np.concatenate([cv2.Rodrigues(D[:3, :3])[0].ravel(), D[:3, 3]]))
+        out.append(np.concatenate([vector_from_rotation(D[:3, :3]), D[:3, 3]]))
     return np.array(out)

@@ -3,8 +3,8 @@
 
 import numpy as np
 
+from calib.rig.camera import LENS
 from calib.rig.triangulation import camera_jacobians
-from calib.wand.bundle_adjustment.problem import LENS
 from calib.wand.outcome import WandCalibration
 from camera_node.arrays import Array
 

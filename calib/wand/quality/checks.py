@@ -7,10 +7,12 @@ from itertools import combinations
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
+from calib.rig.camera import LENS
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
-from calib.wand.bundle_adjustment.linear_system import Linearisation
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS, WandObservations
+from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.bundle_adjustment.residuals import predict_markers
 from calib.wand.detections import WandDetections, ranges
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lengths import distances, free_markers
@@ -29,9 +31,9 @@ SAME = 3.0  # sigmas, per parameter: a lens that is another camera's
 
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
     """Raise CameraFault where lenses are other cameras', or far from those that were given."""
-    lenses, cov = adjusted.problem.lenses, adjusted.covariance(LENS)
+    lenses, cov = adjusted.problem.lenses, camera_covariance(adjusted).of(LENS)
     found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
-    for a, b in combinations(adjusted.problem.cameras(), 2):
+    for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
         crossed = _apart(found[a], lenses[b], cov[a, :, a]), _apart(found[b], lenses[a], cov[b, :, b])
         straight = _apart(found[a], lenses[a], cov[a, :, a]), _apart(found[b], lenses[b], cov[b, :, b])
         if max(crossed) < SAME < min(straight):
@@ -124,7 +126,7 @@ def check_sizes(wand: Body, adjusted: Adjusted, seen: WandObservations) -> None:
     if len(problem.wand.lengths) == 0:
         return
     lenses = [state.lens(k, lens) for k, lens in enumerate(problem.lenses)]
-    points = Linearisation(problem, seen).positions(state)
+    points = predict_markers(problem, seen, state).points
     far = np.linalg.norm(points - state.cameras[seen.camera, :3, 3], axis=1)
     ratio = ranges(lenses, seen, wand.diameter_m) / far
     known = np.isfinite(ratio) & adjusted.used

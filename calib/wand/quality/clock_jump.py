@@ -12,24 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.wand.bundle_adjustment.dependence import widen
-from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, find_robustly
-from calib.wand.bundle_adjustment.problem import (
-    CRYSTAL,
-    DRIFT,
-    LENS,
-    OFFSET,
-    POSE,
-    SLEWED,
-    Problem,
-    State,
-    WandObservations,
-)
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
+from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
+from calib.wand.bundle_adjustment.problem import CRYSTAL_DRIFT, SLEWED_DRIFT, Problem, State, WandObservations
+from calib.wand.bundle_adjustment.residuals import find_weights, whitened_errors
 from camera_node.arrays import Array
 
 # A jump that leaves neither of these has not touched the rig: rejected part of a camera's markers, and drift, s/s.
-REJECTED, DRIFTS = 0.1, 5 * CRYSTAL
+REJECTED, DRIFTS = 0.1, 5 * CRYSTAL_DRIFT
 LATE = np.geomspace(1e-3, 0.4, 24)
 SHIFTS = np.concatenate([-LATE[::-1], [0.0], LATE])  # seconds, that are tried
 FAR = 100.0  # sigmas: what is farther off is as wrong
@@ -69,10 +60,10 @@ def find_jump(names: Sequence[str], adjusted: Adjusted, seen: WandObservations) 
     """
     if not _suspicious(adjusted, seen):
         return None
-    problem = adjusted.problem.freeing(POSE, OFFSET, LENS)  # a drift would take up half of a jump
+    problem = adjusted.problem.with_free(POSE, OFFSET, LENS)  # a drift would take up half of a jump
     steady = replace(adjusted.state, clocks=adjusted.state.clocks * [1.0, 0.0])
-    state = find_robustly(problem, seen, steady)
-    changes = [_find_change(problem, seen, state, camera) for camera in problem.cameras()]
+    state = optimize_robustly(problem, seen, steady)
+    changes = [_find_change(problem, seen, state, camera) for camera in problem.estimated_cameras()]
     change = max(changes, key=lambda change: change.gain)
     return _confirm(names, change, problem, seen, state) if change.gain else None
 
@@ -114,13 +105,13 @@ def _find_change(problem: Problem, seen: WandObservations, state: State, camera:
 
 def _deviations(problem: Problem, rows: WandObservations, state: State, camera: int) -> Array:
     """(SHIFTS, n) how far what one camera saw is from what is expected, sigmas, were its stamps shifted."""
-    linear = Linearisation(problem, rows)
-    linear.weigh(state)
-    off = []
+    weights, off = find_weights(problem, rows, state), []
     for shift in SHIFTS:
         clocks = state.clocks.copy()
         clocks[camera, 0] += shift
-        off.append(np.linalg.norm(linear.whitened(replace(state, clocks=clocks)), axis=1))
+        off.append(
+            np.linalg.norm(whitened_errors(problem, rows, replace(state, clocks=clocks), weights), axis=1)
+        )
     return np.minimum(off, FAR)
 
 
@@ -135,17 +126,17 @@ def _confirm(
     clocks = state.clocks[twice]
     clocks[-1, 0] += change.by_s
     apart = replace(
-        problem.freeing(problem.free, DRIFT),
+        problem.with_free(problem.free, DRIFT),
         lenses=[problem.lenses[k] for k in twice],
         lens_sigma=problem.lens_sigma[twice],
-        lens_doubt=None,
-        sought=problem.sought and (*problem.sought, after),
-        drift_sigma=SLEWED,
+        lens_sigma_claimed=None,
+        estimated=problem.estimated and (*problem.estimated, after),
+        drift_sigma=SLEWED_DRIFT,
     )
     later = (seen.camera == camera) & (seen.t_s >= change.t_s)
     seen = replace(seen, camera=np.where(later, after, seen.camera))
     begin = State(state.cameras[twice], clocks, state.lenses[twice], state.motion)
-    parted = widen(adjust(apart, seen, find_robustly(apart, seen, begin)))
+    parted = inflate_covariance(adjust(apart, seen, optimize_robustly(apart, seen, begin)))
     jump, variance = _difference(parted, camera, change.t_s)
     by_chance = chdtrc(1, jump**2 / variance) * len(seen)
     if by_chance > CHANCE or not 1 / TWICE < -jump / change.by_s < TWICE:
@@ -157,5 +148,7 @@ def _difference(parted: Adjusted, camera: int, at_s: float) -> tuple[float, floa
     """By how much the stamps of `camera` are late from a moment on, where it is the last, seconds, and the variance."""
     since = np.array([1.0, at_s - parted.problem.middle_s])
     ends, by_clock = [camera, len(parted.problem.lenses) - 1], np.array([since, -since]).ravel()
-    covariance = parted.covariance((*OFFSET, *DRIFT))[np.ix_(ends, range(2), ends, range(2))].reshape(4, 4)
+    covariance = (
+        camera_covariance(parted).of((*OFFSET, *DRIFT))[np.ix_(ends, range(2), ends, range(2))].reshape(4, 4)
+    )
     return float(by_clock @ parted.state.clocks[ends].ravel()), float(by_clock @ covariance @ by_clock)

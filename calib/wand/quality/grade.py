@@ -14,6 +14,7 @@ from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.triangulation import Joint
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.blame import lens_to_blame, pose_px
 from calib.wand.report import CameraReport
@@ -212,7 +213,8 @@ def assess(
     """
     wave = waved_points(result)
     rows = {row.name: row for row in result.report.cameras}
-    noise, joint = result.adjusted.by_noise(), result.adjusted.joint_covariance
+    covariance = camera_covariance(result.adjusted)
+    noise, joint = covariance.noise, covariance.joint
     cameras = [
         _assess_camera(result, k, rows[name], wave, noise, joint) for k, name in enumerate(result.names)
     ]

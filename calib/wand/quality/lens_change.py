@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from calib.rig.camera import LENS
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import LENS
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
@@ -47,7 +48,7 @@ class LensChange:
 
 def find_changes(names: Sequence[str], adjusted: Adjusted) -> dict[str, LensChange]:
     """By camera."""
-    covariance, changes = adjusted.covariance(LENS), {}
+    covariance, changes = camera_covariance(adjusted).of(LENS), {}
     for k, (name, lens) in enumerate(zip(names, adjusted.problem.lenses, strict=True)):
         off, cov = adjusted.state.lenses[k], covariance[k, :, k]
         sigmas = float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))

@@ -11,10 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.wand.bundle_adjustment.linear_system import Linearisation
+from calib.rig.camera import SHAPE
+from calib.wand.bundle_adjustment.covariance import inverse_information
+from calib.wand.bundle_adjustment.linear_system import linearize
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import SHAPE, WandObservations
-from calib.wand.bundle_adjustment.schur_complement import marginalise
+from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.bundle_adjustment.residuals import find_weights
+from calib.wand.bundle_adjustment.schur_complement import eliminate_motion
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
@@ -68,20 +71,19 @@ def find_misfit(names: Sequence[str], adjusted: Adjusted, seen: WandObservations
 
 def _step(adjusted: Adjusted, seen: WandObservations) -> tuple[Array, Array]:
     """By how much each lens is off, (C, 4), and the covariances (C, 4, 4)."""
-    problem = adjusted.problem.freeing(adjusted.problem.free, SHAPE)
-    linear = Linearisation(problem, seen.select(adjusted.used))
-    linear.weigh(adjusted.state)
-    linear.relinearise(adjusted.state)
-    cameras = marginalise(linear)
+    problem = adjusted.problem.with_free(adjusted.problem.free, SHAPE)
+    inliers, state = seen.select(adjusted.used), adjusted.state
+    system = linearize(problem, inliers, state, find_weights(problem, inliers, state))
+    cameras = eliminate_motion(system)
     freed = replace(adjusted, problem=problem, information=cameras.information)
     count, d = len(problem.lenses), len(problem.free)
     pulled = np.zeros((count, d))
-    for (camera, *_), (J, *_), error in linear.rig:
-        pulled[camera] += J.T @ error
-    inverse = freed.inverse()
+    for prior in system.priors:
+        pulled[prior.cameras[0]] += prior.jacobians[0].T @ prior.error
+    inverse = inverse_information(freed)
     step = (inverse @ (cameras.scores.sum(axis=0) + pulled.ravel())).reshape(count, d)[:, -len(SHAPE) :]
     blocks = inverse.reshape(count, d, count, d)[:, -len(SHAPE) :, :, -len(SHAPE) :]
-    noise = adjusted.scale**2 * adjusted.dependence
+    noise = adjusted.scale**2 * adjusted.inflation
     return step, noise * np.array([blocks[k, :, k] for k in range(count)])
 
 

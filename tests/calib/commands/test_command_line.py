@@ -67,7 +67,7 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
         ("wand.yaml", "diameter_m: 0.1\nmarker: [[0,0,0]]\n", "unknown field"),
         ("lenses.yaml", "cameras: {cam0: {time_offset_ms: 1.0}}\n", "no intrinsics"),
         ("lenses.yaml", "cameras: [", "not valid YAML"),
-        ("lenses.yaml", "cameras: {cam0: {}, cam0: {}}\n", "'cam0' is there twice"),
+        ("lenses.yaml", "cameras: {cam0: {}, cam0: {}}\n", "'cam0' is defined twice"),
         ("lenses.yaml", "version: 9\ncameras: {}\n", "of this version of Roundel?"),
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n", "one camera"),
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam9,1,1\n", "'cam9'"),

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from calib.rig.camera import pixel_jacobians, with_distortion
-from calib.wand.bundle_adjustment.problem import LENS, PER_CAMERA, POSE, State
+from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians, with_distortion
+from calib.wand.bundle_adjustment.problem import State
 from camera_node.geometry.lens import Lens
 
 SIZE = {"width": 1280, "height": 800, "fx": 810.0, "fy": 805.0, "cx": 633.0, "cy": 404.0}
@@ -26,7 +26,7 @@ def test_derivatives_are_those_of_a_step_of_the_state(lens: Lens):
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def see(step, shift):
-        moved = state.moved(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12))
         T = moved.cameras[0]
         return moved.lens(0, lens).project((points + shift - T[:3, 3]) @ T[:3, :3])
 

@@ -20,7 +20,7 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def test_json_is_one_object_an_image(image: Path, capsys: pytest.CaptureFixture[str]):
+def test_json_has_one_object_for_each_image(image: Path, capsys: pytest.CaptureFixture[str]):
     assert Detect(images=(image, image), json=True).run() == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["file"] for line in lines] == [str(image)] * 2
@@ -51,16 +51,16 @@ def test_a_table_and_a_drawing(image: Path, tmp_path: Path, capsys: pytest.Captu
     assert (drawn.max(axis=2) != drawn.min(axis=2)).any()
 
 
-def test_options_that_do_not_fit_are_refused(image: Path, tmp_path: Path):
+def test_contradictory_options_are_refused(image: Path, tmp_path: Path):
     with pytest.raises(ConfigError, match="one image"):
         Detect(images=(image, image), draw=tmp_path / "out.png").run()
-    with pytest.raises(ConfigError, match="go together"):
+    with pytest.raises(ConfigError, match="--diameter"):
         Detect(images=(image,), name="cam0").run()
     with pytest.raises(ConfigError, match="can't be written"):
         Detect(images=(image,), draw=tmp_path / "missing" / "out.png").run()
 
 
-def test_a_file_that_is_no_image_is_named(tmp_path: Path):
+def test_an_error_names_the_file_that_is_no_image(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("no image")
-    with pytest.raises(CameraError, match=r"notes\.txt is no image"):
+    with pytest.raises(CameraError, match=r"notes\.txt is not an image"):
         Detect(images=(tmp_path / "notes.txt",)).run()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The sheet that people print: what a browser draws of it is what the detector finds."""
+"""The printed sheet: the detector finds the roundels that a browser renders from it."""
 
 import shutil
 import subprocess
@@ -16,8 +16,8 @@ from camera_node.sources.replay import read_grey
 PX_PER_MM = 96 / 25.4  # CSS
 
 
-def test_a_printed_sheet_measures_what_it_says(tmp_path: Path):
-    """A browser's picture of the sheet, at 96 pixels an inch, holds every roundel at its diameter and ratio."""
+def test_roundels_on_a_sheet_have_the_requested_size(tmp_path: Path):
+    """A browser's image of the sheet, at 96 pixels per inch, shows every roundel with its diameter and ratio."""
     if (chromium := shutil.which("chromium")) is None:
         pytest.skip("chromium is not installed")
     sheet = tmp_path / "sheet.svg"
@@ -29,7 +29,7 @@ def test_a_printed_sheet_measures_what_it_says(tmp_path: Path):
     subprocess.run([chromium, *flags.split(), *places], check=True, timeout=60, capture_output=True)
     found = Detector().detect(read_grey(picture))
     assert len(found) == count == 12
-    # The browser draws curves as chords that stay within an eighth of a pixel: a quarter of the diameter's edges.
+    # The browser draws curves as chords within an eighth of a pixel, which is a quarter for a diameter.
     assert abs(found.axes_px - 50 * PX_PER_MM).max() < 0.25
     assert abs(found.ratio - 0.6).max() < 0.002
 
@@ -42,14 +42,13 @@ def test_a_printed_sheet_measures_what_it_says(tmp_path: Path):
         ({"paper": "a9"}, "choose one of a4, a3, letter"),
     ],
 )
-def test_what_can_not_be_printed_is_refused(settings: dict, message: str):
-    """What, and what to do about it."""
+def test_impossible_sheets_are_refused(settings: dict, message: str):
     with pytest.raises(ConfigError, match=message):
         draw(Sheet(Path("x.svg"), **settings))
 
 
 def test_the_command_writes_the_sheet(tmp_path: Path):
-    """`print` says how many roundels of which size there are; a folder that is missing is one line and exit code 2."""
+    """`print` reports the number and size of the roundels; a missing folder gives one line and exit code 2."""
     command = [sys.executable, "-m", "camera_node", "print"]
     done = subprocess.run([*command, str(tmp_path / "a.svg")], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0

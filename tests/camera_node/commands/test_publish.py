@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: what a user did wrong is one line and exit code 2."""
+"""The command line: a mistake of the user is reported as one line with exit code 2."""
 
 import subprocess
 import sys
@@ -25,7 +25,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
         (["--source", "FRAMES", "--inner-ratios", "7"], "inner_ratios"),
         (["--source", "FRAMES", "--zenoh", "none.json5"], "none.json5 does not exist"),
         (["detct", "FRAMES"], "did you mean detect?"),
-        (["show", "FRAMES"], "there are detect, print"),
+        (["show", "FRAMES"], "detect, print"),
         (["--source", "FRAMES", "--fourcc", "JPEG2000"], "four letters"),
     ],
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lenses: projection and its inverse, and the derivative by finite differences."""
+"""Lenses: projection, its inverse, and derivatives against finite differences."""
 
 import numpy as np
 import pytest
@@ -17,15 +17,15 @@ lenses = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 
 
 def points(n: int = 200) -> np.ndarray:
-    """(n, 3) points that all of these lenses see."""
+    """(n, 3) points in the field of view of all these lenses."""
     rng = np.random.default_rng(1)
     z = rng.uniform(0.5, 6, n)
     return np.column_stack([rng.uniform(-0.6, 0.6, n) * z, rng.uniform(-0.45, 0.45, n) * z, z])
 
 
 @lenses
-def test_the_jacobian_is_that_of_the_projection(lens: Lens):
-    """Central differences of step h err by h^2 f''' and rounding / h: with h = 1e-5 under 1e-4 of 1000 px/m."""
+def test_the_jacobian_by_points_equals_finite_differences(lens: Lens):
+    """Central differences have errors of h^2 f''' and rounding / h: below 1e-4 of 1000 px/m for h = 1e-5."""
     p, h = points(), 1e-5
     uv, J = lens.project_with_jacobian(p)
     np.testing.assert_allclose(uv, lens.project(p), atol=1e-9)
@@ -36,8 +36,8 @@ def test_the_jacobian_is_that_of_the_projection(lens: Lens):
 
 
 @lenses
-def test_the_jacobian_by_the_lens_is_that_of_its_parameters(lens: Lens):
-    """Central differences again; all parameters act linearly on the pixel but fx and k, whose products are smooth."""
+def test_the_jacobian_by_parameters_equals_finite_differences(lens: Lens):
+    """The pixel is linear in all parameters except products of fx and k, which are smooth."""
     p, h = points(), 1e-5
     uv, _, J = lens.project_with_jacobians(p)
     assert J.shape == (len(p), 2, 4 + len(lens.distortion))
@@ -50,8 +50,8 @@ def test_the_jacobian_by_the_lens_is_that_of_its_parameters(lens: Lens):
     np.testing.assert_allclose(uv, lens.project(p), atol=1e-9)
 
 
-def test_a_fisheye_sees_to_the_side():
-    """Rays up to 88 degrees from the axis come back, also where theta_d is above 90 degrees."""
+def test_a_fisheye_lens_has_rays_up_to_88_degrees():
+    """Projected rays are recovered, also where theta_d is above 90 degrees."""
     lens = Lens(**{**SHAPE, "fx": 300.0, "fy": 300.0}, distortion=(0.05, -0.01, 0.002, 0.0), model="fisheye")
     theta, phi = np.radians([[5, 40, 70, 85, 88]]), np.radians(np.arange(0, 360, 30))[:, None]
     away = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi]
@@ -61,7 +61,7 @@ def test_a_fisheye_sees_to_the_side():
 
 @lenses
 def test_normalise_inverts_project(lens: Lens):
-    """1e-6 of a focal length is 0.0006 px, far below any detector; the inverse is iterative."""
+    """The inverse is iterative; 1e-6 of a focal length is 0.0006 px, far below the noise of any detector."""
     p = points()
     np.testing.assert_allclose(lens.normalise(lens.project(p)), p[:, :2] / p[:, 2:], atol=1e-6)
 
@@ -75,7 +75,7 @@ def test_rays_point_at_the_points(lens: Lens):
 
 
 @lenses
-def test_what_is_not_before_the_camera_has_no_pixel(lens: Lens):
+def test_points_behind_the_camera_have_no_pixel(lens: Lens):
     uv, J = lens.project_with_jacobian([[0, 0, -1.0], [0, 0, 0], [0, 0, 1.0]])
     assert np.isnan(uv[:2]).all()
     assert np.isnan(J[:2]).all()
@@ -89,8 +89,8 @@ def test_no_points_give_no_pixels(lens: Lens):
     assert lens.rays(np.empty((0, 2))).shape == (0, 3)
 
 
-def test_pixels_that_the_lens_can_not_give_have_no_ray():
-    """Barrel distortion folds back: beyond its largest radius a pixel has no inverse, and says so."""
+def test_pixels_outside_the_range_of_the_distortion_have_no_ray():
+    """Barrel distortion has a largest radius; pixels beyond it are NaN."""
     lens = Lens(**SHAPE, distortion=(-0.3, 0.0, 0.0, 0.0))
     assert np.isnan(lens.normalise([[5000.0, 5000.0]])).all()
 

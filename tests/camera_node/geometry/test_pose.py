@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses form a group, and quaternions lose nothing."""
+"""Poses form a group, and conversions between forms of rotations are exact."""
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from camera_node.geometry.pose import (
     rotation_from_vector,
     rotation_from_wxyz,
     skew,
+    vector_from_rotation,
     wxyz_from_rotation,
 )
 
@@ -27,7 +28,7 @@ half_turns = st.tuples(st.just(0.0), *[st.floats(-1, 1)] * 3).filter(lambda q: n
 
 @given(poses, poses, poses)
 def test_poses_form_a_group(a: Pose, b: Pose, c: Pose):
-    """Associative, with inverse on either side; entries reach 50, hence the factor."""
+    """Associative, with an inverse on both sides; entries reach 50, hence the factor."""
     A, B, C = a.matrix(), b.matrix(), c.matrix()
     np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=50 * EPS)
     np.testing.assert_allclose(A @ invert(A), np.eye(4), atol=50 * EPS)
@@ -35,8 +36,8 @@ def test_poses_form_a_group(a: Pose, b: Pose, c: Pose):
 
 
 @given(quaternions | half_turns)
-def test_a_rotation_survives_its_quaternion(q: tuple[float, ...]):
-    """Also a half turn, where w is 0 and the trace tells nothing."""
+def test_a_rotation_is_recovered_from_its_quaternion(q: tuple[float, ...]):
+    """Also a half turn, where w is 0 and the trace holds no information."""
     R = rotation_from_wxyz(q)
     wxyz = wxyz_from_rotation(R)
     assert wxyz[0] >= 0
@@ -47,11 +48,23 @@ def test_a_rotation_survives_its_quaternion(q: tuple[float, ...]):
 
 
 @given(poses)
-def test_a_pose_survives_its_matrix(pose: Pose):
+def test_a_pose_is_recovered_from_its_matrix(pose: Pose):
     np.testing.assert_allclose(Pose.from_matrix(pose.matrix()).matrix(), pose.matrix(), atol=EPS)
 
 
-def test_a_vector_turns_about_its_axis():
+@given(st.lists(st.tuples(*[st.floats(-1.8, 1.8)] * 3), max_size=4))
+def test_stacks_of_rotations_equal_single_ones_and_keep_their_vectors(vectors: list[tuple[float, ...]]):
+    """Leading axes are free; a vector shorter than half a turn comes back from its rotation."""
+    stack = np.array(vectors).reshape(-1, 1, 3)
+    R = rotation_from_vector(stack)
+    assert (R.shape, wxyz_from_rotation(R).shape) == ((len(stack), 1, 3, 3), (len(stack), 1, 4))
+    for vector, rotation, wxyz in zip(vectors, R[:, 0], wxyz_from_rotation(R)[:, 0], strict=True):
+        np.testing.assert_array_equal(rotation, rotation_from_vector(vector))
+        np.testing.assert_array_equal(wxyz, wxyz_from_rotation(rotation))
+    np.testing.assert_allclose(vector_from_rotation(R), stack, atol=1e3 * EPS)
+
+
+def test_a_vector_is_a_rotation_about_its_axis():
     np.testing.assert_allclose(rotation_from_vector([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=EPS)
     np.testing.assert_allclose(rotation_from_vector([0, 0, 0]), np.eye(3), atol=EPS)
 
@@ -65,8 +78,8 @@ def test_a_camera_looks_at_its_target_upright():
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
 
 
-def test_a_camera_that_looks_straight_down_has_no_upright():
-    with pytest.raises(ValueError, match="straight above"):
+def test_a_camera_that_looks_straight_down_is_refused():
+    with pytest.raises(ValueError, match="exactly above"):
         look_at([0, 0, 3], [0, 0, 0])
 
 
@@ -77,10 +90,8 @@ def test_impossible_poses_are_refused(pose: tuple):
 
 
 @given(poses, st.tuples(*[st.floats(-0.5, 0.5)] * 3), st.tuples(coordinate, coordinate, coordinate))
-def test_the_adjoint_carries_a_twist_through_a_pose(
-    pose: Pose, turn: tuple[float, ...], shift: tuple[float, ...]
-):
-    """T Exp(xi) = Exp(Ad xi) T, by the exponential of 4x4 matrices as SciPy computes it."""
+def test_the_adjoint_transforms_a_twist(pose: Pose, turn: tuple[float, ...], shift: tuple[float, ...]):
+    """T Exp(xi) = Exp(Ad xi) T, with SciPy's exponential of 4x4 matrices."""
     T, xi = pose.matrix(), np.array([*turn, *shift])
     np.testing.assert_allclose(T @ expm(_hat(xi)), expm(_hat(adjoint(T) @ xi)) @ T, atol=1e4 * EPS)
 

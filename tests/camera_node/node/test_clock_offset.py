@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The offset of two clocks: the truth lies within the bound, whatever the network does."""
+"""The offset of two clocks: the true offset lies within the error bound for any network delays."""
 
 from collections.abc import Callable
 
@@ -27,7 +27,7 @@ drifts = st.floats(-50e-6, 50e-6)
 
 
 class World:
-    """A server's clock: `offset` ahead of this machine's at the start, and running `drift` faster."""
+    """A server's clock, `offset` ns ahead of this machine's at the start and with a relative drift of `drift`."""
 
     def __init__(self, offset: int = 0, drift: float = 0.0) -> None:
         self.offset, self.drift, self.now = offset, drift, START
@@ -37,22 +37,22 @@ class World:
         return self.offset + self.drift * (t_ns - START)
 
     def ask(self, there: int, back: int) -> RoundTrip:
-        """A question that takes `there` ns to the server and `back` ns from it."""
-        sent, met = self.now, self.now + there
-        self.now = met + back
-        return RoundTrip(sent, met + round(self.true_offset(met)), self.now)
+        """A request that takes `there` ns to the server, and its reply that takes `back` ns."""
+        sent, arrived = self.now, self.now + there
+        self.now = arrived + back
+        return RoundTrip(sent, arrived + round(self.true_offset(arrived)), self.now)
 
-    def off(self, t_ns: int) -> tuple[float, float]:
-        """By how much the estimate is off, and what it claims at most."""
+    def error(self, t_ns: int) -> tuple[float, float]:
+        """The error of the estimate, and its error bound."""
         estimate, bound = self.estimator.at(t_ns) or (0, -1)
         return estimate - self.true_offset(t_ns), bound
 
-    def live(self, seconds: int, delay: Callable[[], tuple[int, int]]) -> np.ndarray:
-        """Errors and bounds (n, 2), ns, twenty a second, while a burst is made every second."""
+    def run(self, seconds: int, delay: Callable[[], tuple[int, int]]) -> np.ndarray:
+        """Errors and bounds (n, 2), ns, 20 per second, with a burst of round trips every second."""
         seen = []
         for _ in range(seconds):
             self.estimator.add(*(self.ask(*delay()) for _ in range(BURST)))
-            seen += [self.off(self.now + k * SECOND // 20) for k in range(20)]
+            seen += [self.error(self.now + k * SECOND // 20) for k in range(20)]
             self.now += SECOND
         return np.array(seen)
 
@@ -60,22 +60,22 @@ class World:
 @fewer
 @given(offsets, drifts, delays)
 def test_the_truth_lies_within_the_bound(offset: int, drift: float, delays: list[tuple[int, int, int]]):
-    """With any delays, however asymmetric, and 50 ppm of drift, at every round trip and between them."""
+    """With any, also asymmetric delays and 50 ppm of drift, at every round trip and between them."""
     world = World(offset, drift)
     for there, back, pause in delays:
         world.estimator.add(world.ask(there, back))
         for now in (world.now - pause, world.now, world.now + pause // 2, world.now + pause):
-            error, bound = world.off(now)
+            error, bound = world.error(now)
             assert abs(error) <= bound
         world.now += pause
 
 
 @fewer
 @given(offsets, drifts, delays)
-def test_no_round_trip_makes_it_worse(offset: int, drift: float, delays: list[tuple[int, int, int]]):
-    """What is known stays known while it is remembered: a slow round trip leaves the bound, a quick one lessens it.
+def test_no_round_trip_enlarges_the_bound(offset: int, drift: float, delays: list[tuple[int, int, int]]):
+    """Within the window, a slow round trip leaves the bound unchanged and a quick one reduces it.
 
-    To a microsecond, as rounding and what rates leave open may tip either way.
+    To a microsecond, for rounding and the uncertainty of the rate.
     """
     world = World(offset, drift)
     for there, back, pause in delays:
@@ -92,24 +92,24 @@ def test_no_round_trip_makes_it_worse(offset: int, drift: float, delays: list[tu
 
 @fewer
 @given(delays, st.lists(st.integers(-100 * MS, 100 * MS), min_size=60, max_size=60))
-def test_the_newest_round_trip_is_never_contradicted(delays: list[tuple[int, int, int]], jumps: list[int]):
-    """Whatever clocks do, the estimate is off by less than the newest round trip took."""
+def test_the_newest_round_trip_bounds_the_error(delays: list[tuple[int, int, int]], jumps: list[int]):
+    """For any steps of the clocks, the error is smaller than the duration of the newest round trip."""
     world = World()
     for (there, back, pause), jump in zip(delays, jumps, strict=False):
         world.offset += jump
         world.estimator.add(world.ask(there, back))
-        error, _ = world.off(world.now)
-        assert abs(error) <= there + back + 2000  # how finely clocks are read
+        error, _ = world.error(world.now)
+        assert abs(error) <= there + back + 2000  # resolution of the clock readings
         world.now += pause
 
 
 @pytest.mark.parametrize(("seed", "drift"), SEEDED)
-def test_a_bad_minute_of_one_way_moves_little(seed: int, drift: float):
-    """Two minutes in which either way takes 0.1 to 0.3 ms, then one in which questions wait for 10 ms and more.
+def test_a_minute_of_slow_requests_has_little_effect(seed: int, drift: float):
+    """Two minutes with delays of 0.1 to 0.3 ms both ways, then one minute in which requests take 10 ms and more.
 
-    Half of the band's width bounds the error. Its lower edge is that of quick answers; its upper edge that of the last
-    quick question, a minute old, and of the greatest rate, which the two quiet minutes leave open by what both ways
-    took over their length, and `WANDER`. A bound by the quickest question of the minute would be 5 ms.
+    Half of the band's width bounds the error. The quick replies determine its lower edge. Its upper edge follows from
+    the last quick request, a minute old, and from the largest rate, whose uncertainty is the sum of both delays over
+    the two quiet minutes, plus `WANDER`. The quickest request of the last minute alone would give a bound of 5 ms.
     """
     rng, world, quick = np.random.default_rng(seed), World(5 * MS, drift), 0.3e6
 
@@ -119,20 +119,20 @@ def test_a_bad_minute_of_one_way_moves_little(seed: int, drift: float):
     def queued() -> tuple[int, int]:
         return int(10 * MS + rng.exponential(20 * MS)), int(rng.uniform(0.1e6, quick))
 
-    world.live(120, calm)
-    seen = world.live(60, queued)
+    world.run(120, calm)
+    seen = world.run(60, queued)
     assert (np.abs(seen[:, 0]) <= seen[:, 1]).all()
     passed_ns = world.now - START - 120 * SECOND
     assert np.abs(seen[:, 0]).max() <= quick + (2 * quick / (119 * SECOND) + WANDER) * passed_ns / 2
 
 
 @pytest.mark.parametrize(("seed", "drift"), SEEDED)
-def test_random_queues_average_out(seed: int, drift: float):
-    """Either way takes 0.15 ms and an exponential wait of 5 ms in the mean.
+def test_random_delays_average_out(seed: int, drift: float):
+    """Delays both ways are 0.15 ms plus an exponential delay with a mean of 5 ms.
 
-    The quickest of the 3 n waits of n seconds is 5 ms / 3 n in the mean, and what is n seconds old is known WANDER n
-    worse; their sum is least, 0.18 ms, where both are equal. Each edge is off by that, so the middle is in its worst
-    case; a single round trip is off by 3.5 ms RMS.
+    The mean of the smallest of the 3 n delays in n seconds is 5 ms / 3 n, and after n seconds its bound has grown by
+    WANDER n; the sum is smallest, 0.18 ms, where both are equal. This is the error of each edge, and in the worst case
+    of the middle; the RMS error of a single round trip is 3.5 ms.
     """
     rng, world = np.random.default_rng(seed), World(-7 * MS, drift)
     mean = 5e6
@@ -140,41 +140,48 @@ def test_random_queues_average_out(seed: int, drift: float):
     def queued() -> tuple[int, int]:
         return int(0.15e6 + rng.exponential(mean)), int(0.15e6 + rng.exponential(mean))
 
-    world.live(20, queued)
-    seen = world.live(120, queued)
+    world.run(20, queued)
+    seen = world.run(120, queued)
     assert (np.abs(seen[:, 0]) <= seen[:, 1]).all()
     assert np.sqrt(np.mean(seen[:, 0] ** 2)) < 2 * np.sqrt(mean * WANDER * 1e9 / BURST)
 
 
-def test_a_clock_that_is_set_is_followed_at_once():
-    """Round trips that contradict the past mean that a clock was set: what was before is forgotten."""
+def test_the_estimate_follows_a_clock_that_is_set():
+    """A round trip that contradicts the earlier ones shows that a clock was set; the earlier ones are discarded."""
     world = World()
-    world.live(5, lambda: (MS, MS))
+    world.run(5, lambda: (MS, MS))
     for jump in (3_600_000 * MS, -10 * MS):
         world.offset += jump
         world.estimator.add(world.ask(MS, MS))
-        error, bound = world.off(world.now)
+        error, bound = world.error(world.now)
         assert abs(error) <= bound <= 1.1 * MS
 
 
-def test_a_clock_that_is_being_slewed_is_followed():
-    """A time service turns a clock's 50 ppm about: never off by more than a round trip, and right afterwards."""
+def test_the_estimate_follows_a_clock_that_is_slewed():
+    """A time service reverses a drift of 50 ppm: the error stays below a round trip and within the bound afterwards."""
     world = World()
-    world.live(120, lambda: (MS // 4, MS // 4))
+    world.run(120, lambda: (MS // 4, MS // 4))
     world.offset, world.drift = round(-50e-6 * (world.now - START)), 50e-6
-    seen = world.live(60, lambda: (MS // 4, MS // 4))
+    seen = world.run(60, lambda: (MS // 4, MS // 4))
     assert np.abs(seen[:, 0]).max() <= MS // 2 + 50e-6 * SECOND
-    error, bound = world.off(world.now)
+    error, bound = world.error(world.now)
     assert abs(error) <= bound + 50e-6 * SECOND
 
 
-def test_old_round_trips_are_forgotten():
-    world = World()
-    for _ in range(40):
-        world.estimator.add(world.ask(MS, MS))
+def test_round_trips_older_than_the_window_have_no_effect():
+    """Quick ones at the beginning, which would reduce the bound if they were still used."""
+    world, recent = World(), OffsetEstimator()
+    trips = []
+    for k in range(40):
+        delay = MS // 1000 if k < 5 else 20 * MS
+        trips.append(world.ask(delay, delay))
         world.now += 10 * SECOND
-    assert len(world.estimator._limits) <= WINDOW_NS // (10 * SECOND) + 1
+    for trip in trips:
+        world.estimator.add(trip)
+        if trips[-1].received_ns - trip.sent_ns <= WINDOW_NS:
+            recent.add(trip)
+    assert world.estimator.at(world.now) == recent.at(world.now)
 
 
-def test_nothing_is_known_before_the_first_round_trip():
+def test_there_is_no_estimate_before_the_first_round_trip():
     assert OffsetEstimator().at(START) is None

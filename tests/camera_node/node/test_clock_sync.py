@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The clock: exact where the server has the same one, else within its bound; over Zenoh on loopback."""
+"""Clock synchronization over Zenoh on loopback: exact for a shared clock, otherwise within its error bound."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ Start = Callable[[Callable[[], ClockReply]], ClockSync]
 
 @pytest.fixture
 def started(network) -> Iterator[Start]:
-    """Starts a clock beside a server that answers in a given way."""
+    """Start a ClockSync and a server with a given reply."""
     clocks: list[ClockSync] = []
 
     def start(answer: Callable[[], ClockReply]) -> ClockSync:
@@ -32,7 +32,7 @@ def started(network) -> Iterator[Start]:
 
 
 def test_a_clock_that_is_shared_needs_no_estimate(started: Start, eventually):
-    """On one machine a stamp stays what it is, to the nanosecond, and so it claims."""
+    """On one machine, times are unchanged to the nanosecond and the error bound is 0."""
     if not clock_id():
         pytest.skip("this system has no boot id")
     clock = started(lambda: ClockReply(time.time_ns(), clock_id()))
@@ -43,7 +43,7 @@ def test_a_clock_that_is_shared_needs_no_estimate(started: Start, eventually):
 
 @pytest.mark.parametrize("name", ["", "another machine's", clock_id()])
 def test_another_clock_is_estimated(started: Start, eventually, name: str):
-    """Whatever it is called: a virtual machine that was copied while it ran has the name, but not the time."""
+    """With any name: a running virtual machine that was copied has the same clock id but another time."""
     clock = started(lambda: ClockReply(time.time_ns() + HOUR_NS, name))
     assert eventually(clock.estimate)
     offset_ns, bound_ns = clock.estimate() or (0, 0)
@@ -59,13 +59,13 @@ def test_a_server_that_moves_to_another_machine_is_followed(started: Start, even
     assert eventually(lambda: abs((clock.estimate() or (0, 0))[0] - HOUR_NS) < 1e9)
 
 
-def test_a_server_that_speaks_nonsense_is_no_server(started: Start, eventually):
-    """Until it makes sense: nothing is known, and stamps stay what they are."""
+def test_invalid_replies_are_ignored(started: Start, eventually):
+    """Until the first valid reply there is no estimate, and times are unchanged."""
     asked: list[int] = []
 
     def answer() -> ClockReply:
         asked.append(1)
-        return ClockReply("noon" if len(asked) < 3 else time.time_ns())  # pyright: ignore[reportArgumentType] nonsense
+        return ClockReply("noon" if len(asked) < 3 else time.time_ns())  # pyright: ignore[reportArgumentType] invalid on purpose
 
     clock = started(answer)
     assert clock.to_server(5) == 5
@@ -73,8 +73,8 @@ def test_a_server_that_speaks_nonsense_is_no_server(started: Start, eventually):
     assert len(asked) >= 3
 
 
-def test_both_clocks_are_read_at_one_time():
-    """Unix time as it follows from the monotonic clock lies between two readings of it; 1 us is for rounding."""
+def test_unix_time_follows_from_the_monotonic_clock():
+    """It lies between two readings of Unix time, within 1 us for rounding."""
     before = time.time_ns()
-    told = time.monotonic_ns() + unix_ahead_ns()
-    assert before - 1000 <= told <= time.time_ns() + 1000
+    derived = time.monotonic_ns() + unix_ahead_ns()
+    assert before - 1000 <= derived <= time.time_ns() + 1000

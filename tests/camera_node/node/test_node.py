@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The node over real Zenoh: what it publishes, what it answers, and how it ends."""
+"""A camera node over Zenoh: its publications, its replies, and its end."""
 
 import signal
 import subprocess
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from camera_node.commands.source_selection import open_source
+from camera_node.commands.publish import open_source
 from camera_node.detection.detector import Detector
 from camera_node.node.node import Node
 from camera_node.protocol.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
@@ -63,8 +63,8 @@ def running(network):
 
     def start(folder: Path, **settings) -> Node:
         source = open_source(str(folder), SourceSettings(**settings))
-        keep_stamps = settings.get("stamps", "recorded") == "recorded"
-        node = Node("cam0", source, network.client(), keep_stamps=keep_stamps)
+        keep_stamps = source.is_recording and settings.get("stamps", "recorded") == "recorded"
+        node = Node("cam0", source, Detector(), network.client(), keep_stamps=keep_stamps)
         thread = threading.Thread(target=node.run)
         thread.start()
         nodes.append((node, thread))
@@ -84,7 +84,7 @@ def subscribe(session: zenoh.Session, key: str, kind: type, inbox):
 
 
 def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, frames):
-    """In order, with the roundel where it was drawn, to 0.1 px: drawing on whole sub-pixels takes 0.03."""
+    """In order, with the roundel where it was drawn, to 0.1 px; rounding to sub-pixels in the drawing costs 0.03."""
     got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
     running(frames)
     assert got.until(lambda messages: len(messages) == 40)
@@ -96,8 +96,10 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
         assert message.detect_us > 0
 
 
-def test_the_status_comes_once_a_second_and_the_token_goes_with_the_node(network, inbox, running, slow):
-    """10 frames a second are sent; a loaded machine may slip a few of them from one second to the next."""
+def test_the_status_is_published_once_a_second_and_the_token_ends_with_the_node(
+    network, inbox, running, slow
+):
+    """10 frames are sent per second; on a loaded machine a few of them may be sent in the next second."""
     router, alive = network.router(), inbox()
     statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
     subscribe(router, KEYS.detections(), Detections, inbox)
@@ -117,7 +119,7 @@ def test_the_status_comes_once_a_second_and_the_token_goes_with_the_node(network
 
 
 def test_stamps_are_in_the_servers_time(network, inbox, running, slow):
-    """A server whose clock is an hour ahead: stamps follow, to the half of the round trip that the status tells."""
+    """The server's clock is an hour ahead: stamps follow it within the error bound in the status."""
     hour, router = 3600 * 10**9, network.router()
     router.declare_queryable(
         KEYS.clock, lambda query: query.reply(KEYS.clock, encode(ClockReply(time.time_ns() + hour)))
@@ -129,11 +131,11 @@ def test_stamps_are_in_the_servers_time(network, inbox, running, slow):
     status = statuses.items[-1]
     assert abs(status.clock_offset_ms - 3_600_000) <= status.clock_error_ms
     assert got.until(lambda items: items and items[-1].t_ns > time.time_ns() + hour // 2)
-    assert 0 < got.items[-1].clock_error_us < 5e5  # a round trip is given up after half a second
+    assert 0 < got.items[-1].clock_error_us < 5e5  # a round trip times out after half a second
 
 
 def ask(session: zenoh.Session, key: str, payload: bytes | None = None) -> tuple[bool, bytes]:
-    """The first reply: whether it is no error, and its payload."""
+    """The first reply: whether it is a success, and its payload."""
     for reply in session.get(key, payload=payload, timeout=10.0):
         answer = reply.ok or reply.err
         assert answer
@@ -142,7 +144,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes | None = None) -> tuple
 
 
 def test_a_snapshot_is_a_picture(network, inbox, running, slow):
-    """At full quality JPEG loses a few grey levels; a bad quality is refused."""
+    """At full quality JPEG changes a few grey levels; an invalid quality is refused."""
     router = network.router()
     got = subscribe(router, KEYS.detections(), Detections, inbox)
     running(slow)
@@ -160,11 +162,11 @@ def test_a_snapshot_is_a_picture(network, inbox, running, slow):
     assert drawn is not None
     assert (
         drawn.max(axis=2).astype(int) - drawn.min(axis=2)
-    ).max() > 100  # colours: the ellipse and its number
+    ).max() > 100  # the ellipse and its number are in colour
 
 
-def test_settings_are_told_and_taken(network, inbox, running, slow):
-    """A mask over the roundel hides it; msgpack and JSON are answered in kind; nonsense is refused and counted."""
+def test_settings_are_reported_and_changed(network, inbox, running, slow):
+    """A mask hides the roundel; replies have the encoding of the request; invalid requests are refused and counted."""
     router, key = network.router(), KEYS.settings("cam0")
     got = subscribe(router, KEYS.detections(), Detections, inbox)
     statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
@@ -199,8 +201,8 @@ def test_settings_are_told_and_taken(network, inbox, running, slow):
 
 
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
-def test_the_program_outlives_the_servers_absence(network, inbox, eventually, slow, tmp_path, stop):
-    """Started before the router: it says so once, delivers when the router comes, and a signal ends it with code 0."""
+def test_the_program_runs_on_while_the_server_is_away(network, inbox, eventually, slow, tmp_path, stop):
+    """It logs the absence once, delivers after the router opens, and ends with code 0 on a signal."""
     errors = tmp_path / "stderr"
     command = [sys.executable, "-m", "camera_node", "--source", str(slow), "--name", "cam0"]
     with errors.open("w") as file:
@@ -211,7 +213,7 @@ def test_the_program_outlives_the_servers_absence(network, inbox, eventually, sl
         got = subscribe(router, KEYS.detections(), Detections, inbox)
         token = router.liveliness().declare_token(KEYS.fusion_alive)
         assert got.until(len)
-        assert eventually(lambda: "the server is there again" in errors.read_text())
+        assert eventually(lambda: "the server is back" in errors.read_text())
         node.send_signal(stop)
         assert node.wait(10) == 0
         token.undeclare()

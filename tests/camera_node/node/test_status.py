@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a camera says of its light."""
+"""Advice about the exposure in the camera status."""
 
 import numpy as np
 import pytest
@@ -12,23 +12,25 @@ CENTRE = np.array([[80.0, 60.0]])
 
 
 @pytest.mark.parametrize(
-    ("bright", "says"),
+    ("bright", "kind", "change"),
     [
-        (255.0, "saturated: halve the exposure or the gain"),
-        (220.0, ""),
-        (120.0, ""),
-        (80.0, "too dark: 2.5 times the exposure or the gain"),
-        (40.0, "too dark: 5.0 times the exposure or the gain"),
+        (255.0, "saturated", "halve"),
+        (220.0, "", ""),
+        (120.0, "", ""),
+        (80.0, "too dark", "2.5 times"),
+        (40.0, "too dark", "5.0 times"),
     ],
 )
-def test_the_white_of_roundels_tells_what_to_change(bright: float, says: str):
-    """Whatever the ground: dark here, and white where the paper is dark."""
+def test_advice_depends_on_the_white_of_the_roundels(bright: float, kind: str, change: str):
+    """For any background: here a dark one for bright paper and the reverse."""
     roundel = render([Disc((80, 60), 40)], dark=bright / 8, bright=bright, ground=255.0 - bright)
-    assert advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE) == says
+    advice = advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE)
+    assert advice.partition(":")[0] == kind
+    assert change in advice
 
 
-def test_without_roundels_the_histogram_tells():
-    """A few highlights are no reason to go darker; a dark picture is one to go brighter, up to 16 times."""
+def test_without_roundels_advice_depends_on_the_histogram():
+    """A few highlights are ignored; a dark image needs more exposure, up to 16 times."""
     picture = np.full((80, 80), 90, np.uint8)
     assert advise(picture, NONE) == ""
     picture[:8, :16] = 255

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Messages: they arrive as they were sent, and bytes that are no message are told apart whatever they are."""
+"""Messages are decoded as they were encoded, and invalid bytes raise MessageError."""
 
 import contextlib
 import math
@@ -34,7 +34,7 @@ HEADER = {"camera": "cam0", "seq": 3, "t_ns": 1_700_000_000_000_000_000, "width"
 
 @st.composite
 def roundels(draw: st.DrawFn) -> Roundels:
-    """Columns such as a detector gives: centres in range, positive definite covariances, the rest as it comes."""
+    """Columns like those of a detector: centres in range, positive definite covariances, other columns arbitrary."""
     n = draw(st.integers(0, 20))
 
     def column(*shape: int, low=-1e4, high=1e4):
@@ -49,8 +49,8 @@ def roundels(draw: st.DrawFn) -> Roundels:
 
 
 @given(roundels())
-def test_detections_arrive_as_they_were_sent(sent: Roundels):
-    """Centres to the bit; the other columns travel as float32, to half a unit in its last place or its least number."""
+def test_detections_are_decoded_as_they_were_encoded(sent: Roundels):
+    """Centres to the bit; the other columns are float32, with rounding by half a unit in the last place."""
     got = decode(encode(Detections.pack(sent, **HEADER)), Detections).unpack()
     assert np.array_equal(got.uv, sent.uv)
     np.testing.assert_allclose(got.cov, sent.cov, rtol=2.0**-24, atol=2.0**-149)
@@ -59,15 +59,15 @@ def test_detections_arrive_as_they_were_sent(sent: Roundels):
 
 
 @given(st.binary(max_size=400), st.sampled_from(KINDS))
-def test_random_bytes_are_no_message(data: bytes, kind: type[msgspec.Struct]):
-    """Random bytes decode to nothing but MessageError (or, for a message of defaults alone, to a message)."""
+def test_random_bytes_raise_no_other_error(data: bytes, kind: type[msgspec.Struct]):
+    """Random bytes raise MessageError, or are a message of defaults."""
     with contextlib.suppress(MessageError):
         assert isinstance(decode(data, kind), kind)
 
 
 @given(st.data())
-def test_truncated_and_altered_messages_are_caught(data: st.DataObject):
-    """A message cut short is none; with any bytes replaced it is a message or a MessageError, never another error."""
+def test_truncated_and_altered_messages_are_refused(data: st.DataObject):
+    """A truncated message raises MessageError; one with replaced bytes is valid or raises MessageError."""
     whole = bytearray(encode(Detections.pack(Roundels.from_points(np.ones((3, 2)), 0.3), **HEADER)))
     cut = data.draw(st.integers(0, len(whole) - 1))
     with pytest.raises(MessageError):
@@ -117,20 +117,20 @@ def test_impossible_content_is_refused(change: dict):
         decode(encode(msgspec.structs.replace(GOOD, **change)), Detections)
 
 
-def test_a_message_that_claims_too_many_roundels_is_refused():
+def test_a_message_with_too_many_roundels_is_refused():
     many = Detections.pack(Roundels.from_points(np.ones((MAX_ROUNDELS + 1, 2)), 0.3), **HEADER)
     with pytest.raises(MessageError):
         decode(encode(many), Detections)
 
 
 def test_a_newer_sender_may_add_fields():
-    """Fields that this program does not know are skipped, so that a version need not change for them."""
+    """Unknown fields are skipped, so that new fields do not need a new version."""
     fields = msgspec.msgpack.decode(encode(GOOD)) | {"colour": "red"}
     assert decode(msgspec.msgpack.encode(fields), Detections) == GOOD
 
 
 def test_every_field_is_documented():
-    """docs/messages.md names every message of the three packages and every field of it in its own section."""
+    """docs/messages.md has a section for every message of the three packages, with a row for every field."""
     sections = (ROOT / "docs" / "messages.md").read_text().split("\n## ")
     for module in (camera_node.protocol.messages, calib.rig.messages, fusion.protocol.messages):
         for name, kind in vars(module).items():
@@ -153,7 +153,7 @@ def test_every_field_is_documented():
         ("covariance", bytes(575)),
     ],
 )
-def test_a_pose_that_is_none_is_refused(field: str, value: object):
+def test_an_invalid_pose_is_refused(field: str, value: object):
     good = {
         "robot": "a",
         "t_ns": 1,

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Zenoh sessions: they open without a router, find it, survive its loss, and are relayed to one another."""
+"""Zenoh sessions open without a router, find it, reconnect after its loss, and the router relays between them."""
 
 import logging
+import re
 import threading
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
-from camera_node.protocol.session import ServerWatch, open_client, open_router
+from camera_node.protocol.session import ServerWatch, listening_endpoints, open_client, open_router
 
 
 class Ticker:
@@ -38,7 +39,7 @@ def ticking(network):
     ticker.close()
 
 
-def test_a_client_delivers_when_the_router_comes_up_and_when_it_comes_again(network, inbox, ticking):
+def test_a_client_delivers_after_the_router_opens_and_after_it_reopens(network, inbox, ticking):
     for _ in range(2):
         router, got = network.router_again(), inbox()
         router.declare_subscriber("a/b", got.put)
@@ -47,7 +48,7 @@ def test_a_client_delivers_when_the_router_comes_up_and_when_it_comes_again(netw
 
 
 def test_the_router_relays_between_clients(network, inbox, ticking):
-    """What a camera publishes reaches a viewer, not only the server: publications, queries and liveliness."""
+    """A camera's publications, replies and liveliness tokens reach a viewer, not only the server."""
     got, alive = inbox(), inbox()
     network.router_again()
     viewer, camera = network.client(), network.client()
@@ -65,7 +66,7 @@ def test_the_router_relays_between_clients(network, inbox, ticking):
     queryable.undeclare()
 
 
-def test_a_taken_port_is_named(network):
+def test_an_error_names_the_taken_port(network):
     network.router()
     with pytest.raises(NetworkError, match=network.endpoint.rsplit(":", 1)[1]) as caught:
         open_router([network.endpoint])
@@ -73,20 +74,35 @@ def test_a_taken_port_is_named(network):
     assert "\n" not in str(caught.value)
 
 
+def test_port_0_is_replaced_by_the_port_that_clients_reach(inbox):
+    """Of two endpoints with port 0; a client that connects to the second alone receives what is published."""
+    listen = ["tcp/127.0.0.1:0"] * 2
+    with open_router(listen) as router:
+        endpoints = listening_endpoints(router, listen)
+        assert len(set(endpoints)) == 2
+        assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", endpoint) for endpoint in endpoints)
+        with open_client(endpoints[1:]) as client:
+            received = inbox()
+            router.declare_subscriber("a/b", received.put)
+            ticker = Ticker(client, "a/b")
+            assert received.until(len)
+            ticker.close()
+
+
 @pytest.mark.parametrize("endpoint", ["foo", "", "carrier-pigeon/roof:1"])
-def test_endpoints_that_are_none_are_named(endpoint: str):
+def test_an_error_names_the_invalid_endpoint(endpoint: str):
     for open_session in (open_client, open_router):
         with pytest.raises(NetworkError, match="tcp/"):
             open_session([endpoint]).close()
 
 
-def test_a_zenoh_configuration_is_used_or_named(tmp_path: Path, network):
+def test_a_zenoh_configuration_is_used_or_refused(tmp_path: Path, network):
     with pytest.raises(ConfigError, match=r"none\.json5 does not exist"):
         open_client([network.endpoint], tmp_path / "none.json5")
     broken = tmp_path / "broken.json5"
     for text in ("{", '{"nonsense": 1}'):
         broken.write_text(text)
-        with pytest.raises(ConfigError, match="is no Zenoh configuration"):
+        with pytest.raises(ConfigError, match=r"broken\.json5 .*Zenoh configuration"):
             open_client([network.endpoint], broken)
     good = tmp_path / "good.json5"
     good.write_text('{ id: "c0ffee" }')
@@ -94,8 +110,8 @@ def test_a_zenoh_configuration_is_used_or_named(tmp_path: Path, network):
         assert str(session.zid()) == "c0ffee"
 
 
-def test_puts_while_the_router_is_away_are_not_kept(network, inbox, eventually):
-    """10,000 puts of 4 kB would be 40 MB: the first that arrives is a later one."""
+def test_publications_while_the_router_is_away_are_dropped(network, inbox, eventually):
+    """10,000 publications of 4 kB are 40 MB; the first that arrives was sent later."""
     publisher = network.client().declare_publisher("a/b")
     for _ in range(10_000):
         publisher.put(bytes(4096))
@@ -105,21 +121,21 @@ def test_puts_while_the_router_is_away_are_not_kept(network, inbox, eventually):
     assert got.items[0].payload.to_bytes() == b"fresh"
 
 
-def test_the_servers_coming_and_going_is_told_once_each(network, eventually, caplog):
-    """However often the absence is looked at; a server that was never seen is away as well."""
+def test_the_servers_absence_and_return_are_logged_once_each(network, eventually, caplog):
+    """However often the absence is checked; a server that was never present is absent as well."""
     caplog.set_level(logging.WARNING, "camera_node.protocol.session")
     watch = ServerWatch(network.client(), "a/alive", patience_s=0.0)
 
-    def told() -> list[str]:
+    def logged() -> list[str]:
         return [record.getMessage().split(";")[0] for record in caplog.records]
 
     for _ in range(3):
-        watch.tell_absence()
-    assert told() == ["the server is away"]
+        watch.report_absence()
+    assert logged() == ["the server is away"]
     token = network.router_again().liveliness().declare_token("a/alive")
-    assert eventually(lambda: len(told()) == 2)
+    assert eventually(lambda: len(logged()) == 2)
     token.undeclare()
-    assert eventually(lambda: len(told()) == 3, watch.tell_absence)
-    watch.tell_absence()
-    assert told() == ["the server is away", "the server is there again", "the server is away"]
+    assert eventually(lambda: len(logged()) == 3, watch.report_absence)
+    watch.report_absence()
+    assert logged() == ["the server is away", "the server is back", "the server is away"]
     watch.close()

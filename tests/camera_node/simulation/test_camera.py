@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Simulated cameras in real time, and recordings with their truth."""
+"""Simulated cameras in real time, and rendered recordings with their truth."""
 
 import csv
 import json
@@ -16,10 +16,10 @@ import yaml
 
 from camera_node.geometry.pose import Pose
 from camera_node.simulation.camera import SimulatedCamera
-from camera_node.simulation.recording import list_exposures, render_recording
+from camera_node.simulation.recording import render_recording
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
-from camera_node.sources.replay import FolderSource, read_grey
+from camera_node.sources.replay import FrameFolder, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
 from tests.conftest import ROOT
 
@@ -33,8 +33,8 @@ def scene_path(tmp_path) -> Path:
     return write_scene(tmp_path, robots, motions, {"cam0": FAST, "cam1": CAMERA | {"fps": 30.0}})
 
 
-def test_frames_come_at_the_cameras_own_times(scene_path):
-    """Every stamp is a middle of an exposure to the nanosecond, and no frame comes before its exposure's end."""
+def test_frames_have_the_cameras_exposure_times(scene_path):
+    """Every stamp is the middle of an exposure to the nanosecond; no frame arrives before its exposure has ended."""
     epoch_ns = time.time_ns()
     camera = SimulatedCamera(scene_path, "cam0", epoch_ns)
     stamps = []
@@ -50,8 +50,8 @@ def test_frames_come_at_the_cameras_own_times(scene_path):
     assert camera.dropped == (steps - 1).sum()
 
 
-def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted(scene_path):
-    """After work that took five frames' time the next frame is one period old at most, plus its rendering."""
+def test_a_slow_reader_gets_the_newest_frame_and_the_others_are_counted(scene_path):
+    """After five frame periods of other work, the next frame is at most one period old, plus its rendering."""
     epoch_ns = time.time_ns()
     camera = SimulatedCamera(scene_path, "cam0", epoch_ns)
     frames = iter(camera)
@@ -75,7 +75,7 @@ def test_frames_equal_those_of_a_renderer(scene_path):
 
 
 def test_closing_ends_a_wait_at_once(scene_path):
-    """The first exposure is an hour away; a second thread waits for it until the camera is closed."""
+    """The first exposure is in an hour; a second thread waits for it until the camera is closed."""
     camera = SimulatedCamera(scene_path, "cam0", time.time_ns() + 3_600_000_000_000)
     frames: list = []
     waiting = threading.Thread(target=lambda: frames.extend(camera), daemon=True)
@@ -86,27 +86,27 @@ def test_closing_ends_a_wait_at_once(scene_path):
     assert frames == []
 
 
-def test_exposures_lie_in_their_span(scene_path):
+def test_exposures_lie_in_the_time_span(scene_path):
     camera = Scene.load(scene_path).camera("cam0")
-    assert list_exposures(camera, 0.0, 0.023) == range(2)
-    assert list_exposures(camera, 0.003, 0.0231) == range(3)
-    assert list_exposures(camera, -1.0, 0.002) == range(0)
+    assert camera.exposures(0.0, 0.023) == range(2)
+    assert camera.exposures(0.003, 0.0231) == range(3)
+    assert camera.exposures(-1.0, 0.002) == range(0)
 
 
-def test_a_recording_is_what_the_scene_shows(scene_path, tmp_path):
+def test_a_recording_has_the_frames_of_its_cameras(scene_path, tmp_path):
     scene = Scene.load(scene_path)
     render_recording(scene, tmp_path / "out", 1.0, 1.1, epoch_ns=5_000_000_000)
-    frames = list(FolderSource(tmp_path / "out" / "cam1"))
+    frames = list(FrameFolder(tmp_path / "out" / "cam1"))
     assert [frame.t_ns for frame in frames] == [6_000_000_000 + round(k * 1e9 / 30) for k in range(3)]
     assert (frames[1].image == Renderer(scene, "cam1").render(31 / 30, 31)).all()
-    assert len(FolderSource(tmp_path / "out" / "cam0")) == 10
+    assert len(FrameFolder(tmp_path / "out" / "cam0")) == 10
     rig = yaml.safe_load((tmp_path / "out" / "rig.yaml").read_text())["cameras"]
     assert set(rig) == {"cam0", "cam1"}
     assert "T_world_cam" not in rig["cam0"]
 
 
-def test_the_truth_scores_itself_perfectly(scene_path, tmp_path, shared_data):
-    """The true rig and poses, written as calibration and fusion would, have no error in the arena's score."""
+def test_the_truth_has_no_error_in_the_arena_score(scene_path, tmp_path, shared_data):
+    """The true rig and poses are written in the formats of calibration and fusion."""
     tool = shared_data("README.md").parents[1] / "tools" / "score_arena.py"
     scene = Scene.load(scene_path)
     render_recording(scene, tmp_path, 1.0, 1.1)
@@ -137,8 +137,8 @@ def test_the_truth_scores_itself_perfectly(scene_path, tmp_path, shared_data):
     [
         (["gone.yaml", "out"], "gone.yaml does not exist"),
         (["scene.yaml", "out", "--cameras", "cam9"], "no camera 'cam9'"),
-        (["scene.yaml", "out", "--seconds", "0"], "no span of time"),
-        (["scene.yaml", "scene.yaml"], "can't be made"),
+        (["scene.yaml", "out", "--seconds", "0"], "--seconds 0"),
+        (["scene.yaml", "scene.yaml"], "can't be created"),
     ],
 )
 def test_a_fault_is_one_line_and_exit_code_2(scene_path, arguments, says):

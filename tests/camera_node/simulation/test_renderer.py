@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rendered pixels against what geometry says of them: outlines projected through the lens, and their moments."""
+"""Compares rendered pixels with projected outlines and their moments."""
 
 import numpy as np
 import pytest
 
 from camera_node.geometry.pose import invert
 from camera_node.simulation.background import FLOOR
-from camera_node.simulation.renderer import BLACK, WHITE, Disc, Renderer, cover, discs_of, vignette
+from camera_node.simulation.renderer import (
+    BLACK,
+    WHITE,
+    Disc,
+    Renderer,
+    covered_shares,
+    place_discs,
+    vignette,
+)
 from camera_node.simulation.scene import Scene
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 from tests.conftest import ROOT
@@ -21,7 +29,7 @@ LENSES = {
 
 
 def light_of(renderer: Renderer, t_s: float = 0.0, frame: int = 0) -> np.ndarray:
-    """(h, w) grey levels less the floor's, as if the lens let all light through."""
+    """(h, w) grey levels minus the floor's, without vignetting."""
     return renderer.render(t_s, frame) / vignette(renderer.camera) - FLOOR
 
 
@@ -35,7 +43,7 @@ def true_moments(scene: Scene, t_s: float = 0.0) -> tuple[float, np.ndarray]:
     """The same from the outlines, projected through the lens and integrated by Green's theorem."""
     camera = scene.camera("cam0")
     body, T = scene.bodies_at(t_s)["disc"]
-    disc = discs_of(body, invert(camera.T_world_cam) @ T)[0]
+    disc = place_discs(body, invert(camera.T_world_cam) @ T)[0]
     total, first = 0.0, np.zeros(2)
     for radius, step in zip(disc.radii, (WHITE - FLOOR, BLACK - WHITE, WHITE - BLACK), strict=True):
         area, center = outline_moments(camera.project(circle(disc, radius)))
@@ -57,12 +65,12 @@ def outline_moments(uv: np.ndarray) -> tuple[float, np.ndarray]:
 
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.45, 0.3), (-0.5, -0.25), (0.5, -0.2)])
-def test_a_disc_stands_and_weighs_what_geometry_says(tmp_path, lens, x, y):
-    """Area and place of a tilted disc are those of its outline, also where the lens distorts.
+def test_area_and_centroid_of_a_disc_are_those_of_its_outline(tmp_path, lens, x, y):
+    """Also through lenses with distortion.
 
-    The floor is even, so all light that differs is the disc's. Rounding to 8 bits leaves 0.29 grey levels a pixel,
-    which over the disc's own pixels (and the vignette's 1 / 0.7) is `noise` on the sum and `noise` times the spread
-    over the sum on the centroid; 4 sigma, and 0.2 % and 0.005 px for edges that sub-samples find.
+    The floor is uniform, so all differences in light belong to the disc. Rounding to 8 bits adds 0.29 grey levels to
+    each pixel, which over the disc's pixels (and with the vignette's 1 / 0.7) is `noise` on the sum, and `noise` times
+    the spread over the sum on the centroid. The tolerance is 4 sigma, plus 0.2 % and 0.005 px for sub-sampled edges.
     """
     scene = load_disc(tmp_path, LENSES[lens], x_m={"mean": x}, y_m={"mean": y}, **TILTED)
     light = light_of(Renderer(scene, "cam0"))
@@ -76,8 +84,8 @@ def test_a_disc_stands_and_weighs_what_geometry_says(tmp_path, lens, x, y):
     assert np.abs(where - center).max() < 0.005 + 4 * noise * 20 / abs(total)
 
 
-def test_edges_are_right_to_half_a_percent():
-    """Cells' parts within a circle against counting 24 x 24 points a cell (whose own error is about 0.004)."""
+def test_covered_shares_are_right_to_two_percent():
+    """Shares of cells within a circle against counting 24 x 24 points in each cell, with an error of about 0.004."""
     rng = np.random.default_rng(3)
     for cu, cv in rng.uniform(-0.5, 0.5, (5, 2)):
         points = np.arange(-16 * 24, 16 * 24) / 24 + 0.5 / 24 - 0.5
@@ -85,28 +93,28 @@ def test_edges_are_right_to_half_a_percent():
         exact = inside.reshape(32, 24, 32, 24).mean((1, 3))
         fine = np.arange(-16 * 3 - 1, 16 * 3 + 1) / 3 + 0.5 / 3 - 0.5
         radius = np.hypot(fine[None] - cu, fine[:, None] - cv).astype(np.float32)
-        parts = cover(radius, (9.3,))[0].reshape(32, 3, 32, 3).mean((1, 3))
+        parts = covered_shares(radius, (9.3,))[0].reshape(32, 3, 32, 3).mean((1, 3))
         assert np.abs(parts - exact).max() < 0.02
         assert parts.sum() == pytest.approx(np.pi * 9.3**2, rel=5e-4)
 
 
 def test_the_same_scene_gives_the_same_pixels(tmp_path):
-    """Another renderer of the same scene agrees bit by bit; another frame has other noise."""
+    """Two renderers of the same scene agree to the bit; another frame has different noise."""
     scene = load_disc(tmp_path, {"noise": 3.0})
     one, other = Renderer(scene, "cam0"), Renderer(scene, "cam0")
     assert (one.render(1.0, 5) == other.render(1.0, 5)).all()
     assert (one.render(1.0, 5) != other.render(1.0, 6)).mean() > 0.5
 
 
-def test_noise_has_the_size_that_the_camera_says(tmp_path):
-    """Two frames differ by sqrt(2) sigma and rounding; 76,800 pixels fix that to 0.3 %, 4 sigma are 1.1 %."""
+def test_noise_has_the_configured_standard_deviation(tmp_path):
+    """Two frames differ by sqrt(2) sigma and rounding; 76,800 pixels determine that to 0.3 %, so 4 sigma are 1.1 %."""
     renderer = Renderer(load_disc(tmp_path, {"noise": 3.0}), "cam0")
     difference = renderer.render(0.0, 1).astype(float) - renderer.render(0.0, 2)
     assert difference.std() == pytest.approx(np.sqrt(2 * (3.0**2 + 1 / 12)), rel=0.011)
 
 
 def test_the_nearer_roundel_hides_the_farther(tmp_path):
-    """Whichever is named first; inside the nearer card the image is as if it were alone."""
+    """In any order of the bodies; inside the nearer card the image is that of this roundel alone."""
     high, low = {"z_m": {"mean": 0.5}, "y_m": {"mean": -0.1}}, {"z_m": {"mean": 0.1}}
 
     def render(**motions) -> np.ndarray:
@@ -127,8 +135,8 @@ def test_the_back_is_not_drawn(tmp_path, pitch):
     assert np.abs(light_of(Renderer(scene, "cam0"))).max() <= 0.5 / 0.7
 
 
-def test_what_leaves_the_image_is_cut_at_its_border(tmp_path):
-    """A narrower sensor behind the same lens sees the same, up to rounding, wherever a disc crosses its border."""
+def test_discs_are_clipped_at_the_image_border(tmp_path):
+    """A smaller sensor behind the same lens has the same image, up to rounding, wherever a disc crosses its border."""
     narrow = {"width": 160, "height": 120, "cx": 78.3, "cy": 60.7}
     motion = {"x_m": {"amplitude": 0.7, "period_s": 1.0}, "y_m": {"amplitude": 0.5, "period_s": 1.6}}
     wide = Renderer(load_disc(tmp_path, {"distortion": [-0.1, 0.02, 0, 0]}, **motion), "cam0")
@@ -139,23 +147,23 @@ def test_what_leaves_the_image_is_cut_at_its_border(tmp_path):
         assert np.abs(whole - light_of(cut, t_s)).max() < 2 * 0.5 / 0.7 + 0.1
 
 
-def test_an_exposure_smears_along_the_motion(tmp_path):
-    """A speed of v px an exposure adds v^2 / 12 to the variance along it, and moves the centre by nothing."""
+def test_an_exposure_blurs_along_the_motion(tmp_path):
+    """A speed of v px per exposure adds v^2 / 12 to the variance along the motion and does not move the centroid."""
     motion = {"x_m": {"amplitude": 0.5, "period_s": 2.0}, "z_m": {"mean": 0.2}}
     exposure = {"exposure_us": 30000.0, "fps": 20.0}
     sharp = light_of(Renderer(load_disc(tmp_path, exposure, **motion), "cam0"), 2.0)
-    smeared = light_of(
+    blurred = light_of(
         Renderer(load_disc(tmp_path, exposure | {"motion_samples": 16}, **motion), "cam0"), 2.0
     )
     speed_px = 0.5 * np.pi * 0.03 * CAMERA["fx"] / depth_of_motion()
-    (sharp_at, sharp_var), (smeared_at, smeared_var) = spread(sharp), spread(smeared)
-    assert smeared_var[0] - sharp_var[0] == pytest.approx(speed_px**2 / 12, rel=0.05)
-    assert abs(smeared_var[1] - sharp_var[1]) < 0.05
-    assert np.abs(smeared_at - sharp_at).max() < 0.01
+    (sharp_at, sharp_var), (blurred_at, blurred_var) = spread(sharp), spread(blurred)
+    assert blurred_var[0] - sharp_var[0] == pytest.approx(speed_px**2 / 12, rel=0.05)
+    assert abs(blurred_var[1] - sharp_var[1]) < 0.05
+    assert np.abs(blurred_at - sharp_at).max() < 0.01
 
 
 def depth_of_motion() -> float:
-    """Along the optical axis, of the point (0, 0, 0.2) from the camera at (0, -0.6, 2) that looks at the origin."""
+    """Depth of the point (0, 0, 0.2) in the camera at (0, -0.6, 2) that looks at the origin."""
     return float(np.array([0.0, 0.6, -1.8]) @ np.array([0.0, 0.6, -2.0]) / np.hypot(0.6, 2.0))
 
 
@@ -170,10 +178,10 @@ def spread(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ) / total
 
 
-def test_clutter_is_the_same_floor_in_all_cameras_and_no_flat_one():
+def test_all_cameras_see_the_same_cluttered_floor():
     """Two cameras see the same grey levels at the same places of the floor.
 
-    At 6,400 places the correlation of unrelated floors would stay below 4 / sqrt(6400) = 0.05.
+    At 6,400 places, the correlation of unrelated floors is below 4 / sqrt(6400) = 0.05.
     """
     scene = Scene.load(ROOT / "configs" / "demo" / "scene.yaml")
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Cameras by Video4Linux, as far as they go without one: names, settings, times, and a source that fails.
+"""Video4Linux cameras without hardware: names, settings, capture times, and a source that fails.
 
-A short video file, opened by OpenCV like a camera, stands for a camera that stops delivering after its last frame.
+A short video file, opened by OpenCV like a camera, simulates a camera that stops delivering after its last frame.
 """
 
 import logging
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.commands.source_selection import open_source
+from camera_node.commands.publish import open_source
 from camera_node.errors import CameraError
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.v4l2 import (
@@ -26,7 +26,7 @@ from camera_node.sources.v4l2 import (
 
 @pytest.fixture
 def sys_root(tmp_path: Path) -> Path:
-    """A /sys/class/video4linux of two equal cameras, each with a metadata device, and a third."""
+    """A /sys/class/video4linux with two equal cameras, each with a metadata device, and a third camera."""
     for number, (name, index) in enumerate(
         [("HD Webcam", 0), ("HD Webcam", 1), ("HD Webcam", 0), ("HD Webcam", 1), ("Arducam OV9281", 0)]
     ):
@@ -45,11 +45,11 @@ def test_cameras_are_found_by_number_path_and_name(sys_root: Path, text: str, de
     assert find_device(text, sys_root) == Path(device)
 
 
-def test_metadata_devices_are_no_cameras(sys_root: Path):
+def test_metadata_devices_are_not_listed(sys_root: Path):
     assert [str(path) for path in camera_names(sys_root)] == ["/dev/video0", "/dev/video2", "/dev/video4"]
 
 
-def test_names_of_no_or_several_cameras_are_told(sys_root: Path, tmp_path: Path):
+def test_an_error_lists_the_cameras_when_a_name_is_unknown_or_ambiguous(sys_root: Path, tmp_path: Path):
     with pytest.raises(CameraError, match=r"several .* /dev/video0, /dev/video2"):
         find_device("HD Webcam", sys_root)
     with pytest.raises(CameraError, match=r"'nope'; cameras present: .*/dev/video4 \(Arducam OV9281\)"):
@@ -58,15 +58,15 @@ def test_names_of_no_or_several_cameras_are_told(sys_root: Path, tmp_path: Path)
         find_device("nope", tmp_path / "none")
 
 
-def test_a_device_that_is_not_there_is_named():
+def test_an_error_names_the_missing_device():
     with pytest.raises(CameraError, match="/dev/video99 does not exist"):
         open_source("99", SourceSettings())
-    with pytest.raises(CameraError, match="is no camera"):
+    with pytest.raises(CameraError, match="is not a camera"):
         open_capture(Path("/dev/null"), SourceSettings())
 
 
 def test_settings_become_properties_in_the_order_that_v4l2_needs():
-    """The format comes before the size and the rate; an exposure counts 100 us, in manual mode (1)."""
+    """The format comes before the size and the rate; exposures are in units of 100 us, in manual mode (1)."""
     settings = SourceSettings(width=1280, height=720, fps=60, exposure_us=1520, gain=8, fourcc="MJPG")
     assert properties(settings) == [
         (cv2.CAP_PROP_FOURCC, 0x47504A4D),
@@ -90,15 +90,15 @@ UNIX, MONOTONIC, MS = 1_700_000_000_000_000_000, 5_000_000_000_000, 1_000_000
     ("stamp_ms", "exposure_us", "expected"),
     [
         (5_000_000 - 20, 0, UNIX - 20 * MS),  # 20 ms old
-        (5_000_000 - 20, 4000, UNIX - 22 * MS),  # and the middle of its 4 ms
+        (5_000_000 - 20, 4000, UNIX - 22 * MS),  # its exposure of 4 ms ended then
         (0, 4000, UNIX - 2 * MS),  # no stamp: the time of the grab
         (5_000_000 + 20, 0, UNIX),  # from the future
-        (5_000_000 - 1500, 0, UNIX),  # too old to be true
+        (5_000_000 - 1500, 0, UNIX),  # too old to be valid
         (float("nan"), 0, UNIX),
     ],
 )
 def test_buffer_stamps_become_unix_times(stamp_ms: float, exposure_us: float, expected: int):
-    """Doubles of this size resolve 256 ns."""
+    """The spacing of doubles of this size is 256 ns."""
     assert abs(capture_time(stamp_ms, MONOTONIC, UNIX, exposure_us) - expected) <= 256
 
 
@@ -112,8 +112,8 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
-    """Every opening fails every other time, as a camera that is plugged in again; frames come all the same."""
+def test_a_camera_that_stops_is_reopened_and_logged_once(video: Path, caplog):
+    """One opening in three fails, as for a camera that is plugged in again; the frames arrive nevertheless."""
     caplog.set_level(logging.WARNING, "camera_node.sources.v4l2")
     openings = iter(range(1000))
 
@@ -130,13 +130,13 @@ def test_a_camera_that_stops_is_reopened_and_told_once(video: Path, caplog):
             source.close()
     assert {frame.image.shape for frame in frames} == {(48, 64)}
     assert [frame.t_ns for frame in frames] == sorted(frame.t_ns for frame in frames)
-    told = [record.getMessage() for record in caplog.records]
-    assert all("stopped delivering" in line for line in told[::2])
-    assert all("delivers again" in line for line in told[1::2])
+    lines = [record.getMessage() for record in caplog.records]
+    assert all("stopped" in line for line in lines[::2])
+    assert all("again" in line for line in lines[1::2])
 
 
-def test_the_newest_frame_is_taken_and_others_are_counted(video: Path, eventually):
-    """Who comes late gets the last frame; what nobody took is counted."""
+def test_the_newest_frame_is_delivered_and_others_are_counted(video: Path, eventually):
+    """A reader that comes late gets the last frame; the two frames before it are counted as dropped."""
     source = V4l2Source(video, SourceSettings(), lambda path, _: cv2.VideoCapture(str(path)), reopen_s=100)
     assert eventually(lambda: source.dropped == 2)
     frame = next(iter(source))

@@ -3,29 +3,20 @@
 
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from itertools import count
-from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.client.arena import Arena as Client
 from fusion.client.measure import Standing, find_standing, robot_of
 from fusion.errors import FusionError
 from fusion.model.robots import distances, load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import free_port
 from tests.fusion.conftest import fuse
-from tests.fusion.server.test_server import ARENA, DEADLINE_S, config, send, serving, until
+from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 
-STANDS = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))
 UNKNOWN = np.full((3, 3), np.nan)
 
 
@@ -38,9 +29,9 @@ def watched(arena: Arena, n: int = 30) -> list[Markers]:
 def test_what_is_measured_is_what_stands_there():
     """0.1 px is at most 0.6 mm a marker and instant here, and a median of 30 has 1.25 / sqrt(30) of that: distances are
     within 5 sigma of it and the rounding, 1 mm. The frame is the one promised: origin, z and x."""
-    markers = find_standing(watched(Arena({"b": WIDE}, {"b": STANDS}, sigma_px=0.1)))
+    markers = find_standing(watched(Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)))
     robot = robot_of(markers, WIDE.diameter_m)
-    R, p = STANDS(0.0)
+    R, p = WIDE_MOTION(0.0)
     true = p + WIDE.points @ R.T
     order = [int(np.argmin(np.linalg.norm(true - q, axis=1))) for q in markers.position]
     assert sorted(order) == [0, 1, 2]
@@ -53,10 +44,10 @@ def test_what_is_measured_is_what_stands_there():
 
 def test_a_robot_as_measured_is_tracked_where_it_stands():
     """The position is the markers' middle and z is the prints' own, within 1 mm and what 1 mm turns 0.2 m by."""
-    arena = Arena({"b": WIDE}, {"b": STANDS}, sigma_px=0.1)
+    arena = Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)
     measured = {"b": robot_of(find_standing(watched(arena)), WIDE.diameter_m)}
     pose = fuse(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
-    R, p = STANDS(0.0)
+    R, p = WIDE_MOTION(0.0)
     assert pose.state == "tracked"
     assert np.linalg.norm(pose.position - (p + R @ WIDE.points.mean(0))) < 1e-3
     assert R[:, 2] @ rotation_from_wxyz(pose.quaternion_wxyz)[:, 2] > np.cos(1e-3 / 0.2)
@@ -112,35 +103,9 @@ def command(endpoint: str, *words: str) -> list[str]:
     return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
 
 
-@contextmanager
-def running(folder: Path) -> Iterator[tuple[str, Client]]:
-    """The endpoint of a server that follows one robot and sees another, which nobody declared; and a client."""
-    arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": STANDS}, sigma_px=0.05)
-    a_second = arena.messages(30)
-    settings, over = config(folder), threading.Event()
-    with serving(settings) as (server, client):
-
-        def go_on() -> None:
-            for second in count(time.time_ns(), 10**9):
-                for message in a_second:
-                    t_ns = second + message.t_ns - a_second[0].t_ns
-                    if over.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
-                        return
-                    send(server, [msgspec.structs.replace(message, t_ns=t_ns, sent_ns=t_ns)])
-
-        cameras = threading.Thread(target=go_on)
-        cameras.start()
-        try:
-            until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-            yield settings.listen[0], client
-        finally:
-            over.set()
-            cameras.join()
-
-
 def test_a_robot_in_a_running_arena_is_defined(tmp_path):
     """By the command, while the other one drives on; what it prints is an entry for robots.yaml."""
-    with running(tmp_path) as (endpoint, client):
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client):
         words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
         assert done.returncode == 0, done.stderr

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.pose import exp_so3
+from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -33,7 +33,7 @@ def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
     random = np.random.default_rng(seed)
     n = len(CAMERAS) * EACH
     states = States(
-        exp_so3(random.normal(size=(BODIES, 3))),
+        rotation_from_vector(random.normal(size=(BODIES, 3))),
         random.uniform(-0.8, 0.8, (BODIES, 3)),
         random.normal(size=(BODIES, 3)),
         random.normal(size=(BODIES, 3)),
@@ -220,7 +220,7 @@ def test_a_disc_that_is_seen_from_its_edge_gives_numbers_or_nothing():
     tilt = np.radians(90) + np.linspace(-3e-4, 3e-4, 61)
     n, none = len(tilt), np.zeros(len(tilt), np.intp)
     up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])  # towards the camera
-    R = exp_so3(np.outer(tilt, [1.0, 0.0, 0.0])) @ up
+    R = rotation_from_vector(np.outer(tilt, [1.0, 0.0, 0.0])) @ up
     still = np.zeros((n, 3))
     ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
     poses = _core.Poses(R, ahead, still, still, camera, np.zeros((1, 3)), np.zeros(1))

@@ -17,7 +17,7 @@ from fusion.errors import FusionError
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key
 from fusion.server.active_rig import ActiveRig
 from fusion.server.persistence import PersistedFile
-from tests.fusion.server.test_server import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
+from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 from tests.fusion.synthetic import WIDE
 
 
@@ -43,8 +43,8 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
         assert set(robots_of(ask(client, key)[0]).robots) == {"a"}
         request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
         assert list(robots_of(ask(client, key, encode(request))[0]).robots) == ["rover", "wide"]
-        assert server._tracker is not None
-        assert server._tracker.status == ["tracked", None]
+        assert server.pipeline.tracker is not None
+        assert server.pipeline.tracker.status == ["tracked", None]
         reply, _ = ask(client, key, json.dumps({"remove": ["wide"]}).encode())
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == ["rover"]
@@ -53,7 +53,7 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
 def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
     twin = msgspec.structs.replace(ARENA.robots["a"], start_m=None)
     faults = {
-        b"\x00\xff": "no RobotsRequest",
+        b"\x00\xff": "RobotsRequest",
         b'{"colour": 1}': "colour",
         encode(RobotsRequest(remove=("b",))): "there is no robot 'b'",
         encode(RobotsRequest(define={"b/c": WIDE})): "can't name a robot",
@@ -64,28 +64,27 @@ def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
             reply, error = ask(client, robots_key("test"), payload)
             assert reply is None
             assert said in error
-        assert list(server.robots) == ["a"]
+        assert list(server.pipeline.robots) == ["a"]
 
 
 def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
-    settings = config(tmp_path)
-    with serving(settings) as (server, client):
+    with serving(config(tmp_path)) as (server, client):
         with pytest.raises(FusionError, match="nothing to undo"):
             client.undo_correction()
         moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
-        server.link.put(lambda: server.calibration.correct("cam1", moved))
+        server.transport.enqueue(lambda: server.pipeline.active_rig.correct("cam1", moved))
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
-        words = [sys.executable, "-m", "fusion", "undo", "--connect", settings.listen[0], "--arena", "test"]
+        words = [sys.executable, "-m", "fusion", "undo", "--connect", server.endpoints[0], "--arena", "test"]
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
         assert done.stdout == "cam1 is back where it stood, and is not watched any more\n"
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)
-        assert server._tracker is not None
-        assert server._tracker.watch.held == {"cam1"}
+        assert server.pipeline.tracker is not None
+        assert server.pipeline.tracker.watch.held == {"cam1"}
 
 
 def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
-    kept = tmp_path / "rig.kept.yaml"
-    settings = msgspec.structs.replace(config(tmp_path, with_rig=False), kept_rig=str(kept))
+    saved = tmp_path / "rig.saved.yaml"
+    settings = msgspec.structs.replace(config(tmp_path, with_rig=False), saved_rig=str(saved))
     with serving(settings) as (server, client):
         server.session.put(KEYS.rig, encode(RigMessage.of(Rig(cameras=ARENA.cameras))))
         until(lambda: client.rig(DEADLINE_S))
@@ -96,33 +95,33 @@ def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
 
 
 def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
-    given, path = tmp_path / "rig.yaml", tmp_path / "rig.kept.yaml"
-    kept = PersistedFile("rig", str(path), load_rig, save_rig)
+    given, path = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
+    saved = PersistedFile("rig", str(path), load_rig, save_rig)
     config(tmp_path)  # writes rig.yaml
     fewer = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
     path.write_text(dump_rig(fewer))
     for age_ns, expected in ((-1, fewer), (1, Rig(cameras=ARENA.cameras))):
         at = path.stat().st_mtime_ns + age_ns * 10**9
         os.utime(given, ns=(at, at))
-        assert ActiveRig(given, kept).rig == expected
+        assert ActiveRig(given, saved).rig == expected
     path.write_text("cameras: {")
     os.utime(given, (0, 0))
-    assert ActiveRig(given, kept).rig == Rig(cameras=ARENA.cameras)
+    assert ActiveRig(given, saved).rig == Rig(cameras=ARENA.cameras)
 
 
 def test_robots_that_were_changed_are_in_force_after_a_restart(tmp_path):
     """Down to none at all; a file that a person wrote later counts more."""
-    settings = msgspec.structs.replace(config(tmp_path), kept_robots=str(tmp_path / "robots.kept.yaml"))
+    settings = msgspec.structs.replace(config(tmp_path), saved_robots=str(tmp_path / "robots.saved.yaml"))
     requests = (RobotsRequest(define={"wide": WIDE}, rename={"a": "b"}), RobotsRequest(remove=("b", "wide")))
     before = {"a"}
     for request, after in zip(requests, ({"b", "wide"}, set()), strict=True):
         with serving(settings) as (server, client):
-            assert set(server.robots) == before
+            assert set(server.pipeline.robots) == before
             assert set(robots_of(ask(client, robots_key("test"), encode(request))[0]).robots) == after
         before = after
     with serving(settings) as (server, _):
-        assert not server.robots
-    later = (tmp_path / "robots.kept.yaml").stat().st_mtime_ns + 10**9
+        assert not server.pipeline.robots
+    later = (tmp_path / "robots.saved.yaml").stat().st_mtime_ns + 10**9
     os.utime(settings.robots, ns=(later, later))
     with serving(settings) as (server, _):
-        assert set(server.robots) == {"a"}
+        assert set(server.pipeline.robots) == {"a"}

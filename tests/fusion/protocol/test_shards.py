@@ -18,7 +18,7 @@ from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits, Tracker
 from tests.fusion.conftest import errors
-from tests.fusion.server.test_server import DEADLINE_S, config, live, send, serving, until
+from tests.fusion.serving import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 
 NAMES = [f"robot_{k}" for k in range(200)]
@@ -111,7 +111,10 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
     arena = Arena(robots, {name: line(at) for name, at in places.items()}, sigma_px=0.05)
     first = msgspec.structs.replace(config(tmp_path), shard="1/2", limits=Limits(lateness_ms=200))
     (tmp_path / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": msgspec.to_builtins(robots)}))
-    with serving(first) as (server, client), Server(msgspec.structs.replace(first, shard="2/2")) as second:
+    with contextlib.ExitStack() as stack:
+        server, client = stack.enter_context(serving(first))
+        other_shard = msgspec.structs.replace(first, shard="2/2", listen=server.endpoints)
+        second = stack.enter_context(Server(other_shard))
         thread = threading.Thread(target=second.run)
         thread.start()
         try:
@@ -133,10 +136,10 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
                 }
 
             until(all_are_told)
-            assert server._tracker is not None
-            assert second._tracker is not None
-            assert server._tracker.owned.tolist() == [True, False, False]
-            assert second._tracker.owned.tolist() == [False, True, True]
+            assert server.pipeline.tracker is not None
+            assert second.pipeline.tracker is not None
+            assert server.pipeline.tracker.owned.tolist() == [True, False, False]
+            assert second.pipeline.tracker.owned.tolist() == [False, True, True]
         finally:
             second.stop()
             thread.join(DEADLINE_S)

@@ -20,7 +20,7 @@ from fusion.recordings.run import fuse_recording, replay
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Limits
 from tests.fusion.conftest import errors, poses_of
-from tests.fusion.server.test_server import ARENA, KEYS, config, live, send, serving
+from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 
 MOVING = Arena(
@@ -72,8 +72,7 @@ def test_what_is_no_recording_is_said(tmp_path, content):
 
 
 def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
-    settings = config(tmp_path)
-    with serving(settings) as (server, client):
+    with serving(config(tmp_path)) as (server, client):
         done = threading.Event()
 
         def keep_sending() -> None:
@@ -84,7 +83,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
         sender = threading.Thread(target=keep_sending)
         sender.start()
         try:
-            record(tmp_path / "live.mcap", connect=settings.listen, arena="test", seconds=4.0)
+            record(tmp_path / "live.mcap", connect=server.endpoints, arena="test", seconds=4.0)
         finally:
             done.set()
             sender.join(60.0)
@@ -92,7 +91,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert {message.camera for _, message in recording.detections} == ARENA.cameras.keys()
     assert recording.rig is not None
     assert recording.rig.cameras == ARENA.cameras
-    assert recording.robots == server.robots
+    assert recording.robots == server.pipeline.robots
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.server.frame_synchronizer import GONE_NS, FrameSynchronizer
+from fusion.server.frame_synchronizer import SILENT_NS, FrameSynchronizer
 from fusion.tracking.tracker import Limits
 
 PERIOD = 33_333_333
@@ -114,8 +114,8 @@ def test_a_silent_camera_is_waited_for_to_the_bound_and_not_once_it_is_gone():
         [(instant.t_ns - silent_ns, now - instant.t_ns - PERIOD // 2) for now, instant in closed]
     )
     before = waited[:, 0] < 0
-    missing = (waited[:, 0] > PERIOD) & (waited[:, 0] < GONE_NS - LATENESS - PERIOD)
-    gone = waited[:, 0] > GONE_NS
+    missing = (waited[:, 0] > PERIOD) & (waited[:, 0] < SILENT_NS - LATENESS - PERIOD)
+    gone = waited[:, 0] > SILENT_NS
     assert waited[before][8:, 1].max() <= 0  # the frames of both are there before the instant's end
     assert waited[missing, 1].min() >= LATENESS
     assert waited[missing, 1].max() <= LATENESS + TICK
@@ -147,7 +147,7 @@ def test_after_a_long_silence_there_is_a_new_row():
         instants.add(f)
         instants.take(now)
     quiet = instants.take(first[-1][0] + pause)
-    assert 0 < len(quiet) <= GONE_NS // PERIOD + 3
+    assert 0 < len(quiet) <= SILENT_NS // PERIOD + 3
     renewed = play(instants, second)
     assert used(renewed) == sent(second)
     assert all(abs(f.t_ns - i.t_ns) <= PERIOD for _, i in renewed for f in i.frames)

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from fusion.model.frames import CalibratedFrame
+from fusion.protocol.messages import FusionStatus
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.ingest import Ingest
-from fusion.server.status import MAX_STRANGERS, ServerStatistics
+from fusion.server.ingest import MAX_UNCALIBRATED, Ingest
+from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line
@@ -32,8 +33,8 @@ class Path:
     """A message's way through the server, without a network."""
 
     def __init__(self, arena: Arena = ARENA) -> None:
-        self.arena, self.health = arena, ServerStatistics(150.0)
-        self.intake, self.instants = Ingest(KEYS, self.health), FrameSynchronizer(PERIOD_NS)
+        self.arena, self.statistics = arena, ServerStatistics(150.0)
+        self.intake, self.instants = Ingest(KEYS, self.statistics), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 
     def take(self, message: Detections, received_ns: int) -> list[Fused]:
@@ -49,9 +50,10 @@ class Path:
 
     @property
     def faults(self) -> dict[str, int]:
-        status = self.health.status(time.time_ns(), set(), {}, set())
-        assert status is not None
-        return status.faults
+        return self.status().faults
+
+    def status(self) -> FusionStatus:
+        return self.statistics.report(time.time_ns(), PipelineStatus())
 
 
 def play(path: Path, messages: list[Detections]) -> list[Fused]:
@@ -123,10 +125,9 @@ def test_ten_thousand_names_leave_room_for_the_cameras_of_the_rig():
     for k in range(10_000):
         path.take(msgspec.structs.replace(message, camera=f"ghost{k}"), message.t_ns)
     assert "tracked" in states(play(path, ARENA.messages(12)))
-    status = path.health.status(time.time_ns(), set(), {}, set())
-    assert status is not None
-    assert len(status.cameras) == MAX_STRANGERS + len(ARENA.cameras)
-    assert status.faults["too many cameras"] == 10_000 - MAX_STRANGERS
+    status = path.status()
+    assert len(status.cameras) == MAX_UNCALIBRATED + len(ARENA.cameras)
+    assert status.faults["too many cameras"] == 10_000 - MAX_UNCALIBRATED
 
 
 @pytest.mark.parametrize("jump_ns", [-3600 * NS, 3600 * NS, NS])
@@ -149,7 +150,7 @@ def test_a_camera_whose_clock_jumps_does_not_disturb_the_others(jump_ns):
 def test_a_frame_that_comes_twice_counts_once():
     path, twice = Path(), [m for message in ARENA.messages(10) for m in (message, message)]
     fused = play(path, twice)
-    assert path.faults == {"frame that came twice": 40}
+    assert path.faults == {"duplicate frame": 40}
     once = play(Path(), ARENA.messages(10))
     assert [f.poses for f in fused] == [f.poses for f in once]
 
@@ -164,8 +165,7 @@ def test_two_nodes_of_one_name_are_noticed_and_a_restarted_one_is_not(second, sh
         if second:
             other = msgspec.structs.replace(message, t_ns=message.t_ns + 7_000_000, seq=100 + k)
             path.take(other, other.t_ns)
-    status = path.health.status(time.time_ns(), set(), {}, set())
-    assert status is not None
+    status = path.status()
     assert status.cameras["cam0"].shared == shared
     assert ("two nodes publish as camera cam0" in caplog.text) == shared
 

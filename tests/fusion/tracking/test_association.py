@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.pose import exp_so3
+from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import ExpectedMarkers
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -27,7 +27,7 @@ def test_a_markers_covariance_is_that_of_displaced_states(tau: float):
     """Against J P J^T by central differences, of a body that does not turn: exact to their second order, 1e-8."""
     random = np.random.default_rng(5)
     root = 0.1 * random.normal(size=(1, 12, 12))
-    R = exp_so3(np.array([[0.4, -0.8, 1.1]]))
+    R = rotation_from_vector(np.array([[0.4, -0.8, 1.1]]))
     v, still = random.normal(size=(1, 3)), np.zeros((1, 3))
     states = States(R, random.normal(size=(1, 3)), still, v, root @ root.transpose(0, 2, 1))
     catalogue = MarkerTable.of([WIDE])

@@ -54,7 +54,7 @@ def test_halves_agree_within_what_is_claimed(wandering: bool, expected: float):
         )
         found, told = halves(arena, lasting(messages, seed) if wandering else messages)
         chi2, degrees = chi2 + told.chi2, degrees + told.degrees
-        factor = float(np.mean([half.adjusted.dependence for half in found]))
+        factor = float(np.mean([half.adjusted.inflation for half in found]))
         plain, factors = plain + told.chi2 * factor, [*factors, factor]
     if wandering:
         assert np.mean(factors) > expected

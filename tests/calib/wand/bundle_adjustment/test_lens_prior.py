@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import told_sigma
+from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import assess
@@ -93,7 +93,7 @@ def test_one_camera_is_placed_through_a_rough_lens_as_well_as_claimed(off: tuple
 
 def test_figures_that_stand_with_a_lens_are_read_and_checked():
     camera = roughly(recorded(1).intrinsics, CAREFUL, told=True).cameras["cam00"]
-    assert told_sigma(camera) == pytest.approx([6e-4, 0.5, 0.5, 5e-4], rel=0.01)
-    assert told_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
+    assert calibrated_sigma(camera) == pytest.approx([6e-4, 0.5, 0.5, 5e-4], rel=0.01)
+    assert calibrated_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
     with pytest.raises(ValueError, match="lens_sigma"):
         type(camera)(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, lens_sigma=(0.1,))

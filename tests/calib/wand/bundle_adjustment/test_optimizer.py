@@ -9,15 +9,18 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.disc_centres import displacement
-from calib.wand.bundle_adjustment.linear_system import Linearisation
-from calib.wand.bundle_adjustment.problem import DRIFT, LENS, OFFSET, POSE, unobserved
-from calib.wand.bundle_adjustment.trajectory import hermite_rate, interpolate, locate
+from calib.wand.bundle_adjustment.linear_system import reprojection_jacobians
+from calib.wand.bundle_adjustment.problem import gauge_directions
+from calib.wand.bundle_adjustment.residuals import predict_markers, reprojection_errors
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import label
+from calib.wand.trajectory import locate, position_weights, velocity_weights
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
 from camera_node.protocol.messages import Detections
@@ -36,39 +39,42 @@ def test_jacobians_are_those_of_the_residuals():
     """By central differences: the error is of second order in the step, 1e-5 of the largest entry at most."""
     arena = ring(3)
     result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
-    problem = result.adjusted.problem.freeing(POSE, OFFSET, DRIFT, LENS)
-    linear, state = Linearisation(problem, result.observations), result.adjusted.state
+    problem = result.adjusted.problem.with_free(POSE, OFFSET, DRIFT, LENS)
+    seen, state = result.observations, result.adjusted.state
     along = np.zeros((len(state.motion), state.motion[0].size))
-    J = linear._jacobians(state, linear._pass(state))[1]
+    J = reprojection_jacobians(problem, seen, state, predict_markers(problem, seen, state))[1]
     for parameter, step in enumerate([1e-6] * 6 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-5]):
         by = np.zeros((len(state.cameras), 12))
         by[:, parameter] = step
-        there, here = (linear.residuals(state.moved(sign * by, along)) for sign in (1, -1))
+        there, here = (
+            reprojection_errors(problem, seen, state.retract(sign * by, along)) for sign in (1, -1)
+        )
         expected = -(there - here) / (2 * step)
         assert J[:, :, parameter] == pytest.approx(expected, abs=1e-3 * np.abs(expected).max() + 1e-6)
 
 
 def test_a_world_that_moves_changes_no_residual():
-    """Cameras moved by `unobserved` and the wand with them: what is left is of second order, 1e-10 of a motion of 1e-5
+    """Moves the cameras by `gauge_directions`, and the wand with them, by 1e-5: the rest is of second order, 1e-10
     times the 600 px of a radian."""
     arena = ring(3)
     result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
-    linear, state = Linearisation(result.adjusted.problem, result.observations), result.adjusted.state
+    problem, seen, state = result.adjusted.problem, result.observations, result.adjusted.state
     by = np.zeros((len(state.cameras), 12))
-    for column, twist in zip(unobserved(state, POSE).T, np.eye(6), strict=True):
+    for column, twist in zip(gauge_directions(state, POSE).T, np.eye(6), strict=True):
         by[:, :6] = 1e-5 * column.reshape(-1, 6)
         along = state.motion @ skew(1e-5 * twist[:3]).T
         along[:, 0] += 1e-5 * twist[3:]
-        moved = state.moved(by, along.reshape(len(along), -1))
-        assert linear.residuals(moved) == pytest.approx(linear.residuals(state), abs=600 * 1e-10 * 10)
+        moved = state.retract(by, along.reshape(len(along), -1))
+        expected = reprojection_errors(problem, seen, state)
+        assert reprojection_errors(problem, seen, moved) == pytest.approx(expected, abs=600 * 1e-10 * 10)
 
 
 def test_velocity_is_the_derivative_of_position():
     """Also beyond the knots; in between, of third order."""
     knot_s, t_s, step = np.array([0.0, 0.1, 0.25, 1.0]), np.array([-0.03, 0.02, 0.13, 0.2, 0.4, 1.02]), 1e-6
     place = locate(knot_s, t_s, 0.3)
-    change = interpolate(knot_s, t_s + step, place) - interpolate(knot_s, t_s - step, place)
-    assert hermite_rate(knot_s, t_s, place) == pytest.approx(change / (2 * step), abs=1e-6)
+    change = position_weights(knot_s, t_s + step, place) - position_weights(knot_s, t_s - step, place)
+    assert velocity_weights(knot_s, t_s, place) == pytest.approx(change / (2 * step), abs=1e-6)
     assert place.inside.tolist() == [False, True, True, True, False, False]
 
 
@@ -203,7 +209,7 @@ def test_time_offsets_of_a_short_wave_are_as_sure_as_they_say():
         truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
         apart = np.linalg.svd(np.ones((len(truth), 1)))[0][:, 1:]
         off = apart.T @ (result.time_offset_ms - truth) / 1e3
-        covariance = apart.T @ result.adjusted.covariance(OFFSET)[:, 0, :, 0] @ apart
+        covariance = apart.T @ camera_covariance(result.adjusted).of(OFFSET)[:, 0, :, 0] @ apart
         squared, degrees = squared + off @ np.linalg.solve(covariance, off), degrees + len(off)
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 

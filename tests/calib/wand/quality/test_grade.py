@@ -9,9 +9,10 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.plan.precision import map_precision
+from calib.rig.camera import PER_CAMERA, POSE
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
 from calib.rig.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
-from calib.wand.bundle_adjustment.problem import PER_CAMERA, POSE, State
+from calib.wand.bundle_adjustment.problem import State
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
@@ -63,7 +64,7 @@ def test_the_camera_s_jacobians_are_those_of_the_adjustment():
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def see(step):
-        moved = state.moved(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12))
         T = moved.cameras[0]
         return moved.lens(0, camera).project((points - T[:3, 3]) @ T[:3, :3])
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The wand's motion: positions and velocities at knots, white noise on acceleration between them.
+"""The wand's continuous-time trajectory: positions and velocities at knots, white noise on acceleration between them.
 
 The posterior mean of that prior between two knots is the cubic Hermite polynomial (Barfoot, State Estimation for
-Robotics, section 11.1; Anderson and Barfoot 2015), so a frame taken at any time sees a linear function of two knots.
+Robotics, section 11.1; Anderson and Barfoot 2015), so a marker's position at any time is linear in two knots.
 
-The wand is written in affine coordinates: every marker is a fixed combination of one to four basis markers, whose
-mutual distances keep it rigid. A straight wand thus has no turn about itself that would need an anchor.
+The wand is expressed in affine coordinates: every marker is a fixed combination of one to four basis markers, whose
+mutual distances keep the wand rigid. A straight wand has no unobservable rotation about its axis in this form.
+docs/wand_adjustment.md has the equations.
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ import numpy as np
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 
+COPLANAR = 0.01  # of the wand's extent: markers nearer to the basis's span than this add no basis marker
+
 
 @dataclass(frozen=True, slots=True)
 class AffineWand:
@@ -24,7 +27,7 @@ class AffineWand:
     Attributes:
         basis: (B,) indices of the basis markers: 1, 2 on a line, 3 in a plane or 4.
         weights: (M, B) rows that sum to 1; marker k = weights[k] @ basis points.
-        pairs: (E, 2) pairs of the basis, by their place in it.
+        pairs: (E, 2) pairs of basis markers, as indices into `basis`.
         lengths: (E,) their distances, metres.
     """
 
@@ -35,7 +38,7 @@ class AffineWand:
 
     @classmethod
     def of(cls, wand: Body) -> "AffineWand":
-        """Basis markers as far apart as can be: each next one is the farthest from the span of those before."""
+        """Choose the basis greedily: each next marker is the farthest from the span of the previous ones."""
         points = wand.points
         extent = np.ptp(points, axis=0).max()
         basis = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
@@ -44,7 +47,7 @@ class AffineWand:
             if len(basis) > 1:
                 span = np.linalg.qr((points[basis[1:]] - points[basis[0]]).T)[0]
                 off = off - span @ (span.T @ off)
-            if (distance := np.linalg.norm(off, axis=0)).max() < 0.01 * extent:
+            if (distance := np.linalg.norm(off, axis=0)).max() < COPLANAR * extent:
                 break
             basis.append(int(distance.argmax()))
         system = np.vstack([points[basis].T, np.ones(len(basis))])
@@ -56,7 +59,7 @@ class AffineWand:
 
 
 def hermite(tau: Array, dt: Array) -> Array:
-    """(n, 4) weights of p0, v0, p1, v1 in the position at `tau` after the first of two knots `dt` apart."""
+    """(n, 4) weights of p0, v0, p1, v1 in the position at `tau` (n,) after the first of two knots `dt` (n,) apart."""
     s = tau / dt
     return np.column_stack(
         [(1 + 2 * s) * (1 - s) ** 2, tau * (1 - s) ** 2, s**2 * (3 - 2 * s), tau * s * (s - 1)]
@@ -64,54 +67,59 @@ def hermite(tau: Array, dt: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where on the trajectory frames are: `link` (n,) is the interval between knots, `own` (n,) tells 0 or 1, the knot
-    of it that a frame extrapolates, where it is not `inside` (n,) the interval; `spread` (n,) is the variance of a
-    position there, were both knots known, for an acceleration of power spectral density 1."""
+class SplineLocation:
+    """Where n times lie among the knots.
 
-    link: Index
-    own: Index
+    Attributes:
+        interval: (n,) index of the interval between knots; it starts at the knot of the same index.
+        nearest: (n,) 0 or 1: the knot of the interval from which times outside it are extrapolated.
+        inside: (n,) whether the time lies inside an interval that is no gap.
+        spread: (n,) variance of the position given both knots, for an acceleration of power spectral density 1, s^3.
+    """
+
+    interval: Index
+    nearest: Index
     inside: Mask
     spread: Array
 
 
-def locate(knot_s: Array, t_s: Array, gap_s: float) -> Place:
-    """Place frames at `t_s` (n,) between K >= 2 ascending knots; intervals above `gap_s` are gaps."""
-    link = np.clip(np.searchsorted(knot_s, t_s, side="right") - 1, 0, len(knot_s) - 2)
-    dt, tau = knot_s[link + 1] - knot_s[link], t_s - knot_s[link]
+def locate(knot_s: Array, t_s: Array, gap_s: float) -> SplineLocation:
+    """Locate times `t_s` (n,) among K >= 2 ascending knots; intervals longer than `gap_s` are gaps."""
+    interval = np.clip(np.searchsorted(knot_s, t_s, side="right") - 1, 0, len(knot_s) - 2)
+    dt, tau = knot_s[interval + 1] - knot_s[interval], t_s - knot_s[interval]
     inside = (dt <= gap_s) & (tau >= 0) & (tau <= dt)
-    own = (tau > dt / 2).astype(np.intp)
-    beyond = np.abs(t_s - knot_s[link + own])
+    nearest = (tau > dt / 2).astype(np.intp)
+    beyond = np.abs(t_s - knot_s[interval + nearest])
     spread = np.where(inside, (tau * (dt - tau) / dt) ** 3 / 3, beyond**3 / 3)
-    return Place(link, own, inside, spread)
+    return SplineLocation(interval, nearest, inside, spread)
 
 
-def interpolate(knot_s: Array, t_s: Array, place: Place) -> Array:
-    """(n, 4) weights of p0, v0, p1, v1 in the position at `t_s`; beyond a knot with constant velocity."""
-    tau = t_s - knot_s[place.link + place.own]
+def position_weights(knot_s: Array, t_s: Array, location: SplineLocation) -> Array:
+    """(n, 4) weights of p0, v0, p1, v1 in the position at `t_s`; constant velocity outside of the intervals."""
+    tau = t_s - knot_s[location.interval + location.nearest]
     weights = np.zeros((len(tau), 4))
-    rows = np.arange(len(tau))
-    weights[rows, 2 * place.own], weights[rows, 2 * place.own + 1] = 1.0, tau
-    first = place.link[place.inside]
-    weights[place.inside] = hermite(t_s[place.inside] - knot_s[first], knot_s[first + 1] - knot_s[first])
+    rows, inside = np.arange(len(tau)), location.inside
+    weights[rows, 2 * location.nearest], weights[rows, 2 * location.nearest + 1] = 1.0, tau
+    first = location.interval[inside]
+    weights[inside] = hermite(t_s[inside] - knot_s[first], knot_s[first + 1] - knot_s[first])
     return weights
 
 
-def hermite_rate(knot_s: Array, t_s: Array, place: Place) -> Array:
-    """(n, 4) derivative of `interpolate`'s weights by time: the weights of the velocity."""
-    weights = np.zeros((len(t_s), 4))
-    weights[np.arange(len(t_s)), 2 * place.own + 1] = 1.0
-    first = place.link[place.inside]
+def velocity_weights(knot_s: Array, t_s: Array, location: SplineLocation) -> Array:
+    """(n, 4) weights of p0, v0, p1, v1 in the velocity at `t_s`: the time derivative of `position_weights`."""
+    weights, inside = np.zeros((len(t_s), 4)), location.inside
+    weights[np.arange(len(t_s)), 2 * location.nearest + 1] = 1.0
+    first = location.interval[inside]
     dt = knot_s[first + 1] - knot_s[first]
-    s = (t_s[place.inside] - knot_s[first]) / dt
-    weights[place.inside] = np.column_stack(
+    s = (t_s[inside] - knot_s[first]) / dt
+    weights[inside] = np.column_stack(
         [6 * s * (s - 1) / dt, (1 - s) * (1 - 3 * s), 6 * s * (1 - s) / dt, s * (3 * s - 2)]
     )
     return weights
 
 
-def whitened_motion(dt: Array, density: float) -> Array:
-    """(L, 2, 4) whitened errors of constant velocity over `dt`, as factors of p0, v0, p1, v1, along one axis.
+def whitened_constant_velocity(dt: Array, density: float) -> Array:
+    """(L, 2, 4) whitened deviations from constant velocity over `dt`, as factors of p0, v0, p1, v1, along one axis.
 
     Args:
         dt: (L,) times between the knots, s.
@@ -125,7 +133,8 @@ def whitened_motion(dt: Array, density: float) -> Array:
 
 
 def finite_velocities(knot_s: Array, points: Array, gap_s: float) -> Array:
-    """Velocities (K, B, 3) at the knots by central differences of positions (K, B, 3); 0 where no knot is near."""
+    """Velocities (K, B, 3) at the knots by central differences of positions (K, B, 3); 0 where no knot is within
+    `gap_s`."""
     velocity = np.zeros_like(points)
     if len(knot_s) < 2:
         return velocity
@@ -141,9 +150,9 @@ def finite_velocities(knot_s: Array, points: Array, gap_s: float) -> Array:
 def acceleration_density(knot_s: Array, points: Array, gap_s: float) -> float:
     """Power spectral density of the acceleration, m^2/s^3, at least 1e-6, from positions (K, B, 3) at knots.
 
-    Under the prior, the mean velocities of two neighbouring intervals dt differ with variance 2/3 density dt. Of these
-    differences the 90 % quantile counts: a wave has calm parts, and its brisk ones must not be smoothed away; noise in
-    the positions only makes the prior weaker.
+    Under the prior, the mean velocities of two neighbouring intervals dt differ with variance 2/3 density dt. The 90 %
+    quantile of these differences gives the density: the mean would be too small for fast motion, because recordings
+    have slow parts. Noise in the positions only makes the prior weaker.
     """
     dt = np.diff(knot_s)
     steps = np.diff(points, axis=0) / dt[:, None, None]

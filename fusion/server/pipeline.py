@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The active rig and robots, and the synchronizer and tracker that use them; no network."""
+
+import logging
+from pathlib import Path
+
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, load_rig, save_rig
+from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
+from fusion.protocol.messages import RobotsRequest, ShardPoses
+from fusion.protocol.shards import Shard
+from fusion.server.active_rig import ActiveRig
+from fusion.server.config import ArenaConfig
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.persistence import PersistedFile
+from fusion.tracking.result import Move
+from fusion.tracking.tracker import Tracker
+
+log = logging.getLogger("fusion")
+
+
+class TrackingPipeline:
+    """The state of tracking: the active rig and robots, the frame synchronizer, and the tracker.
+
+    `tracker` is None while no camera has a pose.
+
+    Args:
+        config: the arena's files, rate and limits.
+        shard: the robots that this process estimates.
+
+    Raises:
+        ConfigError, FusionError, CalibrationError: a file is missing or broken, or declares robots that can't be
+            tracked.
+    """
+
+    def __init__(self, config: ArenaConfig, shard: Shard) -> None:
+        self._config, self._shard = config, shard
+        saved_rig = PersistedFile("rig", config.saved_rig, load_rig, save_rig)
+        self.active_rig = ActiveRig(Path(config.rig) if config.rig else None, saved_rig)
+        self._saved_robots = PersistedFile("robots", config.saved_robots, load_saved_robots, save_robots)
+        saved = self._saved_robots.load_if_newer(Path(config.robots))
+        self.robots = load_robots(Path(config.robots)) if saved is None else saved
+        self.tracker: Tracker | None
+        self.synchronizer: FrameSynchronizer
+        self.restart()
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras that have a pose in the active rig."""
+        return self.active_rig.rig.placed() if self.active_rig.rig else {}
+
+    def restart(self) -> None:
+        """Drop all frames and tracks; the tracker acquires all robots again."""
+        cameras, limits, rate_hz = self.cameras, self._config.limits, self._config.rate_hz
+        self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
+        period_ns = round(1e9 / rate_hz) if rate_hz else None
+        self.synchronizer = FrameSynchronizer(period_ns, round(limits.lateness_ms * 1e6))
+        if cameras:
+            log.info("active calibration: %s", ", ".join(cameras))
+
+    def replace_rig(self, rig: Rig) -> None:
+        """Activate a published rig. Robots stay tracked if the pose of a single camera differs."""
+        changed_camera = self.active_rig.replace(rig)
+        if changed_camera is None or self.tracker is None:
+            self.restart()
+            return
+        self.tracker.place(changed_camera, rig.cameras[changed_camera])
+        self.tracker.watch.trust(changed_camera)
+
+    def correct_rig(self, move: Move) -> None:
+        """Update the active rig by a camera that the tracker recalibrated."""
+        if move.camera is not None:
+            self.active_rig.correct(move.name, move.camera)
+
+    def undo_correction(self) -> str:
+        """Restore the camera of the last correction; it is no longer monitored until another rig is published.
+
+        Returns:
+            The camera's name.
+
+        Raises:
+            FusionError: there is no correction.
+        """
+        name, camera = self.active_rig.undo()
+        if self.tracker is not None:
+            self.tracker.place(name, camera)
+            self.tracker.watch.hold(name)
+        return name
+
+    def change_robots(self, request: RobotsRequest) -> set[str]:
+        """Rename, remove and define robots, all or none. Robots with unchanged markers stay tracked.
+
+        Returns:
+            The names that no longer exist.
+
+        Raises:
+            ConfigError, FusionError: the request is invalid.
+        """
+        robots = changed(self.robots, request.rename, request.remove, request.define)
+        if robots == self.robots:
+            return set()
+        removed = self.robots.keys() - robots.keys()
+        self.robots = robots
+        self._saved_robots.save(robots)
+        log.info("robots: %s", ", ".join(robots) or "none")
+        if self.tracker is not None:
+            self.tracker = self.tracker.with_robots(robots, request.rename)
+        return removed
+
+    def add_shard_poses(self, poses: ShardPoses) -> None:
+        """Use the robots of another shard: their detections are not available to the robots of this one."""
+        if self.tracker is not None:
+            self.tracker.follow(poses)
+
+    def associate_early(self) -> None:
+        """Associate the frames of the open frame set while the last ones are missing."""
+        frame_set, n_missing = self.synchronizer.open()
+        if self.tracker is not None and frame_set is not None:
+            self.tracker.anticipate(frame_set, n_missing)
+
+    def excluded_cameras(self) -> set[str]:
+        """Cameras that were moved, whose detections are excluded."""
+        return set(self.tracker.watch.bumped) if self.tracker else set()
+
+    def geometry_residuals_px(self) -> dict[str, float]:
+        """RMS residuals of the robots whose markers are not at the declared places."""
+        return self.tracker.shapes.misfits() if self.tracker else {}

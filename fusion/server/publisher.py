@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Publishes the server's results on the arena's keys."""
+
+from collections.abc import Iterable
+
+import msgspec
+
+from calib.rig.messages import RigMessage
+from camera_node.protocol.messages import Keys
+from fusion.protocol.messages import FusionStatus, Latency, Markers, RobotPose, ShardPoses, shard_key
+from fusion.protocol.shards import Shard
+from fusion.server.transport import Transport
+
+
+class ArenaPublisher:
+    """Publishes poses, markers, the rig and the status of one shard; only the leading shard publishes markers.
+
+    Args:
+        transport: the server's.
+        keys: the arena's.
+        shard: of this process.
+    """
+
+    def __init__(self, transport: Transport, keys: Keys, shard: Shard) -> None:
+        self._transport, self._keys, self._shard = transport, keys, shard
+        self._shard_key = shard_key(keys.arena, shard.index)
+        self._status_key = keys.fusion_status + ("" if shard.leads else f"/{shard.index}")
+
+    def publish_poses(self, poses: Iterable[RobotPose], latency: Latency | None) -> None:
+        """Publish poses, each with the latency of its frame set."""
+        for pose in poses:
+            self._transport.publish(
+                self._keys.robot_pose(pose.robot), msgspec.structs.replace(pose, latency=latency)
+            )
+
+    def publish_shard(self, poses: ShardPoses) -> None:
+        """Publish this shard's robots for the other shards."""
+        self._transport.publish(self._shard_key, poses)
+
+    def publish_markers(self, markers: Markers) -> None:
+        """Publish all markers of a frame set."""
+        if self._shard.leads:
+            self._transport.publish(self._keys.markers, markers)
+
+    def publish_rig(self, rig: RigMessage) -> None:
+        """Publish a corrected rig."""
+        self._transport.publish(self._keys.rig, rig)
+
+    def publish_status(self, status: FusionStatus) -> None:
+        """Publish this shard's status."""
+        self._transport.publish(self._status_key, status)
+
+    def stop_robots(self, names: Iterable[str]) -> None:
+        """Undeclare the publishers of robots that no longer exist."""
+        for name in names:
+            self._transport.undeclare(self._keys.robot_pose(name))

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A live server on loopback, a client of it, and the detections of a synthetic arena."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from calib.rig.rig import Rig, save_rig
+from camera_node.protocol.messages import Detections, Keys, encode
+from fusion.client.arena import Arena as Client
+from fusion.server.config import ArenaConfig
+from fusion.server.server import Server
+from fusion.tracking.tracker import Limits
+from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
+
+T = TypeVar("T")
+DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
+ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
+KEYS = Keys("test")
+WIDE_MOTION = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))  # of a robot that the server does not know
+
+
+def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
+    """The settings of a server on a port that the operating system chooses; writes rig.yaml and robots.yaml."""
+    save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
+    (folder / "robots.yaml").write_bytes(
+        msgspec.yaml.encode({"robots": {"a": msgspec.to_builtins(TRIANGLE)}})
+    )
+    rig = str(folder / "rig.yaml") if with_rig else None
+    return ArenaConfig(
+        arena="test",
+        listen=("tcp/127.0.0.1:0",),
+        rig=rig,
+        robots=str(folder / "robots.yaml"),
+        limits=Limits(lateness_ms=5000),  # frames are sent in one burst: every frame set waits to be complete
+    )
+
+
+@contextmanager
+def serving(settings: ArenaConfig) -> Iterator[tuple[Server, Client]]:
+    """A server that runs in a thread, and a client that has reached it."""
+    with Server(settings) as server:
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        try:
+            with connected(server) as client:
+                yield server, client
+        finally:
+            server.stop()
+            thread.join(DEADLINE_S)
+
+
+@contextmanager
+def connected(server: Server) -> Iterator[Client]:
+    """A client that has reached the server."""
+    with Client.connect(*server.endpoints, arena="test") as client:
+        until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
+        yield client
+
+
+def until(condition: Callable[[], T]) -> T:
+    """The first true value of `condition()`, polled; each poll blocks on the network by itself."""
+    deadline = time.monotonic() + DEADLINE_S
+    while time.monotonic() < deadline:
+        if value := condition():
+            return value
+    raise AssertionError("the deadline passed")
+
+
+def live(messages: list[Detections], ago_ns: int = 10**9) -> list[Detections]:
+    """The messages as if their first frame was taken `ago_ns` ago."""
+    shift = time.time_ns() - ago_ns - messages[0].t_ns
+    return [msgspec.structs.replace(m, t_ns=m.t_ns + shift, sent_ns=m.t_ns + shift) for m in messages]
+
+
+def send(server: Server, messages: list[Detections]) -> None:
+    """Publish messages on the server's own session; its queue keeps their order."""
+    for message in messages:
+        server.session.put(KEYS.detections(message.camera), encode(message))
+
+
+@contextmanager
+def serving_an_unknown_robot(folder: Path) -> Iterator[tuple[str, Client]]:
+    """The endpoint of a server that tracks robot a, while its cameras also see the markers of `WIDE`; and a client."""
+    arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": WIDE_MOTION}, sigma_px=0.05)
+    one_second, stopped = arena.messages(30), threading.Event()
+    with serving(config(folder)) as (server, client):
+
+        def publish() -> None:
+            for start_ns in count(time.time_ns(), 10**9):
+                for message in one_second:
+                    t_ns = start_ns + message.t_ns - one_second[0].t_ns
+                    if stopped.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
+                        return
+                    send(server, [msgspec.structs.replace(message, t_ns=t_ns, sent_ns=t_ns)])
+
+        cameras = threading.Thread(target=publish)
+        cameras.start()
+        try:
+            until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+            yield server.endpoints[0], client
+        finally:
+            stopped.set()
+            cameras.join()
