@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""knows lenses and where cameras stand."""
+"""Calibrates lenses, camera poses and the world frame."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m calib`: lenses, where cameras stand, and the world they stand in."""
+"""`python -m calib`: calibrates lenses, camera poses and the world frame."""
 
 import sys
 from typing import Annotated
@@ -13,7 +13,6 @@ from calib.commands.undo import Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
 from camera_node.errors import run
-from camera_node.terminal import console
 
 Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]
@@ -31,10 +30,10 @@ def main() -> None:
 
 
 def execute(arguments: list[str]) -> None:
-    """Do what the command line asks; `--undo` first is the subcommand `undo`."""
+    """Run a command line; `--undo` as the first argument stands for the subcommand `undo`."""
     if arguments[:1] == ["--undo"]:
         arguments = ["undo", *arguments[1:]]
-    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute(console())
+    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute()
 
 
 if __name__ == "__main__":

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The fault family of calibration."""
+"""The exceptions of calibration."""
 
 from camera_node.errors import RoundelError
 
 
 class CalibrationError(RoundelError):
-    """Cameras, a wand or a recording from which no trustworthy calibration follows."""
+    """No reliable calibration is possible from these cameras, this wand or this recording."""
 
 
 class CameraFault(CalibrationError):
     """Some cameras contradict the others.
 
     Attributes:
-        reasons: by the camera's name, what is wrong, to be read after its name.
-        certain: whether this is seen to be the reason; else another one may be found.
+        reasons: what is wrong, by camera name; reads on after the name.
+        certain: whether the reason was observed; otherwise a later diagnosis may replace it.
     """
 
     def __init__(self, reasons: dict[str, str], certain: bool = True) -> None:
-        super().__init__("; ".join(f"camera '{name}': {why}" for name, why in reasons.items()))
+        super().__init__("; ".join(f"camera '{name}': {reason}" for name, reason in reasons.items()))
         self.reasons = reasons
         self.certain = certain

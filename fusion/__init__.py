@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""detections to markers to robots; holds the Zenoh router."""
+"""The server: fuses detections into markers and robot poses, and is the arena's Zenoh router."""

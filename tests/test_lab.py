@@ -21,7 +21,7 @@ import zenoh
 import camera_node.__main__ as camera_program
 import fusion.__main__ as fusion_program
 import web.__main__ as web_program
-from calib.live.collect import publish
+from calib.live.collect import publish_rig
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import Detections, Keys, Roundels, decode, encode
 from camera_node.protocol.session import open_client
@@ -141,7 +141,7 @@ def test_a_viewer_hears_all_and_changes_nothing(lab: Lab):
 
 def test_the_operator_hands_over_a_rig(lab: Lab):
     operator = lab.session("operator")
-    assert publish(operator, "arena", Rig(cameras={}))
+    assert publish_rig(operator, "arena", Rig(cameras={}))
 
 
 @pytest.mark.parametrize("stranger", ["without a certificate", "of another authority"])

@@ -10,9 +10,9 @@ from typing import Any
 
 import viser
 
-from calib.live.collect import publish
-from calib.live.wand_session import MOST_S, SessionProgress, wave
-from calib.rig.recording import save_wave, wave_beside
+from calib.live.collect import publish_rig
+from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
+from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import load_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
@@ -86,16 +86,17 @@ class Calibrating:
     def _calibrate(self) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
         rig, wand = load_rig(files.rig), load_yaml(files.wand, Body)
-        heard, why = wave(session, arena, rig, wand, MOST_S, self._show, self._ended)
+        settings = WandSession(rig=rig, wand=wand)
+        heard, why = run_wand_session(session, arena, settings, self._show, self._ended)
         self._button.disabled = True
-        kept = wave_beside(files.rig)
-        save_wave(kept, arena, heard.messages)
+        kept = wand_recording_path(files.rig)
+        save_wand_recording(kept, arena, heard.messages)
         if self._closed:
             return ""
         self._tell(f"the wave ended: {why}; placing the cameras")
         place_cameras(kept, files)
         rig = load_rig(files.rig)
-        publish(session, arena, rig)
+        publish_rig(session, arena, rig)
         taken = self._subscription.feed.latest().server_alive
         return describe(rig.calibration) + (
             "" if taken else f"; no server is there to take it: give it {files.rig}"
@@ -104,7 +105,7 @@ class Calibrating:
     def _show(self, told: SessionProgress) -> None:
         rows = [Row((*rest, used), "ok" if used else "warn") for *rest, used, _ in told.cells()]
         write(self._seen, Table(("camera", "frames", "image", "shared part"), rows, "no roundel yet").html())
-        self._tell(f"{told.standing}: {told.advice}")
+        self._tell(f"{told.summary}: {told.advice}")
 
     def _tell(self, text: str) -> None:
         write(self._answer, plain(text))

@@ -14,10 +14,10 @@ import numpy as np
 import psutil
 
 import web
-from calib.live.collect import publish
+from calib.live.collect import publish_rig
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig, load_rig, save_rig
-from calib.world.world_frame import align
+from calib.world.world_frame import align_cameras
 from camera_node.arrays import Array
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
@@ -157,10 +157,10 @@ class Demo:
         rig = load_rig(self.processes.folder / "rig.yaml")
         if missing := set(self.scene.cameras) - set(rig.placed()):
             raise ProgramFailed(f"calibration did not place {', '.join(sorted(missing))}")
-        moved, misses_m = align(
+        moved, misses_m = align_cameras(
             rig, {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
         )
-        publish(self.session, ARENA, moved)
+        publish_rig(self.session, ARENA, moved)
         worst = 1e3 * max(misses_m.values())
         print(
             f"calibrated: {len(misses_m)} cameras, {worst:.2f} mm from their true places at most", flush=True

@@ -9,7 +9,7 @@ from camera_node.arrays import Array
 from camera_node.config import is_name
 from camera_node.errors import RoundelError
 from fusion.client.define import describe
-from fusion.client.measure import Standing, find_standing, robot_of
+from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
 from web.drawing import PICKED
 from web.feed import Latest
@@ -53,7 +53,7 @@ class Picking:
         """Know the markers that there are now, and show those that are picked."""
         seen = latest.markers
         if seen is not None and latest.age(seen) < 1.0:
-            self._free = seen.message.positions()[seen.message.free()]
+            self._free = seen.message.positions()[seen.message.unlabeled()]
         self._cloud.visible = bool(self.picked)
         if self.picked:
             self._cloud.points = np.array(self.picked, np.float32)
@@ -78,8 +78,10 @@ class Picking:
                 raise FusionError(f"'{name}' can't name a robot; use letters, digits, - and _")
             if not self.picked:
                 raise FusionError("no marker is picked")
-            standing = _those(find_standing(self._subscription.watch(WATCH_S)), np.array(self.picked))
-            robot = robot_of(standing, self._diameter.value / 1e3, self._motion.value)
+            standing = _those(
+                find_stationary_markers(self._subscription.watch(WATCH_S)), np.array(self.picked)
+            )
+            robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
             self._subscription.define(name, robot)
         except RoundelError as error:
             return str(error)
@@ -97,7 +99,7 @@ class Picking:
         write(self._answer, plain(text))
 
 
-def _those(standing: Standing, picked: Array) -> Standing:
+def _those(standing: StationaryMarkers, picked: Array) -> StationaryMarkers:
     """The markers that were picked, in that order; FusionError where one does not stand there any more."""
     distance = np.linalg.norm(standing.position - picked[:, None], axis=2)  # picked x standing
     gone = np.min(distance, axis=1, initial=np.inf) > SAME_M
@@ -105,4 +107,4 @@ def _those(standing: Standing, picked: Array) -> Standing:
         x, y, z = picked[np.argmax(gone)]
         raise FusionError(f"the marker at {x:.2f}, {y:.2f}, {z:.2f} m does not stand still, or is not seen")
     nearest = distance.argmin(1)
-    return Standing(standing.position[nearest], standing.normal[nearest])
+    return StationaryMarkers(standing.position[nearest], standing.normal[nearest])

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from calib.rig.recording import iterate
+from calib.rig.recording import read_messages
 from camera_node.errors import ConfigError
 from web.feed import Feed
 
@@ -37,7 +37,7 @@ class RecordingPlayer:
         self._rigs: list[tuple[int, str, bytes]] = []
         times: list[int] = []
         arenas: Counter[str] = Counter()
-        for key, data, t_ns in iterate(path, self.faults):
+        for key, data, t_ns in read_messages(path, self.faults):
             times = [min(t_ns, *times), max(t_ns, *times)] if times else [t_ns, t_ns]
             if found := ARENA.match(key):
                 arenas[found[1]] += 1
@@ -107,7 +107,7 @@ class RecordingPlayer:
         in_force = bisect_right(self._rigs, from_ns, key=lambda rig: rig[0])
         if in_force:
             yield from_s, *self._rigs[in_force - 1][1:]
-        for key, data, t_ns in iterate(self.path, Counter()):
+        for key, data, t_ns in read_messages(self.path, Counter()):
             if t_ns >= from_ns:
                 yield (t_ns - self._start_ns) / 1e9, key, data
 

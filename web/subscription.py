@@ -6,7 +6,7 @@ from typing import Any
 import zenoh
 
 from camera_node.errors import RoundelError
-from fusion.client.measure import watch
+from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import Markers, RobotsRequest
 from fusion.protocol.requests import change_robots, undo_correction
@@ -40,7 +40,7 @@ class Subscription:
 
     def watch(self, seconds: float) -> list[Markers]:
         """What the server tells of markers in so many seconds; FusionError where that is nothing."""
-        return watch(self.session, self.feed.keys.arena, seconds)
+        return collect_markers(self.session, self.feed.keys.arena, seconds)
 
     def define(self, name: str, robot: Robot) -> None:
         """Have the server look for a robot; FusionError or NetworkError where it does not."""

@@ -65,7 +65,7 @@ def robot_state(latest: Latest, robot: str) -> str:
 
 def tabulate_robots(latest: Latest) -> Table:
     """One row a robot: state, position (m), speed (m/s) and one standard deviation of the position (mm)."""
-    misfits = latest.status.message.misfits if latest.status else {}
+    misfits = latest.status.message.geometry_residuals_px if latest.status else {}
     rows = [_robot_row(latest, name, misfits.get(name)) for name in sorted(latest.poses)]
     return Table(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, "no robot yet")
 
@@ -128,9 +128,9 @@ def _advise(latest: Latest, seen: Seen | None, health: CameraHealth | None) -> s
         return "away"
     if health is not None and not health.calibrated:
         return "not placed"
-    if health is not None and health.aside:
-        return "moved: set aside until it is placed anew"
-    if health is not None and health.shared:
+    if health is not None and health.excluded:
+        return "moved: excluded until it is recalibrated"
+    if health is not None and health.duplicate_publisher:
         return "two nodes have this name"
     return seen.message.advice
 
@@ -141,7 +141,7 @@ def describe_server(latest: Latest) -> str:
         return "no server answers yet" if latest.status is None else "the server is away"
     status: FusionStatus = latest.status.message
     return (
-        f"{status.instants_per_s:.0f} instants/s, latency {_number(status.latency_ms, 1)} ms, "
+        f"{status.frame_sets_per_s:.0f} poses/s, latency {_number(status.latency_ms, 1)} ms, "
         f"processor {100 * status.cpu:.0f} %, {status.memory_mb:.0f} MB"
     )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib check`: whether a rig can be trusted, by a recording of a waved wand."""
+"""`calib check`: judges a rig by a wand recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.console import Console
 
-from calib.commands.choice import require_one
-from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
-from calib.commands.recording import read_recording
+from calib.commands.inputs import read_recording, require_one
+from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, POSE
@@ -25,97 +23,93 @@ from calib.wand.scale import SIGMA_M, Distance
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from camera_node.terminal import progress_console, say
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Judge a rig by a recording of a waved wand: does it still stand as it says, do two halves agree, how precise is
-    it where robots drive, and which camera is the weakest. Nothing is written unless --maps or --out ask for it."""
+    """Judge a rig by a wand recording: whether the cameras still have the rig's poses, whether two halves of the
+    recording agree, how precise the rig is where robots drive, and which camera limits it. Nothing is written without
+    --maps or --out."""
 
     rig: Path
     """The rig to judge."""
     wand: Path = Path("configs/wand.yaml")
-    """The wand that was waved: diameter_m and markers, metres."""
+    """The wand of the recording: diameter_m and markers, metres."""
     frames: Path | None = None
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
-    """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
     recording: Path | None = None
-    """Or take what calib wand --live kept, or python -m fusion record wrote (MCAP)."""
+    """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
     distance: tuple[str, str, float] | None = None
     """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
     distance_sigma: float = SIGMA_M
     """Standard deviation of that distance, metres."""
     height: float = 0.1
-    """Metres above the floor at which robots carry their roundels."""
+    """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
     maps: Path | None = None
-    """A folder for pictures: each camera's residuals and where to wave next, and the errors to expect."""
+    """A folder for images: each camera's residuals and where to wave next, and the expected errors."""
     out: Path | None = None
-    """Write the rig again, with what was found in its `calibration`."""
+    """Write the rig with the results in its `calibration` to this file."""
 
-    def execute(self, console: Console) -> None:
-        """Calibrate anew, whole and in halves, and compare."""
-        frames, observations, recording = self.frames, self.observations, self.recording
-        require_one(
-            {"--frames FOLDER": frames, "--observations CSV": observations, "--recording MCAP": recording}
-        )
+    def execute(self) -> None:
+        """Calibrate from the whole recording and from its halves, and compare."""
+        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
+        require_one({**files, "--recording MCAP": self.recording})
         if self.out is not None:
             check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
         distance = Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
-        messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
-        said = self._judge(rig, wand, messages, distance, console)
+        messages = read_recording(rig, self.frames, self.observations, self.recording, wand)
+        figures = self._judge(rig, wand, messages, distance)
         if self.out is not None:
-            told = {**rig.calibration, "check": {**provenance(), **said}}
-            write_rig(msgspec.structs.replace(rig, calibration=told), self.out, console)
+            calibration = {**rig.calibration, "check": {**provenance(), **figures}}
+            write_rig(msgspec.structs.replace(rig, calibration=calibration), self.out)
 
     def _judge(
-        self,
-        rig: Rig,
-        wand: Body,
-        messages: Sequence[Detections],
-        distance: Distance | None,
-        console: Console,
+        self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> dict[str, Any]:
-        with console.status("placing cameras"):
+        with progress_console().status("calibrating camera poses"):
             result = calibrate(rig, wand, messages, distance)
-        trust = assess(result, wand, self.height)
-        print_report(result, trust, console)
-        halves = _compare_halves(result.rig, wand, messages, distance, console)
-        stands = _compare_with_rig(rig, result, console)
+        quality = assess(result, wand, self.height)
+        print_report(result, quality)
+        halves = _compare_halves(result.rig, wand, messages, distance)
+        with_rig = _compare_with_rig(rig, result)
         if self.maps is not None:
-            save_maps(self.maps, result, trust, console)
-        return {**trust.as_dict(), "halves": _figures(halves), "rig": _figures(stands)}
+            save_maps(self.maps, result, quality)
+        return {**quality.as_dict(), "halves": _figures(halves), "rig": _figures(with_rig)}
 
 
 def _compare_halves(
-    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None, console: Console
+    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
 ) -> Agreement | None:
-    """Both halves start from the lenses that the whole recording gave: where these were refined, a half that refines
-    them less would turn its cameras instead. What is not known of a measured distance is the same in both."""
-    same = distance and replace(distance, sigma_m=0.0)
+    """Compare calibrations from both halves of a recording.
+
+    Both start from the lenses of the whole recording: a half that refines lenses less would otherwise rotate its
+    cameras instead. The error of a measured distance is the same in both.
+    """
+    exact = distance and replace(distance, sigma_m=0.0)
     try:
-        with console.status("placing cameras by each half"):
-            first, second = (calibrate(rig, wand, half, same) for half in split(messages))
+        with progress_console().status("calibrating camera poses from each half"):
+            first, second = (calibrate(rig, wand, half, exact) for half in split(messages))
             agreement = compare(placed(first), placed(second))
     except CalibrationError as error:
-        say(console, f"warning: the halves of the recording can't be compared: {error}")
+        say(f"warning: the halves of the recording can't be compared: {error}")
         return None
-    say(console, ("" if agreement.holds else "warning: ") + agreement.sentence())
+    say(("" if agreement.holds else "warning: ") + agreement.sentence())
     return agreement
 
 
-def _compare_with_rig(rig: Rig, result: WandCalibration, console: Console) -> Agreement | None:
+def _compare_with_rig(rig: Rig, result: WandCalibration) -> Agreement | None:
     known = Placed.of_rig(rig)
     if len([name for name in known.names if name in result.names]) < 2:
-        say(console, "the rig has no places with covariances to compare; the recording alone was judged")
+        say("the rig has no poses with covariances to compare; only the recording was judged")
         return None
     agreement = compare(known, placed(result))
-    advice = "" if agreement.holds else "; wave the wand again and run python -m calib wand"
-    say(
-        console,
-        ("" if agreement.holds else "warning: ") + agreement.sentence("the rig and the recording") + advice,
-    )
+    sentence = agreement.sentence("the rig and the recording")
+    advice = "wave the wand again and run python -m calib wand"
+    say(sentence if agreement.holds else f"warning: {sentence}; {advice}")
     return agreement
 
 
@@ -127,7 +121,8 @@ def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detect
 
 
 def placed(result: WandCalibration) -> Placed:
-    """The cameras of a calibration, for comparing."""
+    """The cameras of a calibration for `compare`: the covariance without the part that the lens priors cause, and that
+    part by camera."""
     adjusted = result.adjusted
     free, count = list(adjusted.problem.free), len(result.names)
     pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The running arena, as the subcommands reach it."""
+"""The options by which subcommands reach the running arena."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from zenoh import Session
 
-from calib.commands.output import say
-from calib.live.collect import publish
+from calib.live.collect import publish_rig
 from calib.rig.rig import Rig
 from camera_node.protocol.session import open_client
+from camera_node.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,18 +23,18 @@ class Connection:
     arena: str = "arena"
     """The arena's name in the keys."""
     zenoh: Path | None = None
-    """A Zenoh configuration of your own."""
+    """A Zenoh configuration file."""
 
     def open(self) -> Session:
-        """A session; it keeps trying to reach the server."""
+        """Open a session; it keeps trying to reach the server."""
         return open_client(self.connect, self.zenoh)
 
-    def hand_over(self, rig: Rig, file: Path, console: Console) -> None:
-        """Give the server the rig that was written to `file`, or say that nobody took it."""
+    def publish(self, rig: Rig, file: Path) -> None:
+        """Publish the rig that was written to `file`; print a warning if no server received it."""
         with self.open() as session:
-            taken = publish(session, self.arena, rig)
-        if not taken:
-            say(console, f"warning: nobody took the rig; give the server {file}")
+            received = publish_rig(session, self.arena, rig)
+        if not received:
+            say(f"warning: no server received the rig; give the server {file}")
 
 
 Server = Annotated[Connection, tyro.conf.arg(name="")]

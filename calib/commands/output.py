@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What all subcommands do with their result: write it, say where, and how it was made."""
+"""Writes the results of subcommands: rigs with their provenance, and images."""
 
 import os
 import shlex
@@ -8,47 +8,60 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from calib.intrinsics.residual_plot import draw_residuals, save_map
+from calib.intrinsics.residual_plot import draw_residuals
+from calib.rig.precision_plot import draw_precision
 from calib.rig.rig import Rig, save_rig
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.grade import RigQuality
-from camera_node import terminal
 from camera_node.errors import ConfigError
+from camera_node.terminal import say
 
 
 def check_folder(out: Path) -> None:
-    """Raise ConfigError, before any work is done, where `out` can't be written."""
+    """Raise ConfigError if `out` can't be written; called before any work is done."""
     if not out.parent.is_dir():
-        raise ConfigError(f"{out.parent} is no folder; --out can't be written there")
+        raise ConfigError(f"{out.parent} is not a folder; give --out a file in a folder that exists")
     if not os.access(out.parent, os.W_OK):
         raise ConfigError(f"{out.parent} can't be written to; give --out a file in another folder")
     if out.is_dir():
         raise ConfigError(f"{out} is a folder; give --out a file such as {out / 'rig.yaml'}")
 
 
-def write_rig(rig: Rig, out: Path, console: Console) -> None:
-    """Write the rig and say so."""
-    kept = save_rig(rig, out)
-    say(console, f"wrote {out}" + (f"; the one before is kept as {kept.name}" if kept else ""))
+def write_rig(rig: Rig, out: Path) -> None:
+    """Write the rig and print its path, and that of the backup."""
+    backup = save_rig(rig, out)
+    say(f"wrote {out}" + (f"; the previous rig is saved as {backup.name}" if backup else ""))
 
 
-def save_maps(folder: Path, result: WandCalibration, trust: RigQuality, console: Console) -> None:
-    """A picture of each camera's residuals, with where to wave next, and one of the expected errors."""
-    seen, adjusted = result.observations, result.adjusted
-    for k, camera in enumerate(trust.cameras):
-        mine, lens = adjusted.used & (seen.camera == k), result.rig.cameras[camera.name]
-        picture = draw_residuals(camera.name, lens, seen.uv[mine], adjusted.residuals[mine], camera.missing)
-        save_map(folder / f"{camera.name}.png", picture)
-    if trust.expected is not None:
-        save_map(folder / "expected.png", trust.expected.draw(result.rig.placed()))
-    say(console, f"wrote pictures of residuals and expected errors into {folder}")
+def save_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image as PNG.
+
+    Raises:
+        ConfigError: the folder can't be made or written to.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    except OSError as error:
+        raise ConfigError(f"{path} can't be written: {error.strerror}") from None
 
 
-def say(console: Console, text: str) -> None:
-    """One line as it stands."""
-    terminal.say(text, console)
+def save_maps(folder: Path, result: WandCalibration, quality: RigQuality) -> None:
+    """Write an image of each camera's residuals, with the area to wave in next, and one of the expected errors."""
+    observations, adjusted = result.observations, result.adjusted
+    for k, camera in enumerate(quality.cameras):
+        rows, lens = adjusted.used & (observations.camera == k), result.rig.cameras[camera.name]
+        image = draw_residuals(
+            camera.name, lens, observations.uv[rows], adjusted.residuals[rows], camera.missing
+        )
+        save_image(folder / f"{camera.name}.png", image)
+    if quality.expected is not None:
+        save_image(folder / "expected.png", draw_precision(quality.expected, result.rig.placed()))
+    say(f"wrote images of residuals and expected errors to {folder}")
 
 
 def provenance() -> dict[str, Any]:

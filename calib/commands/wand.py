@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib wand`: where cameras stand, by a wand waved before them."""
+"""`calib wand`: calibrates camera poses from a wand that is waved in front of the cameras."""
 
 import shlex
 from collections.abc import Sequence
@@ -7,18 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
 from rich.live import Live
 from zenoh import Session
 
-from calib.commands.choice import require_one
 from calib.commands.connection import Connection, Server
-from calib.commands.output import check_folder, provenance, save_maps, say, write_rig
-from calib.commands.recording import read_recording
-from calib.commands.report import print_report, show_progress
+from calib.commands.inputs import read_recording, require_one, require_positive
+from calib.commands.output import check_folder, provenance, save_maps, write_rig
+from calib.commands.report import print_recalibration, print_report, show_progress
 from calib.live.collect import CollectedFrames
-from calib.live.wand_session import MOST_S, wave
-from calib.rig.recording import save_wave, wave_beside
+from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
+from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
@@ -28,129 +26,145 @@ from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from camera_node.terminal import progress_console
+from camera_node.terminal import console, progress_console, say
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wand:
-    """Place the cameras by a wand that was waved before them."""
+    """Calibrate camera poses from a wand that is waved in front of the cameras."""
 
     wand: Path = Path("configs/wand.yaml")
     """The wand: diameter_m and markers, metres."""
     rig: Path
-    """Intrinsics of every camera; poses in it are not used, but with --only."""
+    """Intrinsics of every camera; its poses are used with --only."""
     out: Path
-    """Where the rig with poses is written; a rig that is there is kept as rig.1.yaml, ..."""
+    """The file for the rig with poses; a previous file is saved as rig.1.yaml, ..."""
     frames: Path | None = None
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
-    """Or take marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
     recording: Path | None = None
-    """Or take what --live kept, or python -m fusion record wrote (MCAP)."""
+    """Or read a recording (MCAP) of --live or of python -m fusion record."""
     live: bool = False
-    """Or subscribe to the running cameras, and hand them the result; the wave is kept beside --out (rig.wave.mcap)."""
+    """Or collect from the running cameras, publish the result to the server, and save the wand recording beside --out
+    (rig.wave.mcap)."""
     seconds: float | None = None
-    """Wave for so long; without it, until more waving would not help, for three minutes at the most."""
+    """Collect for this long; by default until more frames would not improve the result, at most three minutes."""
     only: str | None = None
-    """Place this camera alone, anew, by a short wave; the rig's others stay where they are."""
+    """Calibrate the pose of this camera only, from a short recording; the other cameras keep theirs."""
     distance: tuple[str, str, float] | None = None
     """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
     distance_sigma: float = SIGMA_M
     """Standard deviation of that distance, metres."""
     height: float = 0.1
-    """Metres above the floor at which robots carry their roundels: where errors are foretold."""
+    """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
     maps: Path | None = None
-    """A folder for pictures: each camera's residuals and where to wave next, and the errors to expect."""
+    """A folder for images: each camera's residuals and where to wave next, and the expected errors."""
     server: Server = field(default_factory=Connection)
 
-    def execute(self, console: Console) -> None:
-        """Nothing is written unless two cameras or more were placed."""
+    def execute(self) -> None:
+        """Calibrate and write the rig; nothing is written unless two cameras or more are placed."""
         check_folder(self.out)
         files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
         require_one({**files, "--recording MCAP": self.recording, "--live": self.live})
-        if self.seconds is not None and not self.seconds > 0:
-            raise ConfigError(f"--seconds is {self.seconds}; it must be above 0")
+        require_positive(self.seconds)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
-        distance = self._distance(rig)
+        distance = self._check_distance(rig)
         if self.live:
-            self._run_live(rig, wand, distance, console)
+            self._calibrate_live(rig, wand, distance)
         else:
-            messages = read_recording(rig, self.frames, self.observations, wand, self.recording)
-            self._place(rig, wand, messages, distance, console)
+            messages = read_recording(rig, self.frames, self.observations, self.recording, wand)
+            self._calibrate(rig, wand, messages, distance)
 
-    def _distance(self, rig: Rig) -> Distance | None:
+    def _check_distance(self, rig: Rig) -> Distance | None:
         if self.distance is not None and self.only is not None:
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"
             )
         return Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
 
-    def _place(
-        self,
-        rig: Rig,
-        wand: Body,
-        messages: Sequence[Detections],
-        distance: Distance | None,
-        console: Console,
+    def _calibrate(
+        self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> Rig:
-        if self.only is not None:
-            return self._place_one(rig, wand, messages, self.only, console)
-        with console.status("placing cameras"):
-            result = calibrate(rig, wand, messages, distance)
-        trust = assess(result, wand, self.height)
-        print_report(result, trust, console)
-        if self.maps is not None:
-            save_maps(self.maps, result, trust, console)
-        told = {**provenance(), **trust.as_dict(), **result.as_dict(), **_of_lenses(rig)}
-        placed = msgspec.structs.replace(result.rig, calibration=told)
-        write_rig(placed, self.out, console)
-        return placed
-
-    def _place_one(
-        self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str, console: Console
-    ) -> Rig:
-        with console.status(f"placing {name}"):
-            result = place_one(rig, wand, messages, name)
-        moved = (
-            ""
-            if result.moved_mm is None
-            else f"moved {result.moved_mm:.1f} mm, {result.turned_deg:.2f} degrees; "
+        placed = (
+            self._calibrate_all(rig, wand, messages, distance)
+            if self.only is None
+            else self._calibrate_one(rig, wand, messages, self.only)
         )
-        known = f"its place is known to {result.sigma_mm:.1f} mm, residuals {result.residual_px:.2f} px"
-        say(console, f"{name}: {moved}{known}")
-        told = result.rig.calibration | {"only": {"camera": name, **provenance()}}
-        placed = msgspec.structs.replace(result.rig, calibration=told)
-        write_rig(placed, self.out, console)
+        write_rig(placed, self.out)
         return placed
 
-    def _run_live(self, rig: Rig, wand: Body, distance: Distance | None, console: Console) -> None:
-        with self.server.open() as session:
-            heard, why = self._wave(session, rig, wand, distance, console)
-        say(console, f"the wave ended: {why}")
-        if heard.bad:
-            say(console, f"warning: {heard.bad} messages were none and were skipped")
-        kept = self._keep(heard.messages, console)
-        try:
-            placed = self._place(rig, wand, heard.messages, distance, console)
-        except BaseException:
-            if kept is not None:
-                say(console, f"the wave is kept; to try it again: {self._again(kept)}")
-            raise
-        self.server.hand_over(placed, self.out, console)
+    def _calibrate_all(
+        self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
+    ) -> Rig:
+        with progress_console().status("calibrating camera poses"):
+            result = calibrate(rig, wand, messages, distance)
+        quality = assess(result, wand, self.height)
+        print_report(result, quality)
+        if self.maps is not None:
+            save_maps(self.maps, result, quality)
+        figures = {**provenance(), **quality.as_dict(), **result.as_dict()}
+        if "lenses" in rig.calibration:
+            figures["lenses"] = rig.calibration["lenses"]
+        return msgspec.structs.replace(result.rig, calibration=figures)
 
-    def _keep(self, messages: Sequence[Detections], console: Console) -> Path | None:
-        """Write the wave before it is solved, so that nothing that goes wrong there can lose it."""
-        path = wave_beside(self.out)
+    def _calibrate_one(self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Rig:
+        with progress_console().status(f"calibrating the pose of {name}"):
+            result = place_one(rig, wand, messages, name)
+        print_recalibration(result)
+        figures = result.rig.calibration | {"only": {"camera": name, **provenance()}}
+        return msgspec.structs.replace(result.rig, calibration=figures)
+
+    def _calibrate_live(self, rig: Rig, wand: Body, distance: Distance | None) -> None:
+        with self.server.open() as session:
+            collected, reason = self._collect(session, rig, wand, distance)
+        say(f"the wand session ended: {reason}")
+        if collected.invalid:
+            say(f"warning: {collected.invalid} invalid messages were skipped")
+        recording = self._save(collected.messages)
         try:
-            before = save_wave(path, self.server.arena, messages)
+            placed = self._calibrate(rig, wand, collected.messages, distance)
+        except BaseException:
+            if recording is not None:
+                say(f"the wand recording is saved; to calibrate from it again: {self._command(recording)}")
+            raise
+        self.server.publish(placed, self.out)
+
+    def _collect(
+        self, session: Session, rig: Rig, wand: Body, distance: Distance | None
+    ) -> tuple[CollectedFrames, str]:
+        # With a fixed duration and no terminal, trials would only take processor time from the cameras.
+        trials = self.seconds is None or console().is_terminal
+        settings = WandSession(
+            rig=rig,
+            wand=wand,
+            distance=distance,
+            seconds=self.seconds or MAX_SECONDS,
+            trials=trials,
+            stops_itself=trials and self.seconds is None,
+        )
+        with Live(console=progress_console(), transient=True) as live:
+            return run_wand_session(
+                session,
+                self.server.arena,
+                settings,
+                lambda progress: live.update(show_progress(progress)),
+            )
+
+    def _save(self, messages: Sequence[Detections]) -> Path | None:
+        """Save the recording before the calibration, so that no failure there can lose it."""
+        path = wand_recording_path(self.out)
+        try:
+            backup = save_wand_recording(path, self.server.arena, messages)
         except ConfigError as error:
-            say(console, f"warning: the wave is not kept: {error}")
+            say(f"warning: the wand recording is not saved: {error}")
             return None
-        say(console, f"the wave is kept as {path}" + (f"; the one before as {before.name}" if before else ""))
+        previous = f"; the previous one is saved as {backup.name}" if backup else ""
+        say(f"saved the wand recording as {path}{previous}")
         return path
 
-    def _again(self, recording: Path) -> str:
-        """The command that solves a kept wave with the options of this one."""
+    def _command(self, recording: Path) -> str:
+        """The command that calibrates from a saved recording with the options of this one."""
         options = {"recording": recording, "wand": self.wand, "rig": self.rig, "out": self.out}
         options |= {"only": self.only, "height": self.height, "maps": self.maps}
         words = [
@@ -159,26 +173,3 @@ class Wand:
         if self.distance is not None:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
         return shlex.join(["python", "-m", "calib", "wand", *map(str, words)])
-
-    def _wave(
-        self, session: Session, rig: Rig, wand: Body, distance: Distance | None, console: Console
-    ) -> tuple[CollectedFrames, str]:
-        # Where the time is given and nobody looks, trial solutions would only take time from the cameras.
-        trials = self.seconds is None or console.is_terminal
-        with Live(console=progress_console(), transient=True) as live:
-            return wave(
-                session,
-                self.server.arena,
-                rig,
-                wand,
-                self.seconds or MOST_S,
-                lambda told: live.update(show_progress(told)),
-                by_itself=trials and self.seconds is None,
-                trials=trials,
-                distance=distance,
-            )
-
-
-def _of_lenses(rig: Rig) -> dict:
-    """What the lenses' own calibration said stays true."""
-    return {key: value for key, value in rig.calibration.items() if key == "lenses"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A flat board of known size, as `charuco:5x4:0.054` or `chessboard:9x6:0.025` names it on the command line."""
+"""Finds calibration boards, which the command line names `charuco:5x4:0.054` or `chessboard:9x6:0.025`."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -8,37 +8,40 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.arrays import Grey
 from camera_node.errors import ConfigError
 
-Found = tuple[NDArray[np.float32], NDArray[np.float32]]
+Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
 
-MIN_CORNERS = 6  # of a board that may be seen in part
+MIN_CORNERS = 6  # of a board that is partly visible
+CHARUCO_PARTS, CHESSBOARD_PARTS = 4, 2  # of the text after the kind of board, at most
+MARKER_RATIO, DICTIONARY = 0.75, "DICT_4X4_1000"  # unless given
 FORM = (
     "charuco:COLSxROWS:SQUARE_M[:MARKER_RATIO[:DICTIONARY]] in squares, such as charuco:5x4:0.054:0.75:DICT_4X4_50, "
     "or chessboard:COLSxROWS:SQUARE_M in inner corners, such as chessboard:9x6:0.025"
 )
 
 
-class Finder(Protocol):
+class BoardFinder(Protocol):
     """Finds the corners of one board in images."""
 
-    def find(self, image: NDArray[np.uint8]) -> Found | None:
-        """Pixels (n, 2) and board points (n, 3), metres, in a grey image (h, w); None where there are too few."""
+    def find(self, image: Grey) -> Corners | None:
+        """Pixels (n, 2) and board points (n, 3), metres, in an image (h, w); None if there are too few."""
         ...
 
 
-def make_finder(text: str) -> Finder:
-    """A finder of the board that `text` names.
+def make_finder(text: str) -> BoardFinder:
+    """The finder of the board that `text` names.
 
     Raises:
         ConfigError: the text has another form, an unknown dictionary or impossible sizes.
     """
     if text.split(":")[0] == "chessboard":
-        return ChessboardFinder(*_parse(text, text.split(":")[1:], at_least=3, parts=2))
-    return BoardFinder(make_board(text))
+        return ChessboardFinder(*_parse_size(text, text.split(":")[1:], CHESSBOARD_PARTS))
+    return CharucoFinder(make_charuco_board(text))
 
 
-def make_board(text: str) -> Any:
+def make_charuco_board(text: str) -> Any:
     """The cv2.aruco.CharucoBoard that `text` names; marker ratio 0.75 and DICT_4X4_1000 unless given.
 
     Raises:
@@ -46,37 +49,37 @@ def make_board(text: str) -> Any:
     """
     kind, *parts = text.split(":")
     if kind != "charuco":
-        raise ConfigError(f"--board {text} is no board; write {FORM}")
-    columns, rows, square = _parse(text, parts, at_least=3, parts=4)
+        raise ConfigError(f"--board {text} is not a board; write {FORM}")
+    columns, rows, square = _parse_size(text, parts, CHARUCO_PARTS)
     try:
-        ratio = float(parts[2]) if len(parts) > 2 and parts[2] else 0.75
+        ratio = float(parts[2]) if len(parts) > 2 and parts[2] else MARKER_RATIO
     except ValueError:
         ratio = 0.0
     if not 0.1 < ratio < 1:
-        raise ConfigError(f"--board {text} is no board; write {FORM}")
-    name = parts[3] if len(parts) > 3 else "DICT_4X4_1000"
+        raise ConfigError(f"--board {text} is not a board; write {FORM}")
+    name = parts[3] if len(parts) > 3 else DICTIONARY
     if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
         raise ConfigError(f"--board {text}: OpenCV has no dictionary {name}; write {FORM}")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     return cv2.aruco.CharucoBoard((columns, rows), square, ratio * square, dictionary)
 
 
-def _parse(text: str, given: list[str], at_least: int, parts: int) -> tuple[int, int, float]:
-    """Columns, rows and the square's side, metres, which two kinds of board have in common."""
+def _parse_size(text: str, parts: list[str], max_parts: int) -> tuple[int, int, float]:
+    """Columns, rows and the side of a square, metres, which come first for both kinds of board."""
     try:
-        if not 2 <= len(given) <= parts:
+        if not 2 <= len(parts) <= max_parts:
             raise ValueError
-        columns, rows = (int(n) for n in given[0].lower().split("x"))
-        square = float(given[1])
-        if not (at_least <= columns <= 100 and at_least <= rows <= 100 and 0.001 < square < 10):
+        columns, rows = (int(n) for n in parts[0].lower().split("x"))
+        square = float(parts[1])
+        if not (3 <= columns <= 100 and 3 <= rows <= 100 and 0.001 < square < 10):
             raise ValueError
     except ValueError:
-        raise ConfigError(f"--board {text} is no board; write {FORM}") from None
+        raise ConfigError(f"--board {text} is not a board; write {FORM}") from None
     return columns, rows, square
 
 
-class BoardFinder:
-    """Finds a ChArUco board's inner corners in grey images, printed normally or inverted."""
+class CharucoFinder:
+    """Finds the inner corners of a ChArUco board, printed normally or inverted."""
 
     def __init__(self, board: Any) -> None:
         self.corners = np.asarray(board.getChessboardCorners(), np.float32)
@@ -84,20 +87,19 @@ class BoardFinder:
         parameters.detectInvertedMarker = True
         self._detector = cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
 
-    def find(self, image: NDArray[np.uint8]) -> Found | None:
-        """Pixels (n, 2) and board points (n, 3), metres, of six or more corners; None where fewer are in sight."""
-        for picture in (image, cv2.bitwise_not(image)):
-            pixels, numbers = self._detector.detectBoard(picture)[:2]
+    def find(self, image: Grey) -> Corners | None:
+        """Pixels (n, 2) and board points (n, 3), metres, of six or more corners; None if fewer are visible."""
+        for candidate in (image, cv2.bitwise_not(image)):
+            pixels, numbers = self._detector.detectBoard(candidate)[:2]
             if numbers is not None and len(numbers) >= MIN_CORNERS:
-                return np.asarray(pixels, np.float32).reshape(-1, 2), self.corners[
-                    np.ravel(numbers).astype(np.intp)
-                ]
+                points = self.corners[np.ravel(numbers).astype(np.intp)]
+                return np.asarray(pixels, np.float32).reshape(-1, 2), points
         return None
 
 
 @dataclass(frozen=True)
 class ChessboardFinder:
-    """Finds a plain chessboard, all of whose `columns` x `rows` inner corners must be in sight."""
+    """Finds a plain chessboard, of which all `columns` x `rows` inner corners must be visible."""
 
     columns: int
     rows: int
@@ -109,8 +111,8 @@ class ChessboardFinder:
         y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float32) * self.square_m
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float32)
 
-    def find(self, image: NDArray[np.uint8]) -> Found | None:
-        """Pixels (n, 2) and board points (n, 3), metres, of all corners; None where they are not all in sight."""
+    def find(self, image: Grey) -> Corners | None:
+        """Pixels (n, 2) and board points (n, 3), metres, of all corners; None unless all are visible."""
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
         found, pixels = cv2.findChessboardCornersSB(image, (self.columns, self.rows), flags=flags)
         return (np.asarray(pixels, np.float32).reshape(-1, 2), self.corners) if found else None

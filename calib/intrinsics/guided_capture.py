@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A board shown to a running camera: which pictures are worth keeping, what is still missing, and when it is enough."""
+"""Captures views of a board from a running camera: selects distinct views, gives advice, and ends when they suffice."""
 
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -10,93 +10,101 @@ from rich.text import Text
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import BoardView
-from calib.intrinsics.calibrate import MIN_VIEWS, BoardViews, CalibratedLens, Model
+from calib.intrinsics.calibrate import MIN_VIEWS, BoardViews, Model
+from calib.intrinsics.calibrated_lens import CalibratedLens
+from calib.intrinsics.images import NamedImage
 from calib.rig.coverage import Coverage, enumerate_words
-from camera_node.arrays import Grey
+from camera_node.arrays import Array
 
-NEW = 0.04  # of the image's width, that a view must differ from every one before
-EVERY = 5  # views, between two trial calibrations
+MIN_CHANGE = 0.04  # of the image's width, by which a view must differ from each earlier one
+TRIAL_EVERY = 5  # views
 ENOUGH_VIEWS = 20
 ENOUGH_COVERED = 0.8  # of the image's cells
-ENOUGH_KNOWN_PX = (
-    0.3  # in the median of the image: below, another view changes less than corners are found to
-)
+ENOUGH_SIGMA_PX = 0.3  # median over the image: below, another view changes less than the noise of corners
+SHADES, CORNERS_PER_SHADE = " ░▒▓█", 8  # of a cell, by the logarithm of its number of corners
 
 
-def show_board(
+def capture_views(
     views: BoardViews,
-    pictures: Iterable[tuple[str, Grey]],
+    images: Iterable[NamedImage],
     model: Model,
-    tell: Callable[[Group], None] = lambda panel: None,
+    show: Callable[[Group], None] = lambda panel: None,
 ) -> str:
-    """Fill `views` from a running camera's pictures until they are enough, or the pictures end.
+    """Add distinct views from a running camera's images to `views`, until they suffice or the images end.
 
-    Enough are 20 views that cover 80 % of the image and fix the lens to 0.3 px in its median.
+    20 views suffice if they cover 80 % of the image and fix the lens to 0.3 px in the median of the image.
 
     Returns:
-        why it ended.
+        the reason for the end, and the figures of the lens.
     """
-    said = f"{MIN_VIEWS} views are needed"
-    told = False
-    for name, image in pictures:
-        added = views.add(name, image, partial(is_new, others=views.views, width=image.shape[1]))
-        if added and len(views.views) >= MIN_VIEWS and len(views.views) % EVERY == 0:
-            lens, said = _try(views, model)
-            told = lens is not None and _enough(lens)
-        tell(panel(views, said, added))
-        if told:
-            return "that is enough: " + said
-    return "the time is over: " + said
+    figures = f"{MIN_VIEWS} views are needed"
+    sufficient = False
+    for name, image in images:
+        added = views.add(name, image, partial(is_distinct, others=views.views, width=image.shape[1]))
+        if added and len(views.views) >= MIN_VIEWS and len(views.views) % TRIAL_EVERY == 0:
+            lens, figures = _try_solve(views, model)
+            sufficient = lens is not None and is_sufficient(lens)
+        show(make_panel(views, figures, added))
+        if sufficient:
+            return f"there are enough views: {figures}"
+    return f"the time has passed: {figures}"
 
 
-def is_new(view: BoardView, others: list[BoardView], width: int) -> bool:
-    """Whether a view's place, size or tilt differs from those of all others."""
-    mine = _shape(view)
-    return all(np.abs(mine - _shape(other)).max() > NEW * width for other in others)
+def is_distinct(view: BoardView, others: list[BoardView], width: int) -> bool:
+    """Whether the position, size or tilt of a view differs from those of all others."""
+    corners = _board_outline(view)
+    return all(np.abs(corners - _board_outline(other)).max() > MIN_CHANGE * width for other in others)
 
 
-def _shape(view: BoardView) -> np.ndarray:
-    """Where the view's board would reach: the affine image of the board's own axes, pixels."""
+def _board_outline(view: BoardView) -> Array:
+    """(6,) the affine image of the board: its axes, scaled to the extent of the visible corners, and its centre."""
     board = np.column_stack([view.corners[:, :2], np.ones(len(view.corners))])
     extent = np.ptp(view.corners[:, :2], axis=0).max()
     M = np.linalg.lstsq(board, view.pixels)[0]
     return np.concatenate([M[:2].ravel() * extent, view.pixels.mean(axis=0)])
 
 
-def _try(views: BoardViews, model: Model) -> tuple[CalibratedLens | None, str]:
+def _try_solve(views: BoardViews, model: Model) -> tuple[CalibratedLens | None, str]:
     try:
         lens = views.solve(model)
     except CalibrationError as error:
         return None, str(error).split(": ", 1)[-1]
-    typical = float(np.nanmedian(lens.unknown_px))
-    return lens, f"residual {lens.rms_px:.2f} px, lens known to {typical:.2f} px"
+    sigma_px = float(np.nanmedian(lens.sigma_px))
+    return lens, f"residual {lens.rms_px:.2f} px, projection uncertainty {sigma_px:.2f} px"
 
 
-def _enough(lens: CalibratedLens) -> bool:
-    known = float(np.nanmedian(lens.unknown_px)) <= ENOUGH_KNOWN_PX
-    return known and len(lens.views) >= ENOUGH_VIEWS and lens.coverage.share() >= ENOUGH_COVERED
+def is_sufficient(lens: CalibratedLens) -> bool:
+    """Whether more views would not improve a lens."""
+    precise = float(np.nanmedian(lens.sigma_px)) <= ENOUGH_SIGMA_PX
+    return precise and len(lens.views) >= ENOUGH_VIEWS and lens.coverage.share() >= ENOUGH_COVERED
 
 
-def panel(views: BoardViews, said: str, added: bool) -> Group:
-    """What a person sees: the image's cells as they fill, and what to do next."""
+def make_panel(views: BoardViews, figures: str, added: bool) -> Group:
+    """The state of a capture for the terminal: the covered cells of the image, and what to do next."""
     coverage = views.coverage()
     head = (
-        f"{views.camera}: {len(views.views)} views of {views.frames} pictures, {coverage.share():.0%} covered"
+        f"{views.camera}: {len(views.views)} views of {views.frames} images, {coverage.share():.0%} covered"
     )
     missing = coverage.missing()
-    todo = f"show the board in the {enumerate_words(missing[:3])}" if missing else "tilt it to all sides"
+    advice = (
+        f"show the board in the {enumerate_words(missing[:3])}"
+        if missing
+        else "tilt the board in all directions"
+    )
     return Group(
-        Text(head, "bold green" if added else "bold"), cells(coverage), Text(said), Text(todo, "yellow")
+        Text(head, "bold green" if added else "bold"),
+        _draw_cells(coverage),
+        Text(figures),
+        Text(advice, "yellow"),
     )
 
 
-def cells(coverage: Coverage) -> Text:
-    """The image's cells as blocks: the fuller, the darker."""
+def _draw_cells(coverage: Coverage) -> Text:
+    """The cells of the image as blocks, darker with more corners."""
     text = Text()
     for row in coverage.counts:
         for count in row:
-            text.append(
-                " ░▒▓█"[min(int(np.ceil(np.log2(count / 8 + 1))), 4) if count else 0] * 2 or "  ", "cyan"
-            )
+            shade = int(np.ceil(np.log2(count / CORNERS_PER_SHADE + 1)))
+            text.append(SHADES[min(shade, len(SHADES) - 1)] * 2, "cyan")
         text.append("\n")
     return text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures of a board: out of folders and videos, or from a running camera, each with a name to call it by."""
+"""Reads named images of a board from folders, videos and running cameras."""
 
 import time
 from collections.abc import Iterator
@@ -16,20 +16,20 @@ from camera_node.sources.grey import to_grey
 from camera_node.sources.replay import IMAGES, read_grey
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
-MAX_FRAMES = 600  # of a video that are looked at, evenly spread: a lens needs 60 good ones
-REPLY_S = 2.0  # for a camera to answer with a picture
-PATIENCE_S = 5.0  # without any answer: then the camera is not there
-PAUSE_S = 0.1  # between two questions that nobody answers
-QUALITY = 95  # of the JPEG that is asked for: artefacts move corners
+MAX_FRAMES = 600  # read from a video, evenly spaced: a lens needs 60 good ones
+REPLY_S = 2.0  # for a camera to answer a request
+SILENT_S = 5.0  # without any answer: the camera counts as missing
+RETRY_S = 0.1  # between two requests without an answer
+JPEG_QUALITY = 95  # that is requested: artefacts move corners
 
-Picture = tuple[str, Grey]
+NamedImage = tuple[str, Grey]
 
 
 def find_cameras(path: Path, camera: str | None) -> dict[str, Path]:
-    """Where each camera's frames are: `<path>/<camera>/`, a folder of images, or videos named like cameras.
+    """Find each camera's frames: `<path>/<camera>/`, a folder of images, or videos named like cameras.
 
     Raises:
-        CameraError: nothing is there, or the camera of the frames has no name.
+        CameraError: there are no frames.
     """
     if path.is_file():
         return {camera or path.stem: path}
@@ -49,11 +49,11 @@ def find_cameras(path: Path, camera: str | None) -> dict[str, Path]:
     return found
 
 
-def read_frames(path: Path) -> Iterator[Picture]:
-    """Names and grey images of a folder, or of a video's frames.
+def read_frames(path: Path) -> Iterator[NamedImage]:
+    """Yield names and grey images of a folder, or of a video.
 
     Raises:
-        CameraError: the folder holds no images, a file is no image, or the file is no video.
+        CameraError: the folder holds no images, or a file can't be read.
     """
     if not path.is_dir():
         yield from _read_video(path)
@@ -64,10 +64,10 @@ def read_frames(path: Path) -> Iterator[Picture]:
     yield from ((file.name, read_grey(file)) for file in files)
 
 
-def _read_video(path: Path) -> Iterator[Picture]:
+def _read_video(path: Path) -> Iterator[NamedImage]:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise CameraError(f"{path} is no video that OpenCV reads")
+        raise CameraError(f"{path} is not a video that OpenCV can read")
     stride = max(1, round(video.get(cv2.CAP_PROP_FRAME_COUNT) / MAX_FRAMES))
     try:
         number = 0
@@ -80,40 +80,40 @@ def _read_video(path: Path) -> Iterator[Picture]:
 
 
 def take_snapshots(
-    session: zenoh.Session, arena: str, camera: str, seconds: float, patience_s: float = PATIENCE_S
-) -> Iterator[Picture]:
-    """Pictures of a running camera, one after the other, for a while.
+    session: zenoh.Session, arena: str, camera: str, seconds: float, silent_s: float = SILENT_S
+) -> Iterator[NamedImage]:
+    """Request images from a running camera, one after the other, for a number of seconds.
 
     Raises:
-        CameraError: the camera does not answer for `patience_s`, or at all, or answers with what is no picture.
+        CameraError: the camera does not answer for `silent_s`, or never, or its answer is not an image.
     """
-    key = f"{Keys(arena).snapshot(camera)}?quality={QUALITY}"
-    begun = heard = time.monotonic()
+    key = f"{Keys(arena).snapshot(camera)}?quality={JPEG_QUALITY}"
+    start = answered = time.monotonic()
     number = 0
-    while (now := time.monotonic()) - begun < seconds:
-        image = _ask(session, key, camera)
+    while (now := time.monotonic()) - start < seconds:
+        image = _request(session, key, camera)
         if image is not None:
-            heard = now
+            answered = now
             yield f"snapshot {number}", image
             number += 1
-        elif now - heard > patience_s:
+        elif now - answered > silent_s:
             break
         else:
-            time.sleep(PAUSE_S)
-    if number == 0 or now - heard > patience_s:
+            time.sleep(RETRY_S)
+    if number == 0 or now - answered > silent_s:
         raise CameraError(
-            f"camera '{camera}' sends no pictures on {Keys(arena).snapshot(camera)}; do the server and the "
-            "camera run, and are --camera, --connect and --arena right?"
+            f"camera '{camera}' sends no images on {Keys(arena).snapshot(camera)}; check that the server and the "
+            "camera run, and check --camera, --connect and --arena"
         )
 
 
-def _ask(session: zenoh.Session, key: str, camera: str) -> Grey | None:
-    """One picture; None where nobody answers in time."""
+def _request(session: zenoh.Session, key: str, camera: str) -> Grey | None:
+    """One image; None if there is no answer in time."""
     for reply in session.get(key, timeout=REPLY_S):
         if reply.ok is None:
-            continue  # it timed out, or the camera has no picture yet
+            continue  # a timeout, or the camera has no image yet
         image = cv2.imdecode(np.frombuffer(reply.ok.payload.to_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise CameraError(f"camera '{camera}' answered with bytes that are no picture")
+            raise CameraError(f"camera '{camera}' answered with bytes that are not an image")
         return np.ascontiguousarray(image, np.uint8)
     return None

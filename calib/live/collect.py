@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Live cameras: collect what they see, put the rig."""
+"""Collects detections from running cameras, and publishes the rig."""
 
 import queue
 import threading
@@ -19,120 +19,129 @@ from calib.rig.rig import Rig
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 from camera_node.terminal import progress_console
 
-DELIVERY_S = 2.0  # for the rig to reach whoever listens
-LOOK_EVERY_S = 0.2
-SILENT_S = 2.0  # without a frame: a camera that is lost
+DELIVERY_S = 2.0  # for a subscriber of the rig to be discovered
+INSPECT_EVERY_S = 0.2
+SILENT_S = 2.0  # without a frame: the camera counts as silent
 
 
 @dataclass(slots=True)
 class CollectedFrames:
-    """What came so far: messages; by camera the frames with roundels and where in its image they were, and when
-    it was heard last, seconds; and how many messages were none."""
+    """Detections collected from running cameras.
+
+    Attributes:
+        messages: all detections, in the order of arrival.
+        frames: number of frames with roundels, by camera.
+        coverage: where in the image roundels were detected, by camera.
+        last_seen_s: time of the last message, by camera.
+        invalid: number of messages that could not be decoded.
+    """
 
     messages: list[Detections] = field(default_factory=list)
     frames: Counter[str] = field(default_factory=Counter)
     coverage: dict[str, Coverage] = field(default_factory=dict)
-    latest: dict[str, float] = field(default_factory=dict)
-    bad: int = 0
+    last_seen_s: dict[str, float] = field(default_factory=dict)
+    invalid: int = 0
 
-    def silent(self, now: float) -> list[str]:
-        """Cameras that sent messages and stopped: a camera sends one every frame, with roundels or without."""
-        return sorted(name for name, last in self.latest.items() if now - last > SILENT_S)
+    def silent_cameras(self, now_s: float) -> list[str]:
+        """Cameras that stopped sending: a running camera sends a message every frame, even without roundels."""
+        return sorted(name for name, last in self.last_seen_s.items() if now_s - last > SILENT_S)
 
-    def take(self, data: bytes, now: float) -> None:
-        """Count and keep a message, or count what is none."""
+    def add(self, data: bytes, now_s: float) -> None:
+        """Decode and append a message, or count it as invalid."""
         try:
             message = decode(data, Detections)
         except MessageError:
-            self.bad += 1
+            self.invalid += 1
             return
         self.messages.append(message)
-        self.latest[message.camera] = now
+        self.last_seen_s[message.camera] = now_s
         if not len(message):
             return
         self.frames[message.camera] += 1
-        seen = Coverage.of(message.unpack().uv, message.width, message.height)
+        new = Coverage.of(message.unpack().uv, message.width, message.height)
         before = self.coverage.get(message.camera)
-        self.coverage[message.camera] = before + seen if before else seen
+        self.coverage[message.camera] = before + new if before else new
 
 
-def listen(
-    session: zenoh.Session, arena: str, seconds: float, look: Callable[[CollectedFrames, float], str]
+def collect_frames(
+    session: zenoh.Session, arena: str, seconds: float, inspect: Callable[[CollectedFrames, float], str]
 ) -> tuple[CollectedFrames, str]:
-    """Hear all cameras of an arena for a while.
+    """Collect the detections of all cameras of an arena.
 
     Args:
         session, arena: where cameras publish.
-        seconds: how long at the most; Ctrl-C ends it before, and keeps what came.
-        look: called a few times a second, from this thread, with what came and the seconds that passed; ends it by
-            the reason that it returns, and goes on where that is empty.
+        seconds: the longest duration; Ctrl-C ends it earlier and keeps the frames.
+        inspect: called from this thread a few times a second, with the frames so far and the elapsed seconds; a text
+            that it returns ends the collection and is the reason.
 
     Returns:
-        what came, and why it ended.
+        the frames, and the reason for the end.
 
     Raises:
-        CalibrationError: nothing came.
+        CalibrationError: no message arrived.
     """
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     key = Keys(arena).detections()
     subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
     try:
-        heard, why = _follow(arrived, seconds, look)
+        collected, reason = _receive(arrived, seconds, inspect)
     finally:
         subscriber.undeclare()
-    if not heard.messages:
+    if not collected.messages:
         raise CalibrationError(
-            f"no detections on {key} in {seconds:g} s ({heard.bad} bad messages); are the server and the cameras "
-            "running, and --connect and --arena right?"
+            f"no detections on {key} in {seconds:g} s ({collected.invalid} invalid messages); check that the server "
+            "and the cameras run, and check --connect and --arena"
         )
-    return heard, why
+    return collected, reason
 
 
-def _follow(
-    arrived: queue.SimpleQueue[bytes], seconds: float, look: Callable[[CollectedFrames, float], str]
+def _receive(
+    arrived: queue.SimpleQueue[bytes], seconds: float, inspect: Callable[[CollectedFrames, float], str]
 ) -> tuple[CollectedFrames, str]:
-    heard, begun, looked = CollectedFrames(), time.monotonic(), 0.0
+    collected, start, inspected = CollectedFrames(), time.monotonic(), 0.0
     try:
-        while (passed := time.monotonic() - begun) < seconds:
+        while (elapsed := time.monotonic() - start) < seconds:
             with suppress(queue.Empty):
-                heard.take(arrived.get(timeout=min(seconds - passed, LOOK_EVERY_S)), passed)
-            if passed - looked < LOOK_EVERY_S:
+                collected.add(arrived.get(timeout=min(seconds - elapsed, INSPECT_EVERY_S)), elapsed)
+            if elapsed - inspected < INSPECT_EVERY_S:
                 continue
-            looked = passed
-            if why := look(heard, passed):
-                return heard, why
+            inspected = elapsed
+            if reason := inspect(collected, elapsed):
+                return collected, reason
     except KeyboardInterrupt:
-        return heard, "Ctrl-C; what was seen until then counts"
-    return heard, f"{seconds:g} s are over"
+        return collected, "Ctrl-C; the frames collected so far are used"
+    return collected, f"{seconds:g} s have passed"
 
 
-def collect(session: zenoh.Session, arena: str, seconds: float, doing: str) -> CollectedFrames:
-    """What all cameras of an arena see for a while, with a line of progress.
+def collect_with_progress(
+    session: zenoh.Session, arena: str, seconds: float, description: str
+) -> CollectedFrames:
+    """Collect the detections of all cameras of an arena, with a progress bar.
 
     Raises:
-        CalibrationError: nothing came.
+        CalibrationError: no message arrived.
     """
-    columns = (TextColumn(doing), BarColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(description), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, transient=True, console=progress_console()) as progress:
         task = progress.add_task("waiting for cameras", total=seconds)
 
-        def show(heard: CollectedFrames, passed: float) -> str:
-            told = ", ".join(f"{name} {n}" for name, n in sorted(heard.frames.items()))
-            progress.update(task, completed=passed, description=told or "waiting for cameras")
+        def show(collected: CollectedFrames, elapsed: float) -> str:
+            counts = ", ".join(f"{name} {n}" for name, n in sorted(collected.frames.items()))
+            progress.update(task, completed=elapsed, description=counts or "waiting for cameras")
             return ""
 
-        return listen(session, arena, seconds, show)[0]
+        return collect_frames(session, arena, seconds, show)[0]
 
 
-def publish(session: zenoh.Session, arena: str, rig: Rig) -> bool:
-    """Put the rig on its key; whether a subscriber was there to take it within two seconds."""
+def publish_rig(session: zenoh.Session, arena: str, rig: Rig) -> bool:
+    """Publish the rig on its key; returns whether a subscriber was there within two seconds."""
     publisher = session.declare_publisher(Keys(arena).rig, reliability=zenoh.Reliability.RELIABLE)
     listening = threading.Event()
     listener = publisher.declare_matching_listener(
         lambda status: listening.set() if status.matching else listening.clear()
     )
-    taken = publisher.matching_status or listening.wait(DELIVERY_S)
+    received = publisher.matching_status or listening.wait(DELIVERY_S)
     publisher.put(encode(RigMessage.of(rig)))
     listener.undeclare()
     publisher.undeclare()
-    return taken
+    return received

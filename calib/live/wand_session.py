@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A wand waved before running cameras: how far it is, and when more waving would not help.
+"""Runs a wand session: collects frames from running cameras until the calibration is precise enough.
 
-The rule by which it stops. Every few seconds a part of what was seen is solved, in a process of its own because GTSAM
-holds the GIL. Covariances shrink with the number of frames, so what all frames would give follows. It is enough when
+Every few seconds, a trial calibration is computed from part of the frames, in a process of its own because GTSAM holds
+the GIL. Covariances are inversely proportional to the number of frames, which predicts the result of all frames. The
+session ends when
 
-- every camera that delivers is placed,
+- every camera that sends frames is placed,
 - no camera's own covariance adds more than 5 % to the error of a roundel's pixel, and
-- half of what each camera shares with others was waved through, or nothing was added to that for 15 s.
+- the wand was seen in half of the image area that each camera shares with others, or in no new area for 15 s.
 """
 
 import os
@@ -21,7 +22,7 @@ from multiprocessing.pool import AsyncResult
 import zenoh
 
 from calib.errors import CalibrationError
-from calib.live.collect import CollectedFrames, listen
+from calib.live.collect import CollectedFrames, collect_frames
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
@@ -29,32 +30,56 @@ from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
-MOST_S = 180.0  # that a wave may last when it ends by itself
-TRIAL_EVERY_S = 4.0  # of new frames, at the least, between two trial solutions
-TRIAL_FRAMES = 150  # of each camera: a solution of a second or less
-BLOCK_S = 0.5  # frames that are taken or left together, so that the motion between them is known
-ADDS = 0.05  # to the error of a pixel, that a camera's covariance may add
-USED = 0.5  # of what a camera shares with others
-IDLE_S = 15.0  # without anything added to that
+MAX_SECONDS = 180.0  # of a session that ends by itself
+TRIAL_EVERY_S = 4.0  # the shortest time between two trials
+TRIAL_FRAMES = 150  # per camera: a trial takes a second or less
+BLOCK_S = 0.5  # frames are selected in blocks of this duration, so that the motion between them stays known
+MAX_ADDED_ERROR = 0.05  # that a camera's covariance may add to the error of a pixel, as a fraction of it
+MIN_USED = 0.5  # of the image area that a camera shares with others
+MIN_GROWTH = 0.01  # of the used area, summed over cameras: less counts as none
+IDLE_S = 15.0  # without growth of the used area
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WandSession:
+    """The settings of a wand session.
+
+    Attributes:
+        rig: intrinsics of the cameras.
+        wand: the wand.
+        distance: between two cameras, measured; the scale of trials if the wand has one marker.
+        seconds: the longest duration.
+        trials: whether trial calibrations are computed.
+        trial_every_s: the shortest time between two trials.
+        stops_itself: whether the session ends when a trial is precise enough.
+    """
+
+    rig: Rig
+    wand: Body
+    distance: Distance | None = None
+    seconds: float = MAX_SECONDS
+    trials: bool = True
+    trial_every_s: float = TRIAL_EVERY_S
+    stops_itself: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a part of the frames gives.
+    """A calibration from part of the frames, and its prediction for all of them.
 
     Attributes:
-        fault: why no two cameras could be placed; empty where they were.
-        unplaced: why, by name of cameras that could not.
-        strain: by camera, its covariance in the image over the noise of its pixels.
-        used: by camera, the part of what it shares with others that was waved through.
-        advice: by camera, where to wave next.
-        expected_mm: the expected error of points across the arena, were all frames used; None without metres.
-        grade: of the part.
+        fault: why no two cameras could be placed; empty if they were.
+        unplaced: the reason, by name of each camera that could not be placed.
+        noise_ratio: image error by the camera's own covariance, over the noise of its pixels, by camera.
+        used: fraction of the image area shared with others in which the wand was seen, by camera.
+        advice: where to wave next, by camera.
+        expected_mm: expected error of points across the arena; None for a rig without scale.
+        grade: of the trial.
     """
 
     fault: str = ""
     unplaced: dict[str, str] = field(default_factory=dict)
-    strain: dict[str, float] = field(default_factory=dict)
+    noise_ratio: dict[str, float] = field(default_factory=dict)
     used: dict[str, float] = field(default_factory=dict)
     advice: dict[str, str] = field(default_factory=dict)
     expected_mm: float | None = None
@@ -63,8 +88,16 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class SessionProgress:
-    """How far a wave is: seconds, frames with roundels and the share of the image that had them by camera, the latest
-    trial, whether it is enough, and what to do next."""
+    """The state of a running session.
+
+    Attributes:
+        seconds: elapsed.
+        frames: number of frames with roundels, by camera.
+        covered: fraction of the image in which roundels were detected, by camera.
+        trial: the latest one.
+        enough: whether the stopping rule is met.
+        advice: what to do next.
+    """
 
     seconds: float
     frames: dict[str, int]
@@ -74,8 +107,8 @@ class SessionProgress:
     advice: str
 
     @property
-    def standing(self) -> str:
-        """How long it lasts, and what it would give now."""
+    def summary(self) -> str:
+        """The elapsed time, and the expected result."""
         if self.trial is None or self.trial.expected_mm is None:
             return f"{self.seconds:.0f} s"
         return (
@@ -83,8 +116,8 @@ class SessionProgress:
         )
 
     def cells(self) -> list[tuple[str, ...]]:
-        """By camera: its name, frames, share of the image, part of what it shares with others, strain; the last two are
-        empty before the first trial."""
+        """One row per camera: name, frames, share of the image, used part of the shared area, noise ratio; the last
+        two are empty before the first trial."""
         trial = self.trial or Trial()
         return [
             (
@@ -92,136 +125,120 @@ class SessionProgress:
                 str(frames),
                 f"{self.covered.get(name, 0):.0%}",
                 f"{trial.used[name]:.0%}" if name in trial.used else "",
-                f"{trial.strain[name]:.2f}" if name in trial.strain else "",
+                f"{trial.noise_ratio[name]:.2f}" if name in trial.noise_ratio else "",
             )
             for name, frames in self.frames.items()
         ]
 
 
 @dataclass(slots=True)
-class Rule:
-    """The rule by which a wave stops, with what it remembers from trial to trial."""
+class StoppingRule:
+    """Decides when a session has enough frames; remembers when the used area last grew, and to how much."""
 
-    best_used: float = 0.0
-    grown: float = 0.0
+    most_used: float = 0.0
+    grew_s: float = 0.0
 
-    def judge(self, trial: Trial, now: float) -> bool:
-        """Whether it is enough."""
-        if (used := sum(trial.used.values())) > self.best_used + 0.01:
-            self.best_used, self.grown = used, now
+    def is_met(self, trial: Trial, now_s: float) -> bool:
+        """Whether more frames would not improve the result."""
+        if (used := sum(trial.used.values())) > self.most_used + MIN_GROWTH:
+            self.most_used, self.grew_s = used, now_s
         if trial.fault or trial.unplaced:
             return False
-        # Variances add: (1 + strain^2) ^ 1/2 < 1 + ADDS.
-        precise = max(trial.strain.values()) ** 2 < (1 + ADDS) ** 2 - 1
-        return precise and (min(trial.used.values()) >= USED or now - self.grown > IDLE_S)
+        # Variances add: (1 + ratio^2) ^ 1/2 < 1 + MAX_ADDED_ERROR.
+        precise = max(trial.noise_ratio.values()) ** 2 < (1 + MAX_ADDED_ERROR) ** 2 - 1
+        return precise and (min(trial.used.values()) >= MIN_USED or now_s - self.grew_s > IDLE_S)
 
 
-def wave(
+def run_wand_session(
     session: zenoh.Session,
     arena: str,
-    rig: Rig,
-    wand: Body,
-    seconds: float,
-    tell: Callable[[SessionProgress], None] = lambda progress: None,
-    ended: threading.Event | None = None,
-    by_itself: bool = True,
-    trials: bool = True,
-    every_s: float = TRIAL_EVERY_S,
-    distance: Distance | None = None,
+    settings: WandSession,
+    show: Callable[[SessionProgress], None] = lambda progress: None,
+    stop: threading.Event | None = None,
 ) -> tuple[CollectedFrames, str]:
-    """Collect the detections of all cameras of an arena while a wand is waved.
+    """Collect the detections of all cameras of an arena while a person waves the wand.
 
     Args:
         session, arena: where cameras publish.
-        rig: intrinsics of the cameras.
-        wand: the wand.
-        seconds: how long at the most.
-        tell: called a few times a second, with what a person wants to know; from this thread.
-        ended: ends it from another thread.
-        by_itself: whether it ends when a trial solution says that it is enough.
-        trials: whether trial solutions are made.
-        every_s: how long to wait from one to the next.
-        distance: of two cameras, that trial solutions are scaled by where the wand has one marker.
+        settings: the rig, the wand, and when to end.
+        show: called from this thread a few times a second.
+        stop: ends the session from another thread.
 
     Returns:
-        what was heard, and why it ended.
+        the frames, and the reason for the end.
 
     Raises:
-        CalibrationError: nothing came.
+        CalibrationError: no message arrived.
     """
-    rule = Rule()
-    with _Trials(rig, wand, distance, trials, every_s) as solver:
+    rule = StoppingRule()
+    with _TrialSolver(settings) as solver:
 
-        def look(heard: CollectedFrames, passed: float) -> str:
-            if ended is not None and ended.is_set():
-                return "ended by hand"
-            trial = solver.step(heard.messages, passed)
-            enough = trial is not None and rule.judge(trial, passed)
-            tell(progress(heard, passed, trial, enough))
-            return "more waving would not help" if enough and by_itself else ""
+        def inspect(collected: CollectedFrames, elapsed: float) -> str:
+            if stop is not None and stop.is_set():
+                return "stopped by the user"
+            trial = solver.update(collected.messages, elapsed)
+            enough = trial is not None and rule.is_met(trial, elapsed)
+            show(summarize(collected, elapsed, trial, enough))
+            return "more frames would not improve the result" if enough and settings.stops_itself else ""
 
-        return listen(session, arena, seconds, look)
-
-
-def progress(heard: CollectedFrames, passed: float, trial: Trial | None, enough: bool) -> SessionProgress:
-    """What to tell a person."""
-    covered = {name: coverage.share() for name, coverage in sorted(heard.coverage.items())}
-    return SessionProgress(
-        passed,
-        dict(sorted(heard.frames.items())),
-        covered,
-        trial,
-        enough,
-        _advise(heard, passed, trial, enough),
-    )
+        return collect_frames(session, arena, settings.seconds, inspect)
 
 
-def _advise(heard: CollectedFrames, passed: float, trial: Trial | None, enough: bool) -> str:
+def summarize(
+    collected: CollectedFrames, elapsed: float, trial: Trial | None, enough: bool
+) -> SessionProgress:
+    """The progress of a session, with advice."""
+    covered = {name: coverage.share() for name, coverage in sorted(collected.coverage.items())}
+    advice = _advise(collected, elapsed, trial, enough)
+    return SessionProgress(elapsed, dict(sorted(collected.frames.items())), covered, trial, enough, advice)
+
+
+def _advise(collected: CollectedFrames, elapsed: float, trial: Trial | None, enough: bool) -> str:
     if enough:
-        return "that is enough"
-    if lost := heard.silent(passed):
-        return _name_lost(lost, len(heard.latest))
-    if not heard.frames:
-        return "waiting for roundels" if heard.messages else "waiting for cameras"
-    return _advise_on(trial) if trial is not None else "wave the wand where two cameras or more see it"
+        return "there are enough frames"
+    if silent := collected.silent_cameras(elapsed):
+        return _name_silent(silent, len(collected.last_seen_s))
+    if not collected.frames:
+        return "waiting for roundels" if collected.messages else "waiting for cameras"
+    return _advise_by(trial) if trial is not None else "wave the wand where two cameras or more see it"
 
 
-def _advise_on(trial: Trial) -> str:
+def _advise_by(trial: Trial) -> str:
     if trial.fault:
         return trial.fault
     if trial.unplaced:
-        name, why = next(iter(trial.unplaced.items()))
-        return f"'{name}' has no place yet: {why}"
+        name, reason = next(iter(trial.unplaced.items()))
+        return f"camera '{name}' is not placed yet: {reason}"
     name = min(trial.used, key=trial.used.__getitem__)
-    if trial.used[name] < USED and trial.advice.get(name):
+    if trial.used[name] < MIN_USED and trial.advice.get(name):
         return f"{name}: {trial.advice[name]}"
-    weakest = max(trial.strain, key=trial.strain.__getitem__)
-    return f"go on, most before '{weakest}'"
+    weakest = max(trial.noise_ratio, key=trial.noise_ratio.__getitem__)
+    return f"continue, mostly in front of '{weakest}'"
 
 
-def _name_lost(lost: list[str], cameras: int) -> str:
-    if len(lost) == cameras:
-        return "no camera sends any more: does the server run?"
-    return f"{' and '.join(map(repr, lost))}: no frames any more; does its program run?"
+def _name_silent(silent: list[str], n_cameras: int) -> str:
+    if len(silent) == n_cameras:
+        return "no camera sends frames any more; check that the server runs"
+    return f"{' and '.join(map(repr, silent))}: no frames any more; check that the camera's program runs"
 
 
-def _stand_back() -> None:
-    """In the trials' process: leave the processor to cameras, and Ctrl-C to who waves."""
+def _init_trial_process() -> None:
+    """Run at low priority, so that cameras keep the processor, and leave Ctrl-C to the main process."""
     os.nice(10)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class _Trials:
-    """Trial solutions, one at a time, in a process of their own."""
+class _TrialSolver:
+    """Computes trials, one at a time, in a process of its own."""
 
-    def __init__(self, rig: Rig, wand: Body, distance: Distance | None, wanted: bool, every_s: float) -> None:
-        self._told, self._every_s = (rig, wand, distance), every_s
-        self._pool = get_context("spawn").Pool(1, _stand_back) if wanted else None
+    def __init__(self, settings: WandSession) -> None:
+        self._settings = settings
+        self._pool = get_context("spawn").Pool(1, _init_trial_process) if settings.trials else None
         self._running: AsyncResult[Trial] | None = None
         self._latest: Trial | None = None
-        self._due = every_s
+        self._next_s = settings.trial_every_s
 
-    def __enter__(self) -> "_Trials":
+    def __enter__(self) -> "_TrialSolver":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -229,43 +246,43 @@ class _Trials:
             self._pool.terminate()
             self._pool.join()
 
-    def step(self, messages: Sequence[Detections], now: float) -> Trial | None:
-        """Take a finished trial, start another when it is due; the latest one."""
+    def update(self, messages: Sequence[Detections], now_s: float) -> Trial | None:
+        """Collect a finished trial, and start the next one when it is due; returns the latest finished one."""
         if self._running is not None and self._running.ready():
             self._latest, self._running = self._running.get(), None
-            self._due = now + self._every_s
-        if self._pool is not None and self._running is None and now >= self._due and messages:
-            part = thin(messages)
+            self._next_s = now_s + self._settings.trial_every_s
+        if self._pool is not None and self._running is None and now_s >= self._next_s and messages:
+            part = select_blocks(messages)
             share = len(part) / len(messages)
-            self._running = self._pool.apply_async(try_part, (*self._told, part, share))
+            self._running = self._pool.apply_async(compute_trial, (self._settings, part, share))
         return self._latest
 
 
-def thin(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Detections]:
-    """Messages of whole half seconds, evenly spread, with about `frames` of the camera that has most."""
+def select_blocks(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Detections]:
+    """Select messages in evenly spaced blocks of 0.5 s, with about `frames` of the camera that has most."""
     most = max(Counter(message.camera for message in messages).values())
     stride = -(-most // frames)
     start = min(message.t_ns for message in messages)
     return [m for m in messages if int((m.t_ns - start) * 1e-9 / BLOCK_S) % stride == 0]
 
 
-def try_part(
-    rig: Rig, wand: Body, distance: Distance | None, part: Sequence[Detections], share: float
-) -> Trial:
-    """Solve a part, `share` of all frames, and say what all of them would give."""
+def compute_trial(settings: WandSession, part: Sequence[Detections], share: float) -> Trial:
+    """Calibrate from part of the messages, a `share` of all, and predict the precision of all."""
     try:
-        result = calibrate(rig, wand, part, distance)
+        result = calibrate(settings.rig, settings.wand, part, settings.distance)
     except CalibrationError as error:
         return Trial(fault=str(error))
-    except Exception as error:  # a wave that somebody took trouble over is not lost by a trial
-        return Trial(fault=f"the trial solution failed ({type(error).__name__}: {error}); the wave goes on")
-    trust, fewer = assess(result, wand), share**0.5
-    delivering = {message.camera for message in part}
+    except Exception as error:  # a failed trial must not end the session
+        return Trial(
+            fault=f"the trial calibration failed ({type(error).__name__}: {error}); the session continues"
+        )
+    quality, scale = assess(result, settings.wand), share**0.5
+    sending = {message.camera for message in part}
     return Trial(
-        unplaced={name: why for name, why in trust.unplaced.items() if name in delivering},
-        strain={c.name: fewer * c.strain for c in trust.cameras},
-        used={c.name: 1 - c.figures["unused"] for c in trust.cameras},
-        advice={c.name: c.wave_next for c in trust.cameras},
-        expected_mm=trust.expected.typical_mm if trust.expected else None,
-        grade=trust.grade,
+        unplaced={name: reason for name, reason in quality.unplaced.items() if name in sending},
+        noise_ratio={c.name: scale * c.strain for c in quality.cameras},
+        used={c.name: 1 - c.figures["unused"] for c in quality.cameras},
+        advice={c.name: c.wave_next for c in quality.cameras},
+        expected_mm=quality.expected.typical_mm if quality.expected else None,
+        grade=quality.grade,
     )

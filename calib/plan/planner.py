@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What cameras would see and know of an arena, before a hole is drilled.
+"""Predicts range, coverage and precision of planned cameras, before they are mounted.
 
-The sensor model of Faigl, Krajnik, Chudoba and Saska (ICRA 2013): a roundel of diameter d_o is detected from
+The sensor model is that of Faigl, Krajnik, Chudoba and Saska (ICRA 2013): a roundel of diameter d_o is detected from
 v_min = d_o max(f_x / w, f_y / h), where it fills the image, to v_max = d_o / D min(f_x cos phi, f_y cos psi), where its
-minor axis is D pixels; at v_max the operational space is v_max w / f_x - 2 d_o wide and v_max h / f_y - 2 d_o high.
-(The paper prints these two fractions upside down; only so are they lengths.)
+minor axis is D pixels. At v_max the operational space is v_max w / f_x - 2 d_o wide and v_max h / f_y - 2 d_o high.
+The paper prints the last two fractions inverted; as given here they are lengths.
 """
 
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import Camera
+from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import Pose, look_at
 
@@ -21,13 +21,13 @@ Vector = tuple[float, float, float]
 
 
 class PlannedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A camera that may be bought and mounted: its lens by the horizontal field of view, or by a focal length.
+    """A camera that is not mounted yet, with a lens given by its field of view or by its focal length.
 
     Attributes:
         width, height: of its image, pixels.
-        fov_deg: horizontal field of view without distortion, as data sheets have it.
+        fov_deg: horizontal field of view without distortion, as in data sheets.
         focal_px: focal length, pixels; instead of `fov_deg`.
-        position_m, look_at_m: where it stands and what is in the middle of its image.
+        position_m, look_at_m: its position, and the point in the middle of its image, world.
     """
 
     width: int
@@ -43,11 +43,11 @@ class PlannedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         if self.fov_deg is not None and not 1 < self.fov_deg < 170:
             raise ValueError(f"fov_deg is {self.fov_deg}; give 1 to 170 degrees")
         if np.allclose(self.position_m, self.look_at_m):
-            raise ValueError("look_at_m must be another place than position_m")
+            raise ValueError("look_at_m equals position_m; give another point")
         self.camera()
 
     def camera(self) -> Camera:
-        """The camera, where it would stand; its pose is exact."""
+        """The camera at its planned pose, which counts as exact."""
         focal = self.focal_px or 0.0
         if self.fov_deg is not None:
             focal = self.width / 2 / np.tan(np.radians(self.fov_deg) / 2)
@@ -63,8 +63,16 @@ class PlannedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An arena to be: the floor from `area_m` x0, y0 to x1, y1; robots carry roundels of `diameter_m`, level, at
-    `height_m`; a roundel is found from `min_diameter_px` across its minor axis, its centre to `sigma_px`."""
+    """A planned arena, as in `configs/plan.yaml`.
+
+    Attributes:
+        area_m: x0, y0, x1, y1 of the floor.
+        height_m: of the level roundels that robots carry.
+        diameter_m: of these roundels.
+        min_diameter_px: the smallest minor axis at which the detector finds a roundel.
+        sigma_px: standard deviation of one coordinate of its centre.
+        cameras: by name.
+    """
 
     area_m: tuple[float, float, float, float]
     height_m: float = 0.1
@@ -82,11 +90,20 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not self.cameras:
             raise ValueError("cameras must name one or more")
 
+    def grid(self) -> FloorGrid:
+        """The points for which errors are predicted."""
+        return FloorGrid.covering(self.area_m[:2], self.area_m[2:], self.height_m)
+
 
 @dataclass(frozen=True, slots=True)
-class Range:
-    """Where one camera sees roundels: nearest and farthest distance, size of the operational space at the far end (all
-    metres), and the part of the area that it sees."""
+class SensorRange:
+    """The range in which one camera detects roundels.
+
+    Attributes:
+        v_min, v_max: nearest and farthest distance, metres.
+        v_y, v_z: width and height of the operational space at v_max, metres.
+        share: fraction of the area that the camera sees.
+    """
 
     v_min: float
     v_max: float
@@ -96,23 +113,23 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
-    """What a plan comes to: a range by camera, and the map of expected errors."""
+class PlanReport:
+    """The evaluation of a plan: the range of each camera by name, and the map of expected errors."""
 
-    ranges: dict[str, Range]
-    expected: PrecisionMap
+    ranges: dict[str, SensorRange]
+    precision: PrecisionMap
 
 
-def sensor_range(camera: Camera, diameter_m: float, min_diameter_px: float, tilt_rad: float) -> Range:
-    """The paper's model of one camera, for roundels that are tilted by `tilt_rad` about either axis; share is 0."""
+def sensor_range(camera: Camera, diameter_m: float, min_diameter_px: float, tilt_rad: float) -> SensorRange:
+    """The paper's model of one camera, for roundels tilted by `tilt_rad` about either axis; `share` is 0."""
     w, h, f_x, f_y = camera.width, camera.height, camera.fx, camera.fy
     v_min = diameter_m * max(f_x / w, f_y / h)
     v_max = diameter_m / min_diameter_px * min(f_x, f_y) * float(np.cos(tilt_rad))
-    return Range(v_min, v_max, v_max * w / f_x - 2 * diameter_m, v_max * h / f_y - 2 * diameter_m, 0.0)
+    return SensorRange(v_min, v_max, v_max * w / f_x - 2 * diameter_m, v_max * h / f_y - 2 * diameter_m, 0.0)
 
 
 def sees_level(camera: Camera, points: Array, diameter_m: float, min_diameter_px: float) -> Mask:
-    """Which of the points (N, 3) a camera above sees as level roundels, wholly and not too small.
+    """(N,) whether a camera detects level roundels at points (N, 3), world: from above, complete, and large enough.
 
     A level disc seen under the angle phi from the vertical, at distance r, has a minor axis of about f d_o cos phi / r.
     """
@@ -127,19 +144,17 @@ def sees_level(camera: Camera, points: Array, diameter_m: float, min_diameter_px
     return inside & (minor >= min_diameter_px)
 
 
-def foresee(plan: Plan) -> Forecast:
-    """Range, coverage and expected errors of a plan; poses count as known (a good calibration adds less than 5 %)."""
+def evaluate_plan(plan: Plan) -> PlanReport:
+    """Predict range, coverage and errors. Poses count as exact; a good calibration adds less than 5 % to the errors."""
     cameras = {name: entry.camera() for name, entry in plan.cameras.items()}
-    low, high = np.array(plan.area_m[:2]), np.array(plan.area_m[2:])
 
-    def seen(camera: Camera, points: Array) -> Mask:
+    def sees(camera: Camera, points: Array) -> Mask:
         return sees_level(camera, points, plan.diameter_m, plan.min_diameter_px)
 
-    expected = map_precision(list(cameras.values()), low, high, plan.height_m, plan.sigma_px, sees=seen)
-    grid = expected.points
+    precision = map_precision(list(cameras.values()), plan.grid(), plan.sigma_px, sees=sees)
     ranges = {}
     for name, camera in cameras.items():
         tilt = float(np.arccos(np.clip(-camera.matrix()[2, 2], -1, 1)))
-        told = sensor_range(camera, plan.diameter_m, plan.min_diameter_px, tilt)
-        ranges[name] = replace(told, share=float(seen(camera, grid).mean()))
-    return Forecast(ranges, expected)
+        reach = sensor_range(camera, plan.diameter_m, plan.min_diameter_px, tilt)
+        ranges[name] = replace(reach, share=float(sees(camera, plan.grid().points).mean()))
+    return PlanReport(ranges, precision)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera: a lens that stands somewhere, and how pixels change with either."""
+"""A camera: a lens with a pose and a clock offset, and the Jacobians of its pixels."""
 
 from typing import TypeVar
 
@@ -21,11 +21,14 @@ SHAPE = (12, 13, 14, 15)
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A lens, its pose in the world (None until it is calibrated), and what its clock is off.
+    """A lens with its pose in the world and the offset of its clock.
 
-    True capture time = stamp + `time_offset_ms`. `covariance` is that of the pose in GTSAM's order (rotation in the
-    camera's frame, then translation in the camera's frame), (6, 6), rad and m; None where it is not known.
-    `lens_sigma` are standard deviations of the lens's `parameters`, in their order; None where nobody measured them.
+    Attributes:
+        T_world_cam: the pose; None before the camera is calibrated.
+        time_offset_ms: true capture time = stamp + offset.
+        covariance: (6, 6) of the pose in GTSAM's tangent order (rotation, then translation, both in the camera's
+            frame), rad and m; None where unknown.
+        lens_sigma: standard deviations of the lens's `parameters`, in their order; None where never measured.
     """
 
     T_world_cam: Pose | None = None
@@ -38,15 +41,15 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         sigma = self.lens_sigma
         if sigma is not None and not (len(sigma) >= 4 and np.isfinite(sigma).all() and min(sigma) >= 0):
             raise ValueError(
-                "lens_sigma holds standard deviations of fx, fy, cx, cy and of distortion numbers"
+                "lens_sigma must hold the standard deviations of fx, fy, cx, cy and the distortion coefficients"
             )
 
     def project_world(self, p_world: ArrayLike) -> Array:
-        """Raw pixels (N, 2) of points (N, 3) in the world; NaN for those not before the camera."""
+        """Raw pixels (N, 2) of points (N, 3) in the world; NaN for points that are not in front of the camera."""
         return self.project(transform(invert(self.matrix()), p_world))
 
     def sees(self, uv: ArrayLike) -> Mask:
-        """Which of the pixels (N, 2) lie in the image; NaN does not."""
+        """(N,) whether pixels (N, 2) lie in the image; False for NaN."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         inside = (uv >= -0.5) & (uv < [self.width - 0.5, self.height - 0.5])
         return inside[:, 0] & inside[:, 1]
@@ -68,16 +71,16 @@ def transform(T: Array, points: ArrayLike) -> Array:
 
 
 def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Pixels of points (N, 3), camera frame, and how they change.
+    """Project points (N, 3), camera frame, with all derivatives.
 
     Returns:
         uv: (N, 2) raw pixels.
         J_point: (N, 2, 3) by the point, in the camera's frame.
-        J_pose: (N, 2, 6) by a turn w and a shift t of the camera in its own frame, which move points there by
-            p x w - t.
-        J_lens: (N, 2, 8) by the log of the focal lengths, cx, cy and k1; by the log of fx over fy, and by the three
-            distortion numbers after k1.
-        All NaN for points not before the camera.
+        J_pose: (N, 2, 6) by a rotation w and a translation t of the camera in its own frame, which move points in
+            that frame by p x w - t.
+        J_lens: (N, 2, 8) by log focal length, cx, cy and k1 (`LENS`), then by log fx / fy and the three distortion
+            coefficients after k1 (`SHAPE`).
+        All are NaN for points that are not in front of the camera.
     """
     lens, points = with_distortion(lens), np.asarray(points, float).reshape(-1, 3)
     uv, J_point, by_lens = lens.project_with_jacobians(points)
@@ -88,5 +91,5 @@ def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array,
 
 
 def with_distortion(lens: AnyLens) -> AnyLens:
-    """The same lens with its distortion numbers written out: zeros where it has none."""
+    """The same lens with explicit distortion coefficients: four zeros where it has none."""
     return lens if lens.distortion else lens.with_parameters([*lens.parameters, 0.0, 0.0, 0.0, 0.0])

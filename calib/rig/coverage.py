@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which part of an image has been used, and where the rest is, in words."""
+"""Counts points in the cells of an image, and names the regions of the image that have few."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.arrays import Array, Mask
 
-CELLS = (6, 8)  # rows and columns in which an image is counted
+CELLS = (6, 8)  # rows and columns of the grid
 REGIONS = (
     ("upper left", "upper middle", "upper right"),
     ("left", "middle", "right"),
     ("lower left", "lower middle", "lower right"),
 )
-THIN = 1 / 3  # of a region's cells used: below, it is named
+MIN_SHARE = 1 / 3  # of a region's cells: a region with a smaller used share is reported as missing
 
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How many points fell into each cell of an image: (rows, columns), upper left first."""
+    """Number of points in each cell of an image: `counts` (rows, columns), upper left first."""
 
     counts: NDArray[np.int64]
 
     @classmethod
     def of(cls, uv: ArrayLike, width: int, height: int, cells: tuple[int, int] = CELLS) -> "Coverage":
-        """Count pixels (N, 2) of an image; those outside, or not finite, belong to no cell."""
+        """Count pixels (N, 2); pixels outside of the image or not finite are ignored."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         edges = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
-        known = uv[np.isfinite(uv).all(axis=1)]
-        return cls(np.histogram2d(known[:, 1], known[:, 0], cells, edges)[0].astype(np.int64))
+        finite = uv[np.isfinite(uv).all(axis=1)]
+        return cls(np.histogram2d(finite[:, 1], finite[:, 0], cells, edges)[0].astype(np.int64))
 
     def __add__(self, other: "Coverage") -> "Coverage":
         return Coverage(self.counts + other.counts)
@@ -40,24 +40,22 @@ class Coverage:
         return self.counts > 0
 
     def share(self, useful: Mask | None = None) -> float:
-        """Part of the cells, or of those that are useful, that are used; 1 where none is useful."""
+        """Used fraction of all cells, or of the `useful` cells (rows, columns); 1 if no cell is useful."""
         cells = self.used if useful is None else self.used[useful]
         return float(cells.mean()) if cells.size else 1.0
 
     def missing(self, useful: Mask | None = None) -> list[str]:
-        """Names of the thirds of the image that are hardly used, emptiest first."""
+        """Names of the regions with few used cells, emptiest first; regions with few `useful` cells are skipped."""
         wanted = np.ones(self.counts.shape, bool) if useful is None else useful
-        told = []
+        shares: dict[str, float] = {}
         for name, part in regions(self.counts.shape):
-            if wanted[part].mean() < 0.5:
-                continue
-            if (share := float(self.used[part][wanted[part]].mean())) < THIN:
-                told.append((share, name))
-        return [name for _, name in sorted(told, key=lambda pair: pair[0])]
+            if wanted[part].mean() >= 0.5:
+                shares[name] = float(self.used[part][wanted[part]].mean())
+        return sorted((name for name in shares if shares[name] < MIN_SHARE), key=shares.__getitem__)
 
 
 def regions(shape: tuple[int, ...]) -> list[tuple[str, tuple[slice, slice]]]:
-    """The nine thirds of a grid of cells: name, rows and columns."""
+    """The nine regions of a grid of cells: name, and slices of rows and columns."""
     rows, columns = (np.linspace(0, n, 4).round().astype(int) for n in shape)
     return [
         (REGIONS[r][c], (slice(rows[r], rows[r + 1]), slice(columns[c], columns[c + 1])))
@@ -67,7 +65,7 @@ def regions(shape: tuple[int, ...]) -> list[tuple[str, tuple[slice, slice]]]:
 
 
 def region_of(uv: ArrayLike, width: int, height: int) -> str:
-    """The name of the third of the image in which a pixel (2,) lies."""
+    """The name of the region of the image in which a pixel (2,) lies."""
     u, v = np.asarray(uv, float)
     row, column = (int(np.clip(3 * (x + 0.5) / n, 0, 2)) for x, n in ((v, height), (u, width)))
     return REGIONS[row][column]
@@ -79,7 +77,7 @@ def enumerate_words(words: list[str]) -> str:
 
 
 def cell_centres(width: int, height: int, cells: tuple[int, int] = CELLS) -> Array:
-    """(rows * columns, 2) the pixel in the middle of each cell."""
+    """(rows * columns, 2) the pixel at the centre of each cell."""
     rows, columns = cells
     v, u = np.mgrid[0:rows, 0:columns]
     return np.column_stack(

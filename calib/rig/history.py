@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rigs that were in force before: `rig.1.yaml`, `rig.2.yaml`, ... beside `rig.yaml`, the highest number the newest."""
+"""Backs up files before they are replaced: `rig.1.yaml`, `rig.2.yaml`, ... beside `rig.yaml`, newest last."""
 
 import os
 import re
@@ -10,15 +10,15 @@ from calib.errors import CalibrationError
 from camera_node.errors import ConfigError
 
 
-def predecessors(path: Path) -> list[Path]:
-    """The kept rigs beside `path`, oldest first."""
+def list_backups(path: Path) -> list[Path]:
+    """The backups beside `path`, oldest first."""
     numbered = re.compile(rf"{re.escape(path.stem)}\.([0-9]+){re.escape(path.suffix)}")
     found = [(int(m[1]), p) for p in path.parent.iterdir() if (m := numbered.fullmatch(p.name))]
     return [p for _, p in sorted(found)]
 
 
-def keep(path: Path) -> Path | None:
-    """Keep a file under the next number before it is replaced; None where there is none yet.
+def back_up(path: Path) -> Path | None:
+    """Save a file under the next number; returns the backup, or None if there is no file.
 
     Raises:
         ConfigError: the folder can't be written to.
@@ -26,44 +26,44 @@ def keep(path: Path) -> Path | None:
     if not path.exists():
         return None
     try:
-        kept = _next(path)
-        _duplicate(path, kept)
+        backup = _next_backup(path)
+        _link_or_copy(path, backup)
     except OSError as error:
-        raise ConfigError(f"{path} can't be kept before it is replaced: {error.strerror}") from None
-    return kept
+        raise ConfigError(f"{path} can't be backed up: {error.strerror}") from None
+    return backup
 
 
 def undo(path: Path) -> tuple[Path, Path]:
-    """Bring the newest kept rig back to `path`; the one that it replaces stays as `rig.undone.yaml`.
+    """Restore the newest backup to `path`; the file that it replaces is saved as `rig.undone.yaml`.
 
     Returns:
-        the kept rig's name, which is free again, and the name under which the undone one stays.
+        the name of the restored backup, which no longer exists, and the name of the replaced file.
 
     Raises:
-        CalibrationError: nothing was kept.
+        CalibrationError: there is no backup.
         ConfigError: the folder does not exist or can't be written to.
     """
     undone = path.with_name(f"{path.stem}.undone{path.suffix}")
     try:
-        if not (kept := predecessors(path)):
-            raise CalibrationError(f"no earlier rig is kept beside {path}; nothing was changed")
+        if not (backups := list_backups(path)):
+            raise CalibrationError(f"there is no earlier rig beside {path}; nothing was changed")
         if path.exists():
             undone.unlink(missing_ok=True)
-            _duplicate(path, undone)
-        os.replace(kept[-1], path)
+            _link_or_copy(path, undone)
+        os.replace(backups[-1], path)
     except OSError as error:
-        raise ConfigError(f"{path} can't be brought back: {error.strerror}; is its folder right?") from None
-    return kept[-1], undone
+        raise ConfigError(f"{path} can't be restored: {error.strerror}; check its folder") from None
+    return backups[-1], undone
 
 
-def _next(path: Path) -> Path:
-    last = predecessors(path)[-1:]
+def _next_backup(path: Path) -> Path:
+    last = list_backups(path)[-1:]
     number = int(last[0].name.removesuffix(path.suffix).rsplit(".", 1)[1]) + 1 if last else 1
     return path.with_name(f"{path.stem}.{number}{path.suffix}")
 
 
-def _duplicate(path: Path, target: Path) -> None:
-    """A second name for the same file, at once and never over another; a copy where the disk has no hard links."""
+def _link_or_copy(path: Path, target: Path) -> None:
+    """Give a file a second name, atomically and never over another file; copy where the disk has no hard links."""
     try:
         os.link(path, target)
     except FileExistsError:

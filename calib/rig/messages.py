@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What calibration says over Zenoh, in the encoding of `camera_node.protocol.messages`; the key is `Keys.rig`."""
+"""The message of calibration on Zenoh, encoded as in `camera_node.protocol.messages`; its key is `Keys.rig`."""
 
 import time
 
@@ -19,16 +19,16 @@ class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, rig: Rig) -> "RigMessage":
-        """A rig that is in force from now on."""
+        """The message of a rig that is in force from now on."""
         return cls(t_ns=time.time_ns(), yaml=dump_rig(rig))
 
     def rig(self) -> Rig:
-        """The rig that it tells of.
+        """Decode the rig.
 
         Raises:
-            MessageError: the text is no rig.yaml; in one line.
+            MessageError: the text is not a valid rig.yaml; the error is one line.
         """
         try:
             return msgspec.yaml.decode(self.yaml, type=Rig)
         except (msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
-            raise MessageError(f"no rig.yaml: {' '.join(str(error).split())[:200]}") from None
+            raise MessageError(f"not a valid rig.yaml: {' '.join(str(error).split())[:200]}") from None

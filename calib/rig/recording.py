@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Recordings: messages in MCAP, as they came, one channel a key.
+"""Reads and writes recordings: MCAP files of messages as they arrived, one channel per Zenoh key.
 
-Messages are in MessagePack as on the wire, under their Zenoh keys; `log_time` is when one arrived, in the recorder's
-clock. What an arena's recording holds beside detections is fusion's (`fusion.recordings.record`).
+Messages are in MessagePack as on the wire. `log_time` is the time of arrival, in the recorder's clock. The other
+messages of an arena's recording are defined by fusion (`fusion.recordings.record`).
 """
 
 import os
@@ -16,16 +16,16 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
-from calib.rig.history import keep
+from calib.rig.history import back_up
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
-MAGIC = 8  # bytes that every MCAP begins with
-CHUNK = 1 << 16  # bytes, compressed together: what is lost of a recording that is cut off
+MAGIC = 8  # bytes at the start of every MCAP file
+CHUNK = 1 << 16  # bytes compressed together: the most that is lost when a recording is cut off
 
 
 class RecordingWriter:
-    """Writes an arena's messages; a context manager. A recording that was cut off can be read to where it ends.
+    """Writes the messages of an arena; a context manager. A recording that is cut off is readable up to its end.
 
     Raises, at entry:
         ConfigError: the file can't be written.
@@ -40,9 +40,7 @@ class RecordingWriter:
         try:
             self._file: IO[bytes] = self.path.open("wb")
         except OSError as error:
-            raise ConfigError(
-                f"{self.path} can't be written: {error.strerror}; is its folder there?"
-            ) from None
+            raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
         self._writer = Writer(self._file, chunk_size=CHUNK)
         self._writer.start(profile="roundel", library="roundel")
         return self
@@ -52,18 +50,22 @@ class RecordingWriter:
             self._writer.finish()
 
     def put(self, key: str, data: bytes, received_ns: int) -> None:
-        """A message that arrived on a key."""
+        """Append a message that arrived on a key."""
         if key not in self._channels:
             self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
         self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
         self.counts[key] += 1
 
 
-def iterate(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[str, bytes, int]]:
-    """Key, bytes and time of arrival (ns) of each message, in the order of arrival.
+def read_messages(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[str, bytes, int]]:
+    """Yield key, bytes and time of arrival (ns) of each message, in the order of arrival.
+
+    Args:
+        path: the MCAP file.
+        faults: counts a recording that was cut off; without it, such a recording raises.
 
     Raises:
-        ConfigError: the file is missing, or no MCAP.
+        ConfigError: the file is missing, or not an MCAP file.
     """
     try:
         with path.open("rb") as file:
@@ -73,25 +75,25 @@ def iterate(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[st
                     yield channel.topic, message.data, message.log_time
             except (McapError, EOFError, struct.error) as error:
                 if faults is None or file.tell() <= MAGIC:
-                    raise ConfigError(f"{path} is no MCAP recording: {error}") from None
+                    raise ConfigError(f"{path} is not an MCAP recording: {error}") from None
                 faults["end: the recording was cut off"] += 1
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
 
-def wave_beside(rig: Path) -> Path:
-    """Where the wave is kept by which a rig was made."""
+def wand_recording_path(rig: Path) -> Path:
+    """The path of the wand recording from which the rig file `rig` is calibrated."""
     return rig.with_name(f"{rig.stem}.wave.mcap")
 
 
-def save_wave(path: Path, arena: str, messages: Iterable[Detections]) -> Path | None:
-    """Write a wave's detections as `fusion record` would, as if each had arrived at once; never a part of them.
+def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) -> Path | None:
+    """Write detections atomically, in the format of `fusion record`, with capture times as times of arrival.
 
     Returns:
-        the name under which the wave that was there before is kept, if one was.
+        the backup of the previous recording at `path`, if there was one.
 
     Raises:
-        ConfigError: the folder can't be written to, or is full.
+        ConfigError: the folder can't be written to, or the disk is full.
     """
     part, keys = path.with_name(f".{path.name}.part"), Keys(arena)
     try:
@@ -100,23 +102,23 @@ def save_wave(path: Path, arena: str, messages: Iterable[Detections]) -> Path | 
                 writer.put(keys.detections(message.camera), encode(message), message.t_ns)
         with part.open("rb+") as file:
             os.fsync(file.fileno())
-        kept = keep(path)
+        backup = back_up(path)
         os.replace(part, path)
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}") from None
     finally:
         part.unlink(missing_ok=True)
-    return kept
+    return backup
 
 
-def read_wave(path: Path) -> list[Detections]:
-    """The detections of a recording; of one that was cut off, those that were written, and what is none is skipped.
+def read_detections(path: Path) -> list[Detections]:
+    """Read the detections of a recording up to its end, even if it was cut off; invalid messages are skipped.
 
     Raises:
-        ConfigError: the file is missing, no recording, or holds no detections.
+        ConfigError: the file is missing, not an MCAP recording, or holds no detections.
     """
     messages = []
-    for key, data, _ in iterate(path, Counter()):
+    for key, data, _ in read_messages(path, Counter()):
         if not key.endswith("/detections"):
             continue
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The rig: named cameras and where they stand. Read and written as `rig.yaml`."""
+"""The rig: the cameras of an arena by name. Reads and writes `rig.yaml`."""
 
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,32 +8,33 @@ import msgspec
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
-from calib.rig.history import keep
+from calib.rig.history import back_up
 from camera_node.config import dump_yaml, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 
 T = TypeVar("T")
+INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")  # the fields that every camera needs
 
 
 class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cameras by name; and what calibration says of itself (free text and figures, for people and tools)."""
+    """Cameras by name, and what calibration reports of itself (free text and figures, for people and tools)."""
 
     cameras: dict[str, Camera]
     calibration: dict[str, Any] = {}
 
     def placed(self) -> dict[str, Camera]:
-        """The cameras whose pose is known."""
+        """The cameras with a pose."""
         return {name: camera for name, camera in self.cameras.items() if camera.T_world_cam is not None}
 
     def require_placed(self, path: Path) -> dict[str, Camera]:
-        """The placed cameras of the rig that was read from `path`.
+        """The cameras with a pose, of the rig that was read from `path`.
 
         Raises:
-            CalibrationError: fewer than one camera is placed.
+            CalibrationError: no camera has a pose.
         """
         placed = self.placed()
         if not placed:
-            raise CalibrationError(f"{path} places no camera; run python -m calib wand --rig {path}")
+            raise CalibrationError(f"no camera in {path} has a pose; run python -m calib wand --rig {path}")
         return placed
 
 
@@ -43,14 +44,14 @@ class _Entries(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def load_rig(path: Path) -> Rig:
-    """Read a rig; a camera without a pose is allowed, one without intrinsics is not.
+    """Read a rig; cameras need intrinsics, poses are optional.
 
     Raises:
-        ConfigError: the file is missing, broken, or has a field that no rig has.
+        ConfigError: the file is missing, broken, or has an unknown field.
         CalibrationError: a camera has no intrinsics.
     """
     for name, entry in _read(path, _Entries).cameras.items():
-        if missing := [key for key in ("width", "height", "fx", "fy", "cx", "cy") if key not in entry]:
+        if missing := [key for key in INTRINSICS if key not in entry]:
             raise CalibrationError(
                 f"camera '{name}' in {path} has no intrinsics ({', '.join(missing)} missing); "
                 f"run python -m calib intrinsics --camera {name}"
@@ -70,22 +71,22 @@ def _read(path: Path, kind: type[T]) -> T:
 
 
 def save_rig(rig: Rig, path: Path) -> Path | None:
-    """Write a rig atomically; fields at their defaults are left out.
+    """Write a rig atomically; fields at their defaults are omitted.
 
     Returns:
-        the name under which the file that was there before is kept (`calib undo` brings it back), if one was.
+        the backup of the previous file at `path`, if there was one (`calib undo` restores it).
 
     Raises:
         ConfigError: the folder can't be written to.
     """
-    kept = keep(path)
+    backup = back_up(path)
     try:
         write_atomically(path, dump_rig(rig))
     except BaseException:
-        if kept:
-            kept.unlink()
+        if backup:
+            backup.unlink()
         raise
-    return kept
+    return backup
 
 
 def dump_rig(rig: Rig) -> str:

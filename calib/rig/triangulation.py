@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A point seen by several placed cameras, and how well it is known: by their pixels and by their own poses."""
+"""Triangulates points that several placed cameras see, and predicts the covariance of such points."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,26 +13,31 @@ from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 
-Sees = Callable[[Camera, Array], Mask]
+Visibility = Callable[[Camera, Array], Mask]
 
-MIN_ANGLE = 0.01  # radians between rays, about: nearer to parallel, they fix no point
+MIN_ANGLE = 0.01  # rad between viewing rays, about: rays that are closer to parallel fix no point
 ITERATIONS = 8
 
 
 def triangulate_point(cameras: Sequence[Camera], uv: ArrayLike) -> Array:
-    """The point (3,) nearest to all viewing rays, then of the least squared reprojection error (Gauss-Newton).
+    """Locate one point seen by several cameras.
+
+    Starts at the point nearest to all viewing rays, then minimizes the squared reprojection error by Gauss-Newton.
 
     Args:
-        cameras: the N >= 2 placed cameras that saw it.
-        uv: (N, 2) raw pixels.
+        cameras: the N >= 2 placed cameras that saw the point.
+        uv: (N, 2) raw pixels, one row per camera.
+
+    Returns:
+        (3,) world, metres.
 
     Raises:
-        CalibrationError: the rays are too close to parallel to fix a point.
+        CalibrationError: the rays are too close to parallel to fix a point, or they meet behind the cameras.
     """
     uv = np.asarray(uv, float)
     p = _nearest_to_rays(cameras, uv)
     for _ in range(ITERATIONS):
-        J, r = _linearise(cameras, uv, p)
+        J, r = _linearize(cameras, uv, p)
         if not np.isfinite(J).all():
             break
         p = p + np.linalg.lstsq(J, r)[0]
@@ -53,27 +58,36 @@ def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:
     return np.asarray(np.linalg.solve(A, b), float)
 
 
-def _linearise(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, Array]:
-    """Jacobian (2N, 3) of the pixels by the point, and seen less expected pixels (2N,)."""
-    rows, rest = [], []
+def _linearize(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, Array]:
+    """Jacobian (2N, 3) of the pixels by the point, and residuals (2N,): observed less predicted pixels."""
+    jacobians, residuals = [], []
     for camera, pixel in zip(cameras, uv, strict=True):
         T = camera.matrix()
-        expected, J = camera.project_with_jacobian(transform(invert(T), p))
-        rows.append(J[0] @ T[:3, :3].T)
-        rest.append(pixel - expected[0])
-    return np.vstack(rows), np.concatenate(rest)
+        predicted, J = camera.project_with_jacobian(transform(invert(T), p))
+        jacobians.append(J[0] @ T[:3, :3].T)
+        residuals.append(pixel - predicted[0])
+    return np.vstack(jacobians), np.concatenate(residuals)
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
-    """Covariance (C d, C d) of d `parameters` of C cameras together, numbered as in `linearisation`."""
+class JointCovariance:
+    """Covariance (C d, C d) of C cameras together: of d `parameters` each, numbered as in `calib.rig.camera`."""
 
     parameters: tuple[int, ...]
     covariance: Array
 
+    @classmethod
+    def of_poses(cls, cameras: Sequence[Camera]) -> "JointCovariance":
+        """The cameras' own pose covariances, independent of each other; 0 for a camera without one."""
+        joint = np.zeros((6 * len(cameras), 6 * len(cameras)))
+        for k, camera in enumerate(cameras):
+            if camera.covariance is not None:
+                joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = camera.covariance
+        return cls(POSE, joint)
+
 
 def in_image(camera: Camera, points: Array) -> Mask:
-    """Which of the points (N, 3), world, lie in a camera's image."""
+    """(N,) whether points (N, 3), world, lie in the image of a camera."""
     return camera.sees(camera.project_world(points))
 
 
@@ -81,54 +95,47 @@ def point_covariances(
     cameras: Sequence[Camera],
     points: ArrayLike,
     sigma_px: float,
-    joint: Joint | None = None,
-    sees: Sees = in_image,
+    joint: JointCovariance | None = None,
+    sees: Visibility = in_image,
 ) -> Array:
-    """How well points would be known that all these cameras see, by their pixels and by their own poses.
+    """Predict the covariance of points that these cameras triangulate: from pixel noise and from calibration errors.
 
-    Least squares that takes the cameras for exact, as tracking does: with A = sum J^T J / sigma^2, pixel noise leaves
-    A^-1, and errors xi of the cameras move the point by A^-1 G xi, G = sum J^T (dpixel / dxi) / sigma^2.
+    Tracking treats the cameras as exact, and so does the least squares estimate here: with A = sum J^T J / sigma^2,
+    pixel noise contributes A^-1, and errors xi of the cameras move the point by A^-1 G xi, with
+    G = sum J^T (dpixel / dxi) / sigma^2.
 
     Args:
-        cameras: C placed cameras; a camera without covariance counts as known.
-        points: (N, 3) world.
-        sigma_px: standard deviation of a pixel coordinate.
-        joint: covariance of all cameras together; without it their poses count as independent, and lenses as exact.
-        sees: which points a camera sees.
+        cameras: C placed cameras; a camera without covariance counts as exact.
+        points: (N, 3) world, metres.
+        sigma_px: standard deviation of one pixel coordinate.
+        joint: covariance of all cameras together; by default independent poses and exact lenses.
+        sees: the visibility test, which returns (N,) whether a camera sees each point.
 
     Returns:
         (N, 3, 3) square metres; infinite where fewer than two cameras see the point, or their rays are parallel.
     """
     points = np.asarray(points, float).reshape(-1, 3)
     A, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
-    joint = joint or Joint(POSE, _independent(cameras))
+    joint = joint or JointCovariance.of_poses(cameras)
     d = len(joint.parameters)
     G = np.zeros((len(points), 3, d * len(cameras)))
     for k, camera in enumerate(cameras):
         seen = sees(camera, points)
-        J, by_camera = _pixel_jacobians(camera, points[seen], joint.parameters)
+        J, J_camera = _world_jacobians(camera, points[seen], joint.parameters)
         A[seen] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
-        G[seen, :, d * k : d * k + d] = np.swapaxes(J, 1, 2) @ by_camera / sigma_px**2
+        G[seen, :, d * k : d * k + d] = np.swapaxes(J, 1, 2) @ J_camera / sigma_px**2
         views[seen] += 1
     spread = np.linalg.eigvalsh(A)
     known = (views >= 2) & (spread[:, 0] > MIN_ANGLE**2 / 100 * spread[:, 2])
     inverse = np.linalg.inv(A[known])
-    moved = inverse @ G[known]
+    by_camera = inverse @ G[known]
     covariance = np.full((len(points), 3, 3), np.inf)
-    covariance[known] = inverse + moved @ joint.covariance @ np.swapaxes(moved, 1, 2)
+    covariance[known] = inverse + by_camera @ joint.covariance @ np.swapaxes(by_camera, 1, 2)
     return covariance
 
 
-def _independent(cameras: Sequence[Camera]) -> Array:
-    joint = np.zeros((6 * len(cameras), 6 * len(cameras)))
-    for k, camera in enumerate(cameras):
-        if camera.covariance is not None:
-            joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = camera.covariance
-    return joint
-
-
-def _pixel_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...]) -> tuple[Array, Array]:
-    """How the pixels of points (N, 3) change with the point in the world (N, 2, 3), and with the camera (N, 2, d)."""
+def _world_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...]) -> tuple[Array, Array]:
+    """Derivatives of the pixels of points (N, 3), world: by the point (N, 2, 3) and by the camera (N, 2, d)."""
     T = camera.matrix()
     local = transform(invert(T), points)
     J = camera.project_with_jacobian(local)[1]
@@ -136,10 +143,10 @@ def _pixel_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...])
 
 
 def camera_jacobians(camera: Lens, points: Array, parameters: tuple[int, ...] = POSE) -> Array:
-    """(N, 2, d) how the pixels of points (N, 3), camera frame, change with the camera's `parameters`.
+    """(N, 2, d) derivatives of the pixels of points (N, 3), camera frame, by the camera's `parameters`.
 
-    They are numbered as in `problem`; time offset and drift leave points at rest where they are.
+    Parameters are numbered as in `calib.rig.camera`. Time offset and drift do not move points at rest.
     """
     _, _, J_pose, J_lens = pixel_jacobians(camera, points)
-    still = np.zeros((len(points), 2, 2))
-    return np.concatenate([J_pose, still, J_lens], axis=2)[:, :, list(parameters)]
+    clock = np.zeros((len(points), 2, 2))
+    return np.concatenate([J_pose, clock, J_lens], axis=2)[:, :, list(parameters)]

@@ -20,7 +20,7 @@ from calib.wand.quality.lens_change import find_changes
 from calib.wand.report import CameraReport, Outlier, WandReport
 from calib.wand.scale import Distance, compare, loosen
 from calib.wand.solution import Solution
-from calib.world.world_frame import move, upright
+from calib.world.world_frame import move_rig, upright_frame
 from camera_node.arrays import Array
 from camera_node.geometry.pose import Pose
 
@@ -143,8 +143,8 @@ def _place(rig: Rig, solution: Solution, told: Told, covariance: CameraCovarianc
             covariance=tuple(tuple(row) for row in joint[k, :, k].tolist()),
             lens_sigma=parameter_sigma(lens, cameras[name].lens_sigma, lens_sigma[k]),
         )
-    T_world = upright(state.cameras, state.motion[:, 0].reshape(-1, 3))
-    return move(msgspec.structs.replace(rig, cameras=cameras), T_world)
+    T_world = upright_frame(state.cameras, state.motion[:, 0].reshape(-1, 3))
+    return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 
 
 def _report(solution: Solution, told: Told, joint: Array) -> WandReport:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Roundels that lie still at known places: found in a recording by their geometry, they fix the world.
+"""Locates landmarks, which are stationary roundels at surveyed positions, by their mutual distances.
 
-Nobody needs to say which roundel is which: hypotheses come from three places whose distances three triangulated points
-have (two, where the places lie on a line), and the one under which most places are seen by two cameras or more wins.
+Roundels need no numbers. Hypotheses are the motions that bring three landmarks to three triangulated points with the
+same mutual distances (two, if the landmarks lie on a line). The hypothesis under which two cameras or more see most
+landmarks wins.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,103 +16,110 @@ from numpy.typing import NDArray
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, transform
 from calib.rig.triangulation import triangulate_point
+from calib.world.world_frame import is_collinear
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import rigid_motions
 from camera_node.protocol.messages import Detections
 
-STILL_PX = 2.0  # a roundel that lies still stays within
-PRESENT = 0.3  # of a camera's frames, that a roundel must be in
-FIT_PX = 6.0  # from where a place projects to, a roundel may be seen: rig, survey and camera all have errors
-SLACK = (0.02, 0.03)  # of a distance between places: metres, and of the distance
-LINE = 0.02  # second over first extent: below, places lie on a line
+STILL_PX = 2.0  # radius within which a stationary roundel is detected
+MIN_PRESENCE = 0.3  # fraction of a camera's frames with the roundel
+FIT_PX = 6.0  # reprojection distance of a match: rig, survey and detection all have errors
+MERGE_M = 0.02  # distance within which triangulated points are one
+DISTANCE_SLACK = (0.02, 0.03)  # of a distance between landmarks: metres, and fraction of the distance
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """A roundel that stayed where it is before one camera: its mean pixel (2,), and its number or -1."""
+class StillRoundel:
+    """A stationary roundel in the image of one camera: its mean pixel (2,), and its number or -1."""
 
     camera: str
     uv: Array
     id: int
 
 
-def still_roundels(messages: Sequence[Detections]) -> list[Sighting]:
-    """The roundels of each camera that are in the same place in 30 % of its frames or more."""
+@dataclass(frozen=True, slots=True)
+class _Hypothesis:
+    """A motion of the landmarks with the roundels that match: number of landmarks that two cameras or more see, mean
+    reprojection distance in pixels, and the roundels by landmark."""
+
+    count: int
+    distance_px: float
+    matches: dict[str, list[StillRoundel]]
+
+    def assignment(self) -> dict[str, frozenset[int]]:
+        """Identities of the roundels, of the landmarks that two cameras or more see."""
+        return {name: frozenset(map(id, found)) for name, found in self.matches.items() if len(found) >= 2}
+
+
+def find_still_roundels(messages: Sequence[Detections]) -> list[StillRoundel]:
+    """Find the roundels that each camera detects at the same pixel in 30 % of its frames or more."""
     frames: dict[str, list[tuple[Array, NDArray[np.int32]]]] = {}
     for message in messages:
         columns = message.unpack()
         frames.setdefault(message.camera, []).append((columns.uv, columns.id))
-    found = []
-    for camera, seen in frames.items():
-        uv, ids = (np.concatenate(part) for part in zip(*seen, strict=True))
-        left = np.ones(len(uv), bool)
-        while left.any():
-            mine = _around(uv, left)
-            left &= ~mine
-            if mine.sum() >= max(PRESENT * len(seen), 1):
-                found.append(Sighting(camera, uv[mine].mean(axis=0), int(np.median(ids[mine]))))
-    return found
+    roundels = []
+    for camera, columns in frames.items():
+        uv, ids = (np.concatenate(part) for part in zip(*columns, strict=True))
+        remaining = np.ones(len(uv), bool)
+        while remaining.any():
+            cluster = _first_cluster(uv, remaining)
+            remaining &= ~cluster
+            if cluster.sum() >= max(MIN_PRESENCE * len(columns), 1):
+                roundels.append(StillRoundel(camera, uv[cluster].mean(axis=0), int(np.median(ids[cluster]))))
+    return roundels
 
 
-def _around(uv: Array, left: Mask) -> Mask:
-    """Which of the pixels (N, 2) that are left stay with the first of them, which is always among them."""
-    first = int(left.argmax())
-    mine = left & (np.linalg.norm(uv - uv[first], axis=1) < STILL_PX)
-    centre = np.median(uv[mine], axis=0)
-    mine = left & (np.linalg.norm(uv - centre, axis=1) < STILL_PX)
-    mine[first] = True
-    return mine
+def _first_cluster(uv: Array, remaining: Mask) -> Mask:
+    """(N,) the remaining pixels (N, 2) near the first one, which is always included."""
+    first = int(remaining.argmax())
+    cluster = remaining & (np.linalg.norm(uv - uv[first], axis=1) < STILL_PX)
+    centre = np.median(uv[cluster], axis=0)
+    cluster = remaining & (np.linalg.norm(uv - centre, axis=1) < STILL_PX)
+    cluster[first] = True
+    return cluster
 
 
-def is_line(places: Array) -> bool:
-    """Whether places (K, 3) lie on a line, or nearly."""
-    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < LINE * spread[0])
-
-
-def locate_places(
-    cameras: Mapping[str, Camera], sightings: Sequence[Sighting], places: Mapping[str, Array]
+def locate_landmarks(
+    cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel], landmarks: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Where roundels at known places are, in the world of the rig.
+    """Locate landmarks in the rig's world.
 
     Args:
         cameras: placed cameras.
-        sightings: roundels that lie still; numbers are used where they are the names of places.
-        places: (3,) metres by name, in a world of their own.
+        roundels: stationary roundels; a number that is the name of a landmark identifies it.
+        landmarks: surveyed positions (3,) by name, metres, in a frame of their own.
 
     Returns:
-        (3,) metres in the rig's world, by name; places that fewer than two cameras see are missing.
+        (3,) metres in the rig's world, by name; landmarks that fewer than two cameras see are missing.
 
     Raises:
         CalibrationError: no arrangement of the roundels has these distances, or two different ones have.
     """
-    seen = [s for s in sightings if s.camera in cameras]
-    if numbered := [s for s in seen if str(s.id) in places]:
-        return _triangulate_all(cameras, {n: [s for s in numbered if str(s.id) == n] for n in places})
-    points = _pair_points(cameras, seen)
-    target = np.array(list(places.values()), float)
-    best: list[tuple[tuple[int, float], dict[str, list[Sighting]]]] = []
-    for T in _hypotheses(points, target):
-        matched = _match(cameras, seen, dict(zip(places, transform(T, target), strict=True)))
-        best.append((_score(cameras, matched, T, places), matched))
-    if not best or max(score for score, _ in best)[0] < min(3, len(places)):
+    roundels = [r for r in roundels if r.camera in cameras]
+    if numbered := [r for r in roundels if str(r.id) in landmarks]:
+        return _triangulate(cameras, {name: [r for r in numbered if str(r.id) == name] for name in landmarks})
+    points = _triangulate_pairs(cameras, roundels)
+    surveyed = np.array(list(landmarks.values()), float)
+    hypotheses = [
+        _match(cameras, roundels, dict(zip(landmarks, transform(T, surveyed), strict=True)))
+        for T in _candidate_motions(points, surveyed)
+    ]
+    needed = min(3, len(landmarks))
+    if max((h.count for h in hypotheses), default=0) < needed:
+        counts = ", ".join(f"{name} {sum(r.camera == name for r in roundels)}" for name in sorted(cameras))
         raise CalibrationError(
-            f"no {min(3, len(places))} of the roundels that lie still (by camera: {_tell(cameras, seen)}) have the "
-            "distances of the places; do two cameras see each, is the file in metres, and is the rig's scale right?"
+            f"no {needed} of the stationary roundels (by camera: {counts}) have the distances of the surveyed "
+            "points; check that two cameras see each roundel, that the file is in metres, and the rig's scale"
         )
-    best.sort(key=lambda entry: entry[0], reverse=True)
-    _require_unique(cameras, best)
-    return _triangulate_all(cameras, best[0][1])
+    hypotheses.sort(key=lambda h: (h.count, -h.distance_px), reverse=True)
+    _check_unique(hypotheses)
+    return _triangulate(cameras, hypotheses[0].matches)
 
 
-def _tell(cameras: Mapping[str, Camera], seen: Sequence[Sighting]) -> str:
-    return ", ".join(f"{name} {sum(s.camera == name for s in seen)}" for name in sorted(cameras))
-
-
-def _pair_points(cameras: Mapping[str, Camera], seen: Sequence[Sighting]) -> Array:
-    """(N, 3) points at which two cameras' sightings may meet: most are nobody's, but the true ones are among them."""
+def _triangulate_pairs(cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel]) -> Array:
+    """(N, 3) points where the rays of two cameras meet: most are wrong pairs, but all true points are included."""
     points = []
-    for a, b in combinations(seen, 2):
+    for a, b in combinations(roundels, 2):
         if a.camera == b.camera:
             continue
         pair = [cameras[a.camera], cameras[b.camera]]
@@ -119,17 +127,17 @@ def _pair_points(cameras: Mapping[str, Camera], seen: Sequence[Sighting]) -> Arr
             p = triangulate_point(pair, [a.uv, b.uv])
         except CalibrationError:
             continue
-        off = [np.linalg.norm(c.project_world(p)[0] - s.uv) for c, s in zip(pair, (a, b), strict=True)]
-        if max(off) < FIT_PX:
+        distances = [np.linalg.norm(c.project_world(p)[0] - r.uv) for c, r in zip(pair, (a, b), strict=True)]
+        if max(distances) < FIT_PX:
             points.append(p)
-    return _merge(points)
+    return _merge_points(points)
 
 
-def _merge(points: Sequence[Array]) -> Array:
-    """(N, 3) the means of groups of points that lie within 2 cm of their first."""
+def _merge_points(points: Sequence[Array]) -> Array:
+    """(N, 3) the means of groups of points within 2 cm of the first point of the group."""
     groups: list[list[Array]] = []
     for p in points:
-        near = next((group for group in groups if np.linalg.norm(group[0] - p) < SLACK[0]), None)
+        near = next((group for group in groups if np.linalg.norm(group[0] - p) < MERGE_M), None)
         if near is None:
             groups.append([p])
         else:
@@ -137,88 +145,73 @@ def _merge(points: Sequence[Array]) -> Array:
     return np.array([np.mean(group, axis=0) for group in groups]).reshape(-1, 3)
 
 
-def _hypotheses(points: Array, target: Array) -> Iterator[Array]:
-    """Motions (4, 4) that bring three places (two, on a line) to points with the same distances."""
-    count = 2 if is_line(target) else 3
-    between = np.linalg.norm(points[:, None] - points[None], axis=2)
-    for some in combinations(range(len(target)), count):
-        chosen = target[list(some)]
-        if count == 3 and is_line(chosen):
+def _candidate_motions(points: Array, surveyed: Array) -> Iterator[Array]:
+    """Motions (4, 4) that bring three landmarks (two, on a line) to points with the same mutual distances."""
+    count = 2 if is_collinear(surveyed) else 3
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    for rows in combinations(range(len(surveyed)), count):
+        chosen = surveyed[list(rows)]
+        if count == 3 and is_collinear(chosen):
             continue
-        for found in _with_distances(between, chosen):
+        for found in _rows_with_distances(distances, chosen):
             yield rigid_motions(chosen, points[list(found)])
 
 
-def _with_distances(between: Array, places: Array) -> Iterator[tuple[int, ...]]:
-    """Rows of points whose mutual distances are those of the places, in their order."""
-    wanted = np.linalg.norm(places[:, None] - places[None], axis=2)
+def _rows_with_distances(distances: Array, chosen: Array) -> Iterator[tuple[int, ...]]:
+    """Rows of the matrix of `distances` whose mutual distances are those of the chosen landmarks, in their order."""
+    absolute, relative = DISTANCE_SLACK
+    wanted = np.linalg.norm(chosen[:, None] - chosen[None], axis=2)
     near = [
-        [np.abs(between - wanted[i, j]) < SLACK[0] + SLACK[1] * wanted[i, j] for j in range(len(places))]
-        for i in range(len(places))
+        [np.abs(distances - wanted[i, j]) < absolute + relative * wanted[i, j] for j in range(len(chosen))]
+        for i in range(len(chosen))
     ]
     for a, b in np.argwhere(near[0][1]):
-        if len(places) == 2:
+        if len(chosen) == 2:
             yield int(a), int(b)
         else:
             yield from ((int(a), int(b), int(c)) for c in np.flatnonzero(near[0][2][a] & near[1][2][b]))
 
 
 def _match(
-    cameras: Mapping[str, Camera], seen: Sequence[Sighting], places: Mapping[str, Array]
-) -> dict[str, list[Sighting]]:
-    """For each place the nearest sighting of every camera, where it is near enough."""
-    matched: dict[str, list[Sighting]] = {name: [] for name in places}
+    cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel], landmarks: Mapping[str, Array]
+) -> _Hypothesis:
+    """Match each landmark (3,), in the rig's world, with the nearest roundel of every camera, if it is near enough."""
+    matches: dict[str, list[StillRoundel]] = {name: [] for name in landmarks}
+    matched_px: dict[str, list[float]] = {name: [] for name in landmarks}
     for camera_name, camera in cameras.items():
-        mine = [s for s in seen if s.camera == camera_name]
-        if not mine:
+        own = [r for r in roundels if r.camera == camera_name]
+        if not own:
             continue
-        uv = camera.project_world(np.array(list(places.values())))
-        gaps = np.linalg.norm(uv[:, None] - np.array([s.uv for s in mine])[None], axis=2)
-        for row, name in enumerate(places):
-            k = int(np.nanargmin(gaps[row])) if np.isfinite(gaps[row]).any() else -1
-            if k >= 0 and gaps[row, k] < FIT_PX:
-                matched[name].append(mine[k])
-    return matched
+        uv = camera.project_world(np.array(list(landmarks.values())))
+        distances = np.linalg.norm(uv[:, None] - np.array([r.uv for r in own])[None], axis=2)
+        for name, row in zip(landmarks, distances, strict=True):
+            k = int(np.nanargmin(row)) if np.isfinite(row).any() else -1
+            if k >= 0 and row[k] < FIT_PX:
+                matches[name].append(own[k])
+                matched_px[name].append(float(row[k]))
+    counted = [px for px in matched_px.values() if len(px) >= 2]
+    distance_px = float(np.mean(np.concatenate(counted))) if counted else np.inf
+    return _Hypothesis(len(counted), distance_px, matches)
 
 
-def _score(
-    cameras: Mapping[str, Camera], matched: dict[str, list[Sighting]], T: Array, places: Mapping[str, Array]
-) -> tuple[int, float]:
-    """Places that two cameras see, and less the mean distance of sightings from where places project to."""
-    good = {name: s for name, s in matched.items() if len(s) >= 2}
-    off = [
-        np.linalg.norm(cameras[s.camera].project_world(transform(T, places[name]))[0] - s.uv)
-        for name, mine in good.items()
-        for s in mine
-    ]
-    return len(good), -float(np.mean(off)) if off else -np.inf
-
-
-def _require_unique(
-    cameras: Mapping[str, Camera], best: list[tuple[tuple[int, float], dict[str, list[Sighting]]]]
-) -> None:
-    """Raise where another assignment is as good as the best: then a turn of the places is anybody's guess."""
-    (count, off), first = best[0]
-    labels = _labels(first)
-    for (other, other_off), matched in best[1:]:
-        if other < count or other_off < 2 * off - 0.5:
+def _check_unique(hypotheses: Sequence[_Hypothesis]) -> None:
+    """Raise CalibrationError if another assignment is as good as that of the first hypothesis; the best come first."""
+    best = hypotheses[0]
+    for other in hypotheses[1:]:
+        if other.count < best.count or other.distance_px > 2 * best.distance_px + 0.5:
             return
-        if _labels(matched) != labels:
+        if other.assignment() != best.assignment():
             raise CalibrationError(
-                "the places can be seen in two ways (they look the same after a turn); use unequal distances, such "
+                "the surveyed points match the roundels in two ways (they are symmetric); use unequal distances, such "
                 "as an L with legs of 0.3 m and 0.5 m, or number the roundels in the recording"
             )
 
 
-def _labels(matched: dict[str, list[Sighting]]) -> dict[str, frozenset[int]]:
-    return {name: frozenset(map(id, mine)) for name, mine in matched.items() if len(mine) >= 2}
-
-
-def _triangulate_all(
-    cameras: Mapping[str, Camera], matched: Mapping[str, Sequence[Sighting]]
+def _triangulate(
+    cameras: Mapping[str, Camera], matches: Mapping[str, Sequence[StillRoundel]]
 ) -> dict[str, Array]:
-    found = {}
-    for name, mine in matched.items():
-        if len({s.camera for s in mine}) >= 2:
-            found[name] = triangulate_point([cameras[s.camera] for s in mine], [s.uv for s in mine])
-    return found
+    return {
+        name: triangulate_point([cameras[r.camera] for r in found], [r.uv for r in found])
+        for name, found in matches.items()
+        if len({r.camera for r in found}) >= 2
+    }

@@ -66,37 +66,38 @@ class DiscPoses:
 
 
 @dataclass(frozen=True, slots=True)
-class _Outlines:
-    """What poses are computed from: (N, 5) u, v, major, minor, angle, and the measured offsets if there are any."""
+class _Offsets:
+    """Measured positions of N discs' centres: `offset_px` (N, 2) and `pose_cov` (N, 7, 7) of `DetectedRoundels`."""
 
-    ellipses: Array
-    offset_px: Array | None = None
-    pose_cov: Array | None = None
+    offset_px: Array
+    pose_cov: Array
 
 
 def locate(roundel: Roundel, lens: Lens, diameter_m: float) -> tuple[DiscPose, DiscPose] | None:
-    """Both poses of one disc, the likelier first, as in `locate_all`; None where the lens has no inverse."""
-    outline = _Outlines(np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]]))
+    """Compute both poses of one disc, as in `locate_all`; None where the lens has no inverse."""
+    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
+    offsets = None
     if roundel.offset_px is not None and roundel.pose_cov is not None:
-        outline = _Outlines(outline.ellipses, roundel.offset_px[None], roundel.pose_cov[None])
-    return _locate(outline, lens, diameter_m)[0]
+        offsets = _Offsets(roundel.offset_px[None], roundel.pose_cov[None])
+    return _locate(ellipse, lens, diameter_m, offsets)[0]
 
 
 def locate_all(roundels: Roundels, lens: Lens, diameter_m: float) -> DiscPoses:
-    """Both poses of each disc of outer diameter `diameter_m`, the likelier first.
+    """Compute both poses of each disc of outer diameter `diameter_m`, the likelier first.
 
-    The ellipse's boundary goes through the lens, point by point: that a circle's image through distortion is no
-    ellipse then costs nothing to first order. The conic there is decomposed (Forsyth et al. 1991; Safaee-Rad et al.
+    Points of each ellipse are undistorted and a conic is fitted to them, because the image of a circle through a lens
+    with distortion is not an ellipse. Decomposing the conic gives both poses (Forsyth et al. 1991; Safaee-Rad et al.
     1992).
 
-    The outer ellipse does not distinguish the two poses. The image of the disc's own centre does. Of
-    `DetectedRoundels`, both poses are adjusted to the ellipse and to the measured offset, and the probability is that
-    of the remaining chi-square with two degrees of freedom, scaled by `SCATTER`. Otherwise both are 0.5.
+    The outer ellipse does not distinguish the two poses; the image of the disc's own centre does. For
+    `DetectedRoundels`, both poses are adjusted to the ellipse and the measured offset, and their probabilities follow
+    from the remaining chi-square with two degrees of freedom, divided by `SCATTER`. Otherwise both are 0.5.
     """
     ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
-    if not isinstance(roundels, DetectedRoundels):
-        return _locate(_Outlines(ellipses), lens, diameter_m)
-    return _locate(_Outlines(ellipses, roundels.offset_px, roundels.pose_cov), lens, diameter_m)
+    measured = isinstance(roundels, DetectedRoundels)
+    return _locate(
+        ellipses, lens, diameter_m, _Offsets(roundels.offset_px, roundels.pose_cov) if measured else None
+    )
 
 
 def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
@@ -123,35 +124,38 @@ def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) 
     return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
 
 
-def _locate(outlines: _Outlines, lens: Lens, diameter_m: float) -> DiscPoses:
-    ellipses = outlines.ellipses
+def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | None) -> DiscPoses:
+    """Both poses of ellipses (N, 5): u, v, major, minor, angle."""
     n = len(ellipses)
     xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
-    seen = np.isfinite(xy).all(axis=(1, 2))
+    valid = np.isfinite(xy).all(axis=(1, 2))
     position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
     odds = np.full((n, 2), 0.5)
-    if seen.any():
-        Q, radius = _fit_conics(xy[seen]), diameter_m / 2
-        position[seen], normal[seen] = decompose(Q, radius)
-        if outlines.offset_px is not None and outlines.pose_cov is not None:
-            disc_centres = lens.normalise(ellipses[seen, :2] + outlines.offset_px[seen])
-            shapes = shape_of(np.asarray(np.linalg.inv(Q), float))
-            measured = np.concatenate([shapes, disc_centres], axis=1)
-            cov = covariance_through(lens, ellipses[seen], outlines.pose_cov[seen])
-            poses = _adjust((position[seen], normal[seen]), radius, measured, cov)
-            position[seen], normal[seen], odds[seen] = poses
+    if valid.any():
+        Q, radius = _fit_conics(xy[valid]), diameter_m / 2
+        position[valid], normal[valid] = decompose(Q, radius)
+        if offsets is not None:
+            offsets = _Offsets(offsets.offset_px[valid], offsets.pose_cov[valid])
+            measured, cov = _measure(Q, lens, ellipses[valid], offsets)
+            poses = _adjust(position[valid], normal[valid], radius, measured, cov)
+            position[valid], normal[valid], odds[valid] = poses
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
-    order = np.argsort(-odds, axis=1, kind="stable")
-    pick = np.arange(n)[:, None], order
+    pick = np.arange(n)[:, None], np.argsort(-odds, axis=1, kind="stable")
     return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick])
 
 
+def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[Array, Array]:
+    """Measurements (N, 7) for `adjust`, and their covariances (N, 7, 7)."""
+    centres = lens.normalise(ellipses[:, :2] + offsets.offset_px)
+    shapes = shape_of(np.asarray(np.linalg.inv(Q), float))
+    return np.concatenate([shapes, centres], axis=1), covariance_through(lens, ellipses, offsets.pose_cov)
+
+
 def _adjust(
-    poses: tuple[Array, Array], radius: float, measured: Array, covariance: Array
+    position: Array, normal: Array, radius: float, measured: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Adjust positions and normals (N, 2, 3) to what was measured (N, 7), as `adjust` does; also their odds (N, 2)."""
-    position, normal = poses
-    measured, covariance = np.repeat(measured, 2, axis=0), np.repeat(covariance, 2, axis=0)  # of both poses
+    """Adjust both poses (N, 2, 3) of each disc to its measurements; also returns their probabilities (N, 2)."""
+    measured, covariance = np.repeat(measured, 2, axis=0), np.repeat(covariance, 2, axis=0)
     c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, measured, covariance)
     return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
 

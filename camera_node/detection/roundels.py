@@ -15,14 +15,14 @@ class Roundel:
     """One roundel in an image, in raw pixels.
 
     Attributes:
-        uv: (2,) centre of the outer ellipse. Where the disc's own centre projects is another point.
+        uv: (2,) centre of the outer ellipse, which is not the image of the disc's own centre.
         cov: (2, 2) covariance of `uv`, square pixels.
         axes_px: (2,) full major and minor axis of the outer ellipse.
         angle_rad: direction of the major axis from +u towards +v, in (-pi/2, pi/2].
         ratio: inner over outer diameter.
-        contrast: bright level less dark level, grey levels of 255.
+        contrast: bright minus dark, grey levels of 255.
         id: the number printed in the roundel or given by a file, or None.
-        track: a number that stays with the roundel from frame to frame, or None.
+        track: number of the roundel in all frames in which it is tracked, or None.
         offset_px, pose_cov: as in `DetectedRoundels`; None unless a detector measured them.
     """
 
@@ -43,7 +43,7 @@ class Roundels:
     """All roundels of one frame, as columns of N rows. `id` and `track` are -1 where there is none.
 
     Shapes: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), angle_rad, ratio, contrast, id and track (N,).
-    What a source of detections does not know is NaN.
+    Unknown values are NaN.
     """
 
     uv: Array
@@ -57,7 +57,7 @@ class Roundels:
 
     @classmethod
     def from_points(cls, uv: Array, sigma_px: float, id: NDArray[np.int32] | None = None) -> "Roundels":
-        """Detections of which only the centre (N, 2) is known, each coordinate to `sigma_px`."""
+        """Detections with centres (N, 2) alone, each coordinate with the standard deviation `sigma_px`."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         n = len(uv)
         unknown, none = np.full(n, np.nan), np.full(n, -1, np.int32)
@@ -70,7 +70,7 @@ class Roundels:
         return len(self.uv)
 
     def select(self, rows: NDArray) -> "Roundels":
-        """The rows that a mask or an index array names."""
+        """The rows that a mask or an index array selects."""
         return Roundels(*(getattr(self, name)[rows] for name in Roundels.__slots__))
 
     def __getitem__(self, k: int) -> Roundel:
@@ -92,13 +92,13 @@ class Roundels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedRoundels(Roundels):
-    """The N roundels that a detector found in one image, with what only a fit to the image measures.
+    """The N roundels that a detector found in one image, with the measurements that only a fit to the image gives.
 
     Attributes:
         offset_px: (N, 2) vectors from the outer ellipses' centres `uv` to the images of the discs' own centres,
             measured by the position of the inner ellipse in the outer one.
-        pose_cov: (N, 7, 7) covariance of what a pose is computed from: of `uv`, of the ellipse's shape xx, xy, yy (it
-            is `uv` + A q, |q| = 1, A symmetric) and of the offset; pixels.
+        pose_cov: (N, 7, 7) covariance of the measurements of a pose, pixels: `uv`, the ellipse's shape as xx, xy, yy
+            of A (the ellipse is `uv` + A q, |q| = 1, A symmetric), and the offset.
         n_postponed: positions in the image that may hold a roundel and were not fitted, because the work for a frame
             is bounded. The next frame begins with them. It is 0 unless the image has hundreds of untracked ring-like
             shapes.
@@ -109,7 +109,7 @@ class DetectedRoundels(Roundels):
     n_postponed: int = 0
 
     def select(self, rows: NDArray) -> "DetectedRoundels":
-        """The rows that a mask or an index array names."""
+        """The rows that a mask or an index array selects."""
         names = (*Roundels.__slots__, "offset_px", "pose_cov")
         columns = {name: getattr(self, name)[rows] for name in names}
         return DetectedRoundels(**columns, n_postponed=self.n_postponed)

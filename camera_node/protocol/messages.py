@@ -12,6 +12,17 @@ from camera_node.detection.roundels import Roundels
 VERSION = 1
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
+F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
+COLUMNS = {  # of detections: type and number of values in each row
+    "uv": (F8, 2),
+    "cov": (F4, 3),
+    "axes_px": (F4, 2),
+    "angle_rad": (F4, 1),
+    "ratio": (F4, 1),
+    "contrast": (F4, 1),
+    "id": (I4, 1),
+    "track": (I4, 1),
+}
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -79,18 +90,9 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def pack(cls, roundels: Roundels, **header) -> "Detections":
         """Build a message from `roundels`; `header` contains the fields that are not columns."""
-        cov = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
-        return cls(
-            uv=roundels.uv.astype("<f8").tobytes(),
-            cov=cov.astype("<f4").tobytes(),
-            axes_px=roundels.axes_px.astype("<f4").tobytes(),
-            angle_rad=roundels.angle_rad.astype("<f4").tobytes(),
-            ratio=roundels.ratio.astype("<f4").tobytes(),
-            contrast=roundels.contrast.astype("<f4").tobytes(),
-            id=roundels.id.astype("<i4").tobytes(),
-            track=roundels.track.astype("<i4").tobytes(),
-            **header,
-        )
+        columns = {name: getattr(roundels, name) for name in COLUMNS}
+        columns["cov"] = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
+        return cls(**{name: columns[name].astype(COLUMNS[name][0]).tobytes() for name in COLUMNS}, **header)
 
     def __len__(self) -> int:
         return len(self.uv) // 16
@@ -98,34 +100,34 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
     def unpack(self) -> Roundels:
         """Convert the columns to arrays."""
-        cov = _column(self.cov, "<f4", 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        return Roundels(
-            _column(self.uv, "<f8", 2),
-            cov,
-            _column(self.axes_px, "<f4", 2),
-            *(_column(c, "<f4", 1)[:, 0] for c in (self.angle_rad, self.ratio, self.contrast)),
-            *(np.frombuffer(c, "<i4").astype(np.int32) for c in (self.id, self.track)),
-        )
+        columns = {name: self._column(name) for name in COLUMNS}
+        columns["cov"] = columns["cov"][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        return Roundels(**columns)
+
+    def _column(self, name: str) -> np.ndarray:
+        dtype, width = COLUMNS[name]
+        column = np.frombuffer(getattr(self, name), dtype).astype(np.int32 if dtype is I4 else float)
+        return column if width == 1 else column.reshape(-1, width)
 
     @np.errstate(invalid="ignore")  # as in `unpack`
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive definite and small."""
-        n, rest = divmod(len(self.uv), 16)
-        if rest or n > MAX_ROUNDELS:
-            raise MessageError(f"column uv of {len(self.uv)} bytes")
-        sizes = {"cov": 12, "axes_px": 8, "angle_rad": 4, "ratio": 4, "contrast": 4, "id": 4, "track": 4}
-        for name, size in sizes.items():
-            if len(getattr(self, name)) != n * size:
-                raise MessageError(f"column {name} of {len(getattr(self, name))} bytes for {n} roundels")
+        n = len(self)
+        if n > MAX_ROUNDELS:
+            raise MessageError(f"{n} roundels; a message has at most {MAX_ROUNDELS}")
+        for name, (dtype, width) in COLUMNS.items():
+            size = len(getattr(self, name))
+            if size != n * width * dtype.itemsize:
+                raise MessageError(f"column {name} of {size} bytes for {n} roundels")
         if not (self.camera and 0 < self.width <= 32768 and 0 < self.height <= 32768):
             raise MessageError("no camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
-        uu, uv, vv = _column(self.cov, "<f4", 3).T  # comparisons with NaN are False
+        uu, uv, vv = self._column("cov").T  # comparisons with NaN are False
         valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
-        if not (valid.all() and (np.abs(np.frombuffer(self.uv, "<f8")) < 1e5).all()):
+        if not (valid.all() and (np.abs(self._column("uv")) < 1e5).all()):
             raise MessageError("a centre or a covariance is NaN or out of range")
 
 
@@ -209,7 +211,3 @@ def decode(data: bytes, kind: type[T]) -> T:
     if check:
         check()
     return message
-
-
-def _column(data: bytes, dtype: str, width: int) -> np.ndarray:
-    return np.frombuffer(data, dtype).reshape(-1, width).astype(float)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A robot's pose as ROS 2's own messages, in bytes: little-endian CDR as rmw implementations put it on the wire.
+"""Encodes a robot's pose as ROS 2 messages: little-endian CDR, the bytes of rmw implementations.
 
-Turned into ROS's conventions (REP 103, REP 105, the comments of `geometry_msgs`): quaternions x, y, z, w; covariances
-of position, then of rotation about the frame's fixed axes; a twist in the frame of what moves.
+The conventions are ROS's (REP 103, REP 105, the comments of `geometry_msgs`): quaternions x, y, z, w; covariances of
+position, then of rotation about the frame's fixed axes; a twist in the frame of the moving body.
 """
 
 import struct
@@ -13,7 +13,7 @@ from camera_node.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz, skew
 from fusion.protocol.messages import RobotPose
 
-# What ROS 2 calls a message, and the hash of its definition (REP 2016), the same in all releases since Iron.
+# ROS 2 name of a message -> hash of its definition (REP 2016), the same in all releases since Iron
 TYPE_HASHES = {
     "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
@@ -22,7 +22,7 @@ TYPE_HASHES = {
 
 
 class Cdr:
-    """Bytes in the making. Each number stands at a multiple of its size, counted from behind the four-byte head."""
+    """Encodes CDR. The offset of each number behind the four-byte header is a multiple of its size."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -52,7 +52,7 @@ class Cdr:
 
 
 def pose_stamped(pose: RobotPose, frame: str) -> bytes:
-    """`geometry_msgs/msg/PoseStamped` in the frame named `frame`, our world."""
+    """`geometry_msgs/msg/PoseStamped` in the frame named `frame`, which is the arena's world."""
     cdr = Cdr()
     _put_header(cdr, pose, frame)
     _put_pose(cdr, pose)
@@ -75,7 +75,7 @@ def odometry(pose: RobotPose, frame: str, child: str) -> bytes:
 
 
 def transform(pose: RobotPose, frame: str, child: str) -> bytes:
-    """`tf2_msgs/msg/TFMessage` of one transform, of `child` in `frame`."""
+    """`tf2_msgs/msg/TFMessage` with one transform, that of `child` in `frame`."""
     cdr = Cdr()
     cdr.u32(1)
     _put_header(cdr, pose, frame)
@@ -85,16 +85,17 @@ def transform(pose: RobotPose, frame: str, child: str) -> bytes:
 
 
 def covariance(pose: RobotPose, R: Array, twist: Array) -> Array:
-    """(12, 12) covariance in ROS's order: position and rotation in the world, velocity and turn in the body's frame.
+    """(12, 12) covariance in ROS's order: position, rotation (world), velocity, angular velocity (body's frame).
 
-    With R exp(theta) for the true rotation, R^T v is off by R^T dv + v_body x theta, and the turn likewise.
+    With the true rotation R exp(theta), the error of v_body = R^T v is R^T dv + v_body x theta to first order, and that
+    of the angular velocity has the same form.
 
     Args:
-        pose: with its own covariance.
+        pose: the pose with its own covariance.
         R: (3, 3) its rotation, body to world.
         twist: (2, 3) its velocity and angular velocity in the body's frame.
     """
-    J = np.zeros((12, 12))  # by rotation (body), position, angular velocity and velocity (world)
+    J = np.zeros((12, 12))  # columns: rotation (body), position, angular velocity, velocity (world)
     J[0:3, 3:6], J[3:6, 0:3], J[6:9, 9:12], J[9:12, 6:9] = np.eye(3), R, R.T, R.T
     J[6:12, 0:3] = skew(twist).reshape(6, 3)
     return J @ pose.covariance_matrix @ J.T
@@ -106,6 +107,6 @@ def _put_header(cdr: Cdr, pose: RobotPose, frame: str) -> None:
 
 
 def _put_pose(cdr: Cdr, pose: RobotPose) -> None:
-    """A Pose and a Transform have the same seven numbers."""
+    """Put the seven numbers that a Pose and a Transform have in common."""
     w, x, y, z = pose.quaternion_wxyz
     cdr.doubles(*pose.position, x, y, z, w)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The public import of programs that read poses: `from fusion.client import Arena`."""
+"""The public interface for programs that read poses: `from fusion.client import Arena`."""
 
 from fusion.client.arena import Arena, RobotStream, Stream
 

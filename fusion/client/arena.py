@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robot poses for programs: iterate, ask for the latest, be called back, or `async for`.
+"""Robot poses for programs: iterate, get the latest, register a callback, or use `async for`.
 
-Needs no GTSAM and no SciPy. A reader slower than the poses gets the newest and skips the rest.
+Needs no GTSAM and no SciPy. A reader that is slower than the poses gets the newest one and skips the others.
 
     with Arena.connect("tcp/host:7447", arena="demo") as arena:
         for pose in arena.robot("robot_a"):
@@ -26,7 +26,7 @@ from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.protocol.requests import AGAIN_S, change_robots, undo_correction
+from fusion.protocol.requests import RETRY_S, change_robots, undo_correction
 
 T = TypeVar("T")
 TIMEOUT_S = 10.0
@@ -34,17 +34,21 @@ MAX_ROBOTS = 1024
 
 
 class Stream(Generic[T]):
-    """One kind of message, such as the poses of one robot.
+    """Messages of one kind, such as the poses of one robot.
 
-    Iterating blocks for the next one, `timeout_s` at the most (None: for ever), and ends when the arena is closed.
+    Iterating blocks until the next message, at most `timeout_s` (None: for ever), and ends when the arena is closed.
+
+    Args:
+        content: the word for the messages in errors.
+        timeout_s: of iterating.
 
     Raises, while iterating:
-        NetworkError: none came within `timeout_s`.
+        NetworkError: none arrived within `timeout_s`.
     """
 
-    def __init__(self, what: str, timeout_s: float | None) -> None:
+    def __init__(self, content: str, timeout_s: float | None) -> None:
         self.timeout_s = timeout_s
-        self._what = what
+        self._content = content
         self._changed = threading.Condition()
         self._latest: T | None = None
         self._count = 0
@@ -56,13 +60,13 @@ class Stream(Generic[T]):
         return self._latest
 
     def next(self, timeout_s: float | None = None) -> T:
-        """Block for a message newer than this call; the stream's own timeout unless one is given."""
+        """Block until a message arrives after this call; the stream's own timeout applies unless one is given."""
         for message in self._follow(self.timeout_s if timeout_s is None else timeout_s):
             return message
-        raise NetworkError(f"the arena was closed while waiting for {self._what}")
+        raise NetworkError(f"the arena was closed while waiting for {self._content}")
 
     def on_message(self, callback: Callable[[T], object]) -> Callable[[], None]:
-        """Call back with every message, on Zenoh's thread: be quick. Returns what ends it."""
+        """Call `callback` with every message, on Zenoh's thread: it must be fast. Returns its removal."""
         self._callbacks.append(callback)
 
         def remove() -> None:
@@ -78,7 +82,7 @@ class Stream(Generic[T]):
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
 
         def wake(_: T) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            with contextlib.suppress(RuntimeError):  # the loop is closed
                 loop.call_soon_threadsafe(arrived.set)
 
         remove = self.on_message(wake)
@@ -99,17 +103,17 @@ class Stream(Generic[T]):
             seen = self._count
         while True:
             with self._changed:
-                came = self._changed.wait_for(lambda: self._closed or self._count > seen, timeout_s)  # noqa: B023
+                has_changed = self._changed.wait_for(lambda: self._closed or self._count > seen, timeout_s)  # noqa: B023
                 if self._closed:
                     return
-                if not came:
+                if not has_changed:
                     raise self._silence(timeout_s)
                 seen, message = self._count, self._latest
             if message is not None:
                 yield message
 
     def _silence(self, timeout_s: float | None) -> NetworkError:
-        return NetworkError(f"no {self._what} within {timeout_s:g} s; is python -m fusion running there?")
+        return NetworkError(f"no {self._content} within {timeout_s:g} s; is python -m fusion running there?")
 
     def _put(self, message: T) -> None:
         with self._changed:
@@ -129,31 +133,31 @@ class RobotStream(Stream[RobotPose]):
     """The poses of one robot."""
 
     def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
-        """Call back with every pose, on Zenoh's thread: be quick. Returns what ends it."""
+        """Call `callback` with every pose, on Zenoh's thread: it must be fast. Returns its removal."""
         return self.on_message(callback)
 
 
 class Arena:
-    """A connection to an arena's server. `faults` counts bytes that were no message."""
+    """A connection to an arena's server. `faults` counts undecodable messages."""
 
-    def __init__(self, session: zenoh.Session, arena: str, where: str) -> None:
+    def __init__(self, session: zenoh.Session, arena: str, endpoints: str) -> None:
         self.keys = Keys(arena)
         self.faults: Counter[str] = Counter()
-        self._session, self._where = session, f"from arena '{arena}' at {where}"
+        self._session, self._origin = session, f"from arena '{arena}' at {endpoints}"
         self._lock = threading.Lock()
         self._robots: dict[str, RobotStream] = {}
         self._streams: dict[str, Stream] = {}
-        self._all: Stream[RobotPose] = Stream(f"poses {self._where}", TIMEOUT_S)
+        self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
         self._known: set[str] = set()
         poses = session.declare_subscriber(self.keys.robot_pose(), self._take_pose)
         self._subscribers: list[Any] = [poses]
 
     @classmethod
     def connect(cls, *endpoints: str, arena: str = "arena", zenoh_config: Path | None = None) -> "Arena":
-        """Connect to "tcp/host:7447"; returns at once and keeps trying while no server is there.
+        """Connect to "tcp/host:7447"; returns at once, and retries in the background while no server is reachable.
 
         Raises:
-            NetworkError: an endpoint is none.
+            NetworkError: an endpoint is invalid.
         """
         chosen: Sequence[str] = endpoints or ("tcp/127.0.0.1:7447",)
         return cls(open_client(chosen, zenoh_config), arena, " ".join(chosen))
@@ -173,19 +177,19 @@ class Arena:
         self._session.close()
 
     def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> RobotStream:
-        """The poses of a robot; iterating waits `timeout_s` for the next (None: for ever)."""
+        """The poses of a robot; iterating waits at most `timeout_s` for the next one (None: for ever)."""
         with self._lock:
-            robot = self._robots.setdefault(name, RobotStream(f"pose of '{name}' {self._where}", timeout_s))
+            robot = self._robots.setdefault(name, RobotStream(f"pose of '{name}' {self._origin}", timeout_s))
         robot.timeout_s = timeout_s
         return robot
 
     def poses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[RobotPose]:
-        """The poses of all robots as they come, each in every instant: a callback has them all."""
+        """The poses of all robots: every robot in every frame set. A callback receives all of them."""
         self._all.timeout_s = timeout_s
         return self._all
 
     def robots(self) -> tuple[str, ...]:
-        """Names of the robots that were heard of so far."""
+        """Names of the robots whose poses were received so far."""
         return tuple(sorted(self._known))
 
     def change_robots(
@@ -194,49 +198,57 @@ class Arena:
         remove: Sequence[str] = (),
         define: dict[str, RobotBody] | None = None,
     ) -> dict[str, RobotBody]:
-        """Rename, then remove, then define robots while the server runs, all or nothing; those that there are then.
+        """Rename, then remove, then define robots while the server runs, all or none.
+
+        Returns:
+            All robots that the server tracks after the change.
 
         Raises:
-            FusionError: the change makes no sense; the server's own words.
+            FusionError: the server refuses the change; the message is the server's.
             NetworkError: no server answers in time.
         """
         request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
         return change_robots(self._session, self.keys.arena, request)
 
     def undo_correction(self) -> Rig:
-        """Put the camera that the server placed anew last back where it stood; the rig in force then.
+        """Undo the last recalibration of a moved camera by the server.
+
+        Returns:
+            The active rig after that.
 
         Raises:
-            FusionError: there is nothing to undo; the server's own words.
+            FusionError: there is nothing to undo; the message is the server's.
             NetworkError: no server answers in time.
         """
         return undo_correction(self._session, self.keys.arena)
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
-        """All markers of every instant."""
+        """All markers of every frame set."""
         return self._stream(self.keys.markers, Markers, "markers", timeout_s)
 
     def status(self, timeout_s: float | None = TIMEOUT_S) -> Stream[FusionStatus]:
-        """How the server does, once a second."""
+        """The server's status, once a second."""
         return self._stream(self.keys.fusion_status, FusionStatus, "status", timeout_s)
 
     def rig(self, timeout_s: float = TIMEOUT_S) -> Rig | None:
-        """The calibration in force, or None where the server has none.
+        """The active calibration, or None if the server has none.
 
         Raises:
             NetworkError: no server answers within `timeout_s`.
         """
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
-            # asked before the rig: a session that has just been opened may reach the server in between
-            there = any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0)))
+            # queried before the rig: a session that was just opened may reach the server between both queries
+            is_reached = any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0)))
             for reply in self._session.get(self.keys.rig, timeout=min(left, 1.0)):
                 if reply.ok is not None and (rig := self._read_rig(reply.ok.payload.to_bytes())):
                     return rig
-            if there:
+            if is_reached:
                 return None
-            time.sleep(min(AGAIN_S, left))
-        raise NetworkError(f"no rig {self._where} within {timeout_s:g} s; is python -m fusion running there?")
+            time.sleep(min(RETRY_S, left))
+        raise NetworkError(
+            f"no rig {self._origin} within {timeout_s:g} s; is python -m fusion running there?"
+        )
 
     def _read_rig(self, data: bytes) -> Rig | None:
         try:
@@ -245,9 +257,9 @@ class Arena:
             self.faults["RigMessage"] += 1
             return None
 
-    def _stream(self, key: str, kind: type, what: str, timeout_s: float | None) -> Stream:
+    def _stream(self, key: str, kind: type, content: str, timeout_s: float | None) -> Stream:
         if key not in self._streams:
-            stream = self._streams[key] = Stream(f"{what} {self._where}", timeout_s)
+            stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s)
             take = self._taker(kind, stream._put)
             self._subscribers.append(self._session.declare_subscriber(key, take))
         self._streams[key].timeout_s = timeout_s
@@ -265,9 +277,9 @@ class Arena:
         return take
 
     def _take_pose(self, sample: zenoh.Sample) -> None:
-        self._taker(RobotPose, lambda pose: self._give(pose, str(sample.key_expr)))(sample)
+        self._taker(RobotPose, lambda pose: self._deliver(pose, str(sample.key_expr)))(sample)
 
-    def _give(self, pose: RobotPose, key: str) -> None:
+    def _deliver(self, pose: RobotPose, key: str) -> None:
         if key != self.keys.robot_pose(pose.robot) or len(self._known | {pose.robot}) > MAX_ROBOTS:
             self.faults["RobotPose"] += 1
             return

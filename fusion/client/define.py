@@ -1,67 +1,67 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion define`: a robot that stands in the arena becomes one that the server looks for."""
+"""Defines a robot in a running server from the markers of a stationary one."""
 
+from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
-import tyro
+import zenoh
 
 from camera_node.config import is_name
 from camera_node.errors import ConfigError
-from camera_node.protocol.session import open_client
-from fusion.client.measure import find_standing, robot_of, watch
+from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
 from fusion.model.robots import Robot, distances
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots
 
 
-def define(
-    name: str,
-    /,
-    *,
-    diameter: float,
-    at: tuple[float, float, float] | None = None,
-    within: float = 0.3,
-    motion: Literal["ground", "aerial"] = "aerial",
-    seconds: float = 2.0,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
-) -> int:
-    """Measure a robot's markers where it stands, and have the running server look for it.
+@dataclass(frozen=True)
+class RobotDefinition:
+    """What the user specifies about a robot.
 
-    All its markers must be seen by two cameras or more, and belong to no other robot.
-
-    Args:
+    Attributes:
         name: the robot's name.
-        diameter: of its roundels' black discs, d_o, metres.
-        at: roughly where it stands, world, metres; without it every marker of no robot is its own.
-        within: its markers are no further than this from there, metres.
+        diameter_m: of its roundels' black discs.
         motion: how it moves.
-        seconds: how long to look.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        centre: its rough position, world, metres; None if it has all unlabeled markers.
+        radius_m: the largest distance of its markers from there.
+
+    Raises:
+        ConfigError: the name can't be one.
     """
-    if not is_name(name):
-        raise ConfigError(f"'{name}' can't name a robot; use letters, digits, - and _")
-    if not 0 < seconds < 3600:
-        raise ConfigError(f"--seconds is {seconds:g}; it must be above 0, and below an hour")
-    with open_client(connect, zenoh_config) as session:
-        change_robots(session, arena, RobotsRequest())  # says whether a server is there, before anybody waits
-        markers = find_standing(watch(session, arena, seconds))
-        robot = robot_of(markers.within(at, within) if at else markers, diameter, motion)
-        change_robots(session, arena, RobotsRequest(define={name: robot}))
-    print(describe(name, robot))
-    return 0
+
+    name: str
+    diameter_m: float
+    motion: Literal["ground", "aerial"] = "aerial"
+    centre: tuple[float, float, float] | None = None
+    radius_m: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not is_name(self.name):
+            raise ConfigError(f"'{self.name}' can't name a robot; use letters, digits, - and _")
+
+
+def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robot:
+    """Measure a robot for `seconds`, and add it to the robots of the running server.
+
+    Raises:
+        FusionError: the markers make no robot, or the server refuses it.
+        NetworkError: no server answers in time.
+    """
+    change_robots(session, arena, RobotsRequest())  # fails without a server, before the measurement
+    markers = find_stationary_markers(collect_markers(session, arena, seconds))
+    if definition.centre is not None:
+        markers = markers.within(definition.centre, definition.radius_m)
+    robot = robot_from_markers(markers, definition.diameter_m, definition.motion)
+    change_robots(session, arena, RobotsRequest(define={definition.name: robot}))
+    return robot
 
 
 def describe(name: str, robot: Robot) -> str:
-    """What was measured, in words, and as an entry for robots.yaml."""
+    """The measured robot in words, and as an entry for robots.yaml."""
     D = distances(robot.points)
-    apart = ", ".join(f"{i}-{j} {D[i, j] * 1e3:.1f}" for i, j in combinations(range(len(D)), 2))
-    said = f"the server looks for {name}, of {len(D)} marker{'s' * (len(D) > 1)}"
+    pairs = ", ".join(f"{i}-{j} {D[i, j] * 1e3:.1f}" for i, j in combinations(range(len(D)), 2))
+    defined = f"the server now tracks {name}, with {len(D)} marker{'s' * (len(D) > 1)}"
     entry = msgspec.json.encode({name: robot}).decode()[1:-1].replace('":', '": ').replace(",", ", ")
-    return f"{said}{f' ({apart} mm apart)' if apart else ''}; for robots.yaml:\n  {entry}"
+    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}; for robots.yaml:\n  {entry}"

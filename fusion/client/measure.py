@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A new robot out of markers that nobody knows, measured where it stands."""
+"""Measures a new robot: finds stationary unlabeled markers, and makes a constellation of them."""
 
 import queue
 import time
@@ -10,93 +10,91 @@ from typing import Literal
 import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Index
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.model.robots import MotionModel, Robot
 from fusion.protocol.messages import Markers
 
-SAME_M = 0.02  # from one instant to the next: a marker that stands is no further off
-REST_M = 0.005  # median distance from its place: more, and it does not stand
-SEEN = 0.5  # share of the instants in which a marker that counts is seen
-FLAT_M = 0.005  # markers within this of a plane tell where the robot's z points better than their prints do
-OFF_CENTRE_M = 0.02  # the first marker that is so far from the middle shows where x points
+SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
+STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position
+MIN_SEEN = 0.5  # share of the messages that contain a marker that counts
+PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
+OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Markers that belong to nobody and stand: median positions (K, 3) and mean normals (K, 3), NaN where unknown.
-
-    World, metres.
-    """
+class StationaryMarkers:
+    """Stationary unlabeled markers: median positions (K, 3), mean normals (K, 3), NaN where unknown; world, metres."""
 
     position: Array
     normal: Array
 
-    def within(self, centre: ArrayLike, radius_m: float) -> "Standing":
-        """Those no further than `radius_m` from a point (3,)."""
+    def within(self, centre: ArrayLike, radius_m: float) -> "StationaryMarkers":
+        """The markers within `radius_m` of a point (3,)."""
         near = np.linalg.norm(self.position - np.asarray(centre, float), axis=1) <= radius_m
-        return Standing(self.position[near], self.normal[near])
+        return StationaryMarkers(self.position[near], self.normal[near])
 
 
-def watch(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
-    """What a running server tells of markers in so many seconds; FusionError where that is nothing."""
-    arrived: queue.Queue[bytes] = queue.Queue()
+def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
+    """The markers that a running server publishes within `seconds`.
+
+    Raises:
+        FusionError: it publishes none.
+    """
+    received: queue.Queue[bytes] = queue.Queue()
     subscriber = session.declare_subscriber(
-        Keys(arena).markers, lambda sample: arrived.put(sample.payload.to_bytes())
+        Keys(arena).markers, lambda sample: received.put(sample.payload.to_bytes())
     )
-    end, instants = time.monotonic() + seconds, []
+    end, messages = time.monotonic() + seconds, []
     try:
         while (left := end - time.monotonic()) > 0:
             try:
-                instants.append(decode(arrived.get(timeout=left), Markers))
+                messages.append(decode(received.get(timeout=left), Markers))
             except (queue.Empty, MessageError):
                 continue
     finally:
         subscriber.undeclare()
-    if not instants:
+    if not messages:
         raise FusionError(
-            f"the server told of no instant in {seconds:g} s: are cameras running and calibrated?"
+            f"the server published no markers within {seconds:g} s; are cameras running and calibrated?"
         )
-    return instants
+    return messages
 
 
-def find_standing(instants: Sequence[Markers]) -> Standing:
-    """The markers without a robot that were seen in half of the instants or more, and stood there."""
-    free = [_unlabelled(instant) for instant in instants]
-    most = max(free, key=len, default=np.empty((0, 6)))
-    seen = np.full((len(free), len(most), 6), np.nan)  # instants x markers x (position, normal)
-    for row, there in zip(seen, free, strict=True):
-        distance = cdist(most[:, :3], there[:, :3])
-        mine, its = linear_sum_assignment(distance)
-        same = distance[mine, its] < SAME_M
-        row[mine[same]] = there[its[same]]
-    often = np.isfinite(seen[:, :, 0]).mean(0) >= SEEN if len(free) else np.zeros(0, bool)
-    seen = seen[:, often]
-    if not often.any():
-        return Standing(np.empty((0, 3)), np.empty((0, 3)))
+def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
+    """The unlabeled markers that half of the messages or more contain, at one place."""
+    unlabeled = [_unlabeled(message) for message in messages]
+    reference = max(unlabeled, key=len, default=np.empty((0, 6)))
+    seen = np.full((len(unlabeled), len(reference), 6), np.nan)  # messages x markers x (position, normal)
+    for row, markers in zip(seen, unlabeled, strict=True):
+        ours, theirs = _mutual_nearest(reference[:, :3], markers[:, :3])
+        row[ours] = markers[theirs]
+    seen = seen[:, np.isfinite(seen[:, :, 0]).sum(0) >= max(1, MIN_SEEN * len(seen))]
+    if not seen.size:
+        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
     position = np.nanmedian(seen[..., :3], 0)
-    off = np.nanmedian(np.linalg.norm(seen[..., :3] - position, axis=2), 0)
-    seen, position = seen[:, off < REST_M], position[off < REST_M]
-    return Standing(
-        position, np.array([_mean_direction(seen[:, k, 3:]) for k in range(len(position))]).reshape(-1, 3)
-    )
+    spread = np.nanmedian(np.linalg.norm(seen[..., :3] - position, axis=2), 0)
+    seen, position = seen[:, spread < STATIONARY_M], position[spread < STATIONARY_M]
+    normals = [_mean_direction(seen[:, k, 3:]) for k in range(len(position))]
+    return StationaryMarkers(position, np.array(normals).reshape(-1, 3))
 
 
-def robot_of(
-    markers: Standing, diameter_m: float, motion: Literal["ground", "aerial"] | MotionModel = "aerial"
+def robot_from_markers(
+    markers: StationaryMarkers,
+    diameter_m: float,
+    motion: Literal["ground", "aerial"] | MotionModel = "aerial",
 ) -> Robot:
-    """A robot with these markers: its origin in their middle, z out of the prints, x towards the first marker.
+    """A robot with these markers: its origin is their mean, z is out of the prints, x towards the first marker.
 
     Raises:
-        FusionError: there are none, or no robot can have them.
+        FusionError: there are no markers, or no robot can have them.
     """
     if not len(markers.position):
         raise FusionError(
-            "no marker of no robot stands there: hold the robot still where two cameras see it, with all markers up"
+            "no stationary unlabeled marker found there; hold the robot still, with all markers up, in view of two "
+            "cameras"
         )
     try:
         return Robot(diameter_m=diameter_m, markers=_in_body(markers), motion=motion)
@@ -104,40 +102,50 @@ def robot_of(
         raise FusionError(f"these markers make no robot: {error}") from None
 
 
-def _unlabelled(instant: Markers) -> Array:
-    """(K, 6) positions and normals of markers that belong to no robot, and that more than one camera sees."""
-    rows = np.hstack([instant.positions(), instant.normals().astype(float)])[instant.free()]
+def _unlabeled(message: Markers) -> Array:
+    """(K, 6) positions and normals of unlabeled markers that more than one camera sees."""
+    rows = np.hstack([message.positions(), message.normals().astype(float)])[message.unlabeled()]
     return rows[np.isfinite(rows[:, :3]).all(1)]
 
 
+def _mutual_nearest(a: Array, b: Array) -> tuple[Index, Index]:
+    """Rows of points a (N, 3) and b (M, 3) that are each other's nearest, closer than `SAME_M`."""
+    if not (len(a) and len(b)):
+        return np.empty(0, int), np.empty(0, int)
+    distance = np.linalg.norm(a[:, None] - b, axis=2)
+    nearest, rows = distance.argmin(1), np.arange(len(a))
+    rows = rows[(distance.argmin(0)[nearest] == rows) & (distance[rows, nearest] < SAME_M)]
+    return rows, nearest[rows]
+
+
 def _mean_direction(normals: Array) -> Array:
-    """(3,) of those (T, 3) that are known; NaN where none is."""
+    """(3,) mean direction of the normals (T, 3) that are known; NaN where none is."""
     known = normals[np.isfinite(normals).all(1)]
     total = known.sum(0)
     return total / np.linalg.norm(total) if np.any(total) else np.full(3, np.nan)
 
 
-def _in_body(markers: Standing) -> tuple[tuple[float, float, float], ...]:
+def _in_body(markers: StationaryMarkers) -> tuple[tuple[float, float, float], ...]:
     """The positions in the robot's own frame, to a tenth of a millimetre."""
-    at = markers.position - markers.position.mean(0)
-    z = _up(at, markers.normal)
-    flat = at - np.outer(at @ z, z)
+    centred = markers.position - markers.position.mean(0)
+    z = _z_axis(centred, markers.normal)
+    flat = centred - np.outer(centred @ z, z)
     off = np.linalg.norm(flat, axis=1) >= OFF_CENTRE_M
     if not off.any():
-        return ((0.0, 0.0, 0.0),) * len(at)  # one marker; of several in one place `Robot` knows what to say
+        return ((0.0, 0.0, 0.0),) * len(centred)  # one marker; `Robot` refuses several in one place
     x = flat[np.argmax(off)] / np.linalg.norm(flat[np.argmax(off)])
-    body = at @ np.column_stack([x, np.cross(z, x), z])
+    body = centred @ np.column_stack([x, np.cross(z, x), z])
     x, y, z = np.round(body, 4).T.tolist()
     return tuple(zip(x, y, z, strict=True))
 
 
-def _up(at: Array, normals: Array) -> Array:
-    """Where prints face: along their plane's normal, else as the mean of theirs; upwards where none is known."""
+def _z_axis(centred: Array, normals: Array) -> Array:
+    """(3,) the plane's normal if the markers are planar, else their mean normal; upwards where no normal is known."""
     facing = _mean_direction(normals)
-    known = np.isfinite(facing).all()
-    _, _, axes = np.linalg.svd(at)
-    flat = len(at) >= 3 and np.abs(at @ axes[2]).max() < FLAT_M
-    if flat or not known:
-        up = axes[2] if len(at) >= 3 else np.array([0.0, 0.0, 1.0])
-        return -up if up @ (facing if known else [0.0, 0.0, 1.0]) < 0 else up
+    is_known = np.isfinite(facing).all()
+    _, _, axes = np.linalg.svd(centred)
+    is_planar = len(centred) >= 3 and np.abs(centred @ axes[2]).max() < PLANAR_M
+    if is_planar or not is_known:
+        z = axes[2] if len(centred) >= 3 else np.array([0.0, 0.0, 1.0])
+        return -z if z @ (facing if is_known else [0.0, 0.0, 1.0]) < 0 else z
     return facing

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a program may ask of a running server."""
+"""Requests to a running server."""
 
 import time
 
@@ -13,48 +13,54 @@ from fusion.errors import FusionError
 from fusion.model.robots import Robot
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, undo_key
 
-ASK_S = 5.0
-AGAIN_S = 0.1
+REQUEST_S = 5.0  # the timeout of a request
+RETRY_S = 0.1
 
 
 def change_robots(
-    session: zenoh.Session, arena: str, request: RobotsRequest, timeout_s: float = ASK_S
+    session: zenoh.Session, arena: str, request: RobotsRequest, timeout_s: float = REQUEST_S
 ) -> dict[str, Robot]:
-    """Rename, remove and define robots, all of it or nothing; the robots that the server looks for then.
+    """Rename, remove and define robots, all or none.
+
+    Returns:
+        All robots that the server tracks after the change.
 
     Raises:
-        FusionError: the request makes no sense; the server's own words.
+        FusionError: the server refuses the request; the message is the server's.
         NetworkError: no server answers in time.
     """
-    answer = _ask(session, arena, robots_key(arena), encode(request), timeout_s)
+    data = _request(session, arena, robots_key(arena), encode(request), timeout_s)
     try:
-        return decode(answer, Robots).robots
+        return decode(data, Robots).robots
     except MessageError as error:
-        raise NetworkError(f"the server's answer is no list of robots: {error}") from None
+        raise NetworkError(f"the server's reply is no list of robots: {error}") from None
 
 
-def undo_correction(session: zenoh.Session, arena: str, timeout_s: float = ASK_S) -> Rig:
-    """Put the camera whose pose the server corrected last back where it stood; the rig in force then.
+def undo_correction(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig:
+    """Undo the last recalibration of a moved camera by the server.
+
+    Returns:
+        The active rig after that.
 
     Raises:
-        FusionError: there is nothing to undo; the server's own words.
+        FusionError: there is nothing to undo; the message is the server's.
         NetworkError: no server answers in time.
     """
-    answer = _ask(session, arena, undo_key(arena), b"", timeout_s)
+    data = _request(session, arena, undo_key(arena), b"", timeout_s)
     try:
-        return decode(answer, RigMessage).rig()
+        return decode(data, RigMessage).rig()
     except MessageError as error:
-        raise NetworkError(f"the server's answer is no rig: {error}") from None
+        raise NetworkError(f"the server's reply is no rig: {error}") from None
 
 
-def _ask(session: zenoh.Session, arena: str, key: str, payload: bytes, timeout_s: float) -> bytes:
+def _request(session: zenoh.Session, arena: str, key: str, payload: bytes, timeout_s: float) -> bytes:
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
         for reply in session.get(key, payload=payload, timeout=left):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             raise FusionError(reply.err.payload.to_string() if reply.err else "the server refused")
-        time.sleep(min(AGAIN_S, left))  # a session that has just been opened knows nobody whom it could ask
+        time.sleep(min(RETRY_S, left))  # a session that was just opened knows no queryable yet
     raise NetworkError(
         f"no server of arena '{arena}' answers within {timeout_s:g} s; is python -m fusion running there?"
     )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robots shared out over several fusion processes of one arena, by their names.
+"""Distributes the robots of an arena over several fusion processes (shards), by their names.
 
-Every shard hears all detections and knows all robots. It estimates and publishes its own; the others' it takes from
-what their shards tell of them, so that their detections are claimed, and none is of two robots. The first shard leads:
-it holds the router, the clock and the rig, and publishes the markers.
+Every shard receives all detections and knows all robots. It estimates and publishes its own robots, and takes the poses
+of the others from their shards, so that no detection is assigned to two robots. The first shard leads: it is the router
+and the clock, owns the rig, and publishes the markers.
 """
 
 import zlib
@@ -27,10 +27,10 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """`2/3` is the second of three.
+        """Parse text such as `2/3`, the second of three.
 
         Raises:
-            ConfigError: it is none.
+            ConfigError: the text is no shard.
         """
         index, _, count = text.partition("/")
         if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count) <= 64):
@@ -42,29 +42,37 @@ class Shard:
         return self.index == 1
 
     def owns(self, robot: str) -> bool:
-        """Whether this shard estimates the robot: by its name alone, so that other robots don't change it."""
+        """Whether this shard estimates the robot. Only the robot's name decides, so other robots can't change it."""
         return zlib.crc32(robot.encode()) % self.count == self.index - 1
 
 
-def told_of(
+def shard_poses_of(
     names: tuple[str, ...], t_ns: int, states: States, status: list[TrackingState | None], rows: Index
 ) -> ShardPoses:
-    """What a shard tells the others of robots `rows`, each of which has a status."""
-    of_each = states.select(rows)
-    motion = np.column_stack([of_each.p, wxyz_from_rotation(of_each.R), of_each.v, of_each.omega])
+    """The message of a shard for the others.
+
+    Args:
+        names: of all N robots.
+        t_ns: the time of the states.
+        states: of all N robots.
+        status: of all N robots; not None for those in `rows`.
+        rows: the robots to publish.
+    """
+    selected = states.select(rows)
+    motion = np.column_stack([selected.p, wxyz_from_rotation(selected.R), selected.v, selected.omega])
     return ShardPoses(
         t_ns=t_ns,
         robots=tuple(names[k] for k in rows.tolist()),
         states=tuple(state for k in rows.tolist() if (state := status[k]) is not None),
         motion=motion.astype("<f8").tobytes(),
-        covariance=of_each.P.astype("<f4").tobytes(),
+        covariance=selected.P.astype("<f4").tobytes(),
     )
 
 
-def states_of(told: ShardPoses, t_ns: int) -> States:
-    """The robots that another shard told of, carried to `t_ns` by their speeds."""
-    dt = (t_ns - told.t_ns) * 1e-9
-    p, wxyz, v, omega = np.split(told.motions(), [3, 7, 10], axis=1)
+def states_of(poses: ShardPoses, t_ns: int) -> States:
+    """The states of another shard's robots, predicted to `t_ns` with constant velocities."""
+    dt = (t_ns - poses.t_ns) * 1e-9
+    p, wxyz, v, omega = np.split(poses.motions(), [3, 7, 10], axis=1)
     return States(
-        rotation_from_vector(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, told.covariances()
+        rotation_from_vector(omega * dt) @ rotation_from_wxyz(wxyz), p + v * dt, omega, v, poses.covariances()
     )

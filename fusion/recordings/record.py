@@ -1,48 +1,44 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Recordings: an arena's messages in MCAP, as they came, one channel a key; each holds what a replay needs.
+"""Records an arena's messages in MCAP, one channel a key, and reads such recordings.
 
-Messages are in MessagePack as on the wire, under their Zenoh keys; `log_time` is when one arrived, in the recorder's
-clock. The rig in force and the robots are asked of the server at the start.
+Messages are in MessagePack as on the wire, under their Zenoh keys. `log_time` is the time of arrival in the recorder's
+clock. At the start the recorder requests the active rig and the robots from the server, so a recording contains
+everything that a replay needs.
 """
 
 import contextlib
-import logging
 import queue
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 import zenoh
 
 from calib.rig.messages import RigMessage
-from calib.rig.recording import RecordingWriter, iterate
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
-from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, Robots, robots_key
 
-log = logging.getLogger("fusion.recording")
-QUEUE = 20_000
-ASK_S = 1.0  # for the server to tell of its rig and robots; they are asked for again while they are not there
+QUEUE_SIZE = 20_000
+REQUEST_S = 1.0  # the timeout of a request for the rig or the robots, and the interval until the next one
 
 
 @dataclass
 class ArenaRecording:
-    """What a recording holds: detections and when they arrived (ns), poses as they were told, rig and robots."""
+    """The content of a recording: detections and when they arrived (ns), published poses, rig and robots."""
 
     detections: list[tuple[int, Detections]] = field(default_factory=list)
     poses: list[RobotPose] = field(default_factory=list)
-    rig: Rig | None = None  # the first that was in force
+    rig: Rig | None = None  # the first one
     robots: dict[str, Robot] = field(default_factory=dict)
     faults: Counter[str] = field(default_factory=Counter)
 
-    def take(self, key: str, data: bytes, received_ns: int) -> None:
-        """A recorded message; what is none is counted."""
+    def add(self, key: str, data: bytes, received_ns: int) -> None:
+        """Add a recorded message; count it if it can't be decoded."""
         try:
             if key.endswith("/detections"):
                 self.detections.append((received_ns, decode(data, Detections)))
@@ -53,80 +49,53 @@ class ArenaRecording:
             elif key.endswith("/robots"):
                 self.robots = decode(data, Robots).robots
         except MessageError:
-            self.faults[f"messages on {key} that are none"] += 1
+            self.faults[f"undecodable messages on {key}"] += 1
 
 
 def read_recording(path: Path) -> ArenaRecording:
-    """Read a recording; of one that was cut off, what was written.
+    """Read a recording; of a truncated one, everything before its end.
 
     Raises:
         ConfigError: the file is missing, or no recording of an arena.
     """
     recording = ArenaRecording()
-    for key, data, received_ns in iterate(path, recording.faults):
-        recording.take(key, data, received_ns)
+    for key, data, received_ns in read_messages(path, recording.faults):
+        recording.add(key, data, received_ns)
     if not recording.detections:
         raise ConfigError(f"{path} holds no detections; record with python -m fusion record {path}")
     return recording
 
 
-def record(
-    out: Path,
-    /,
-    *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
-    seconds: float | None = None,
-) -> int:
-    """Record an arena's detections, poses, markers, rig and robots, until stopped.
-
-    Args:
-        out: the MCAP file to write.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
-        seconds: how long; until Ctrl-C unless given.
-    """
-    arrived: queue.Queue[tuple[str, bytes, int]] = queue.Queue(QUEUE)
-    with contextlib.ExitStack() as stack:
-        writer = stack.enter_context(RecordingWriter(out))
-        session = stack.enter_context(open_client(connect, zenoh_config))
-        subscriber = session.declare_subscriber(f"{arena}/**", lambda sample: _enqueue(arrived, sample))
-        stack.callback(subscriber.undeclare)
-        with contextlib.suppress(KeyboardInterrupt):
-            _write(session, arena, arrived, writer, seconds)
-    for key, count in sorted(writer.counts.items()):
-        print(f"{count:7} on {key}")
-    print(f"wrote {out}")
-    return 0
-
-
-def _enqueue(arrived: queue.Queue[tuple[str, bytes, int]], sample: zenoh.Sample) -> None:
-    with contextlib.suppress(queue.Full):
-        arrived.put_nowait((str(sample.key_expr), sample.payload.to_bytes(), time.time_ns()))
-
-
-def _write(
-    session: zenoh.Session, arena: str, arrived: queue.Queue, writer: RecordingWriter, seconds: float | None
+def record_arena(
+    session: zenoh.Session, arena: str, writer: RecordingWriter, seconds: float | None = None
 ) -> None:
+    """Write all messages of an arena for `seconds`, or until Ctrl-C."""
+    received: queue.Queue[tuple[str, bytes, int]] = queue.Queue(QUEUE_SIZE)
+    subscriber = session.declare_subscriber(f"{arena}/**", lambda sample: _enqueue(received, sample))
     end = time.monotonic() + (seconds if seconds is not None else float("inf"))
-    wanted, asked = {Keys(arena).rig, robots_key(arena)}, 0.0
-    while time.monotonic() < end:
-        if wanted and time.monotonic() - asked > ASK_S:
-            asked = time.monotonic()
-            for key in wanted - writer.counts.keys():
-                _ask(session, key, arrived)
-            wanted -= writer.counts.keys()
-        with contextlib.suppress(queue.Empty):
-            writer.put(*arrived.get(timeout=0.1))
+    missing, requested = {Keys(arena).rig, robots_key(arena)}, 0.0
+    with contextlib.suppress(KeyboardInterrupt):
+        while time.monotonic() < end:
+            if missing and time.monotonic() - requested > REQUEST_S:
+                requested = time.monotonic()
+                missing -= writer.counts.keys()
+                for key in missing:
+                    _request(session, key, received)
+            with contextlib.suppress(queue.Empty):
+                writer.put(*received.get(timeout=0.1))
+    subscriber.undeclare()
 
 
-def _ask(session: zenoh.Session, key: str, arrived: queue.Queue) -> None:
-    """Have the server's answer recorded as if it were published."""
+def _enqueue(received: queue.Queue[tuple[str, bytes, int]], sample: zenoh.Sample) -> None:
+    with contextlib.suppress(queue.Full):
+        received.put_nowait((str(sample.key_expr), sample.payload.to_bytes(), time.time_ns()))
+
+
+def _request(session: zenoh.Session, key: str, received: queue.Queue[tuple[str, bytes, int]]) -> None:
+    """Query the server; record the reply as if it were published."""
 
     def take(reply: zenoh.Reply) -> None:
         if reply.ok is not None:
-            _enqueue(arrived, reply.ok)
+            _enqueue(received, reply.ok)
 
-    session.get(key, take, timeout=ASK_S)
+    session.get(key, take, timeout=REQUEST_S)

@@ -57,6 +57,11 @@ class FrameSynchronizer:
         self._end_ns: int | None = None  # of the open frame set; None while there is none
         self._newest_ns = 0
 
+    @classmethod
+    def at_rate(cls, rate_hz: float | None, lateness_ms: float) -> "FrameSynchronizer":
+        """A synchronizer of so many frame sets a second; None for the rate of the fastest camera."""
+        return cls(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
+
     @property
     def late(self) -> dict[str, int]:
         """Frames dropped since the start, by camera."""

@@ -51,10 +51,9 @@ class TrackingPipeline:
 
     def restart(self) -> None:
         """Drop all frames and tracks; the tracker acquires all robots again."""
-        cameras, limits, rate_hz = self.cameras, self._config.limits, self._config.rate_hz
+        cameras, limits = self.cameras, self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
-        period_ns = round(1e9 / rate_hz) if rate_hz else None
-        self.synchronizer = FrameSynchronizer(period_ns, round(limits.lateness_ms * 1e6))
+        self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
             log.info("active calibration: %s", ", ".join(cameras))
 

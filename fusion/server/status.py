@@ -46,8 +46,8 @@ class _CameraCounts:
     is_late: bool = False
     has_two_publishers: bool = False
     lateness_ms: list[float] = field(default_factory=list)
-    used: int = 0
-    unused: int = 0
+    assigned: int = 0
+    unassigned: int = 0
     squared_px: float = 0.0
 
 
@@ -111,8 +111,8 @@ class ServerStatistics:
             self._latencies_ms.append(latency_ms)
         for name, use in cameras.items():
             if camera := self._cameras.get(name):
-                camera.used += use.used
-                camera.unused += use.unused
+                camera.assigned += use.used
+                camera.unassigned += use.unused
                 camera.squared_px += use.squared_px
 
     def is_due(self, now_ns: int) -> bool:
@@ -128,7 +128,7 @@ class ServerStatistics:
             faults = dict(self._faults)
         status = FusionStatus(
             t_ns=now_ns,
-            instants_per_s=self._n_frame_sets / seconds,
+            frame_sets_per_s=self._n_frame_sets / seconds,
             latency_ms=float(np.median(self._latencies_ms)) if self._latencies_ms else None,
             cpu=(cpu_s - self._cpu_s) / seconds,
             memory_mb=memory_mb(),
@@ -137,7 +137,7 @@ class ServerStatistics:
             },
             robots=dict(self._robots),
             faults=faults,
-            misfits=pipeline.geometry_residuals_px,
+            geometry_residuals_px=pipeline.geometry_residuals_px,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()
@@ -148,7 +148,7 @@ class ServerStatistics:
         self._latencies_ms.clear()
         for camera in self._cameras.values():
             camera.lateness_ms.clear()
-            camera.used = camera.unused = 0
+            camera.assigned = camera.unassigned = 0
             camera.squared_px = 0.0
 
     def _find_silent_cameras(self, now_ns: int) -> None:
@@ -172,11 +172,11 @@ def _camera_health(
     return CameraHealth(
         fps=len(camera.lateness_ms) / seconds,
         lateness_ms=float(np.mean(camera.lateness_ms)) if camera.lateness_ms else 0.0,
-        residual_px=float(np.sqrt(camera.squared_px / camera.used)) if camera.used else None,
-        used=camera.used,
-        unused=camera.unused,
+        residual_px=float(np.sqrt(camera.squared_px / camera.assigned)) if camera.assigned else None,
+        assigned=camera.assigned,
+        unassigned=camera.unassigned,
         late=pipeline.late.get(name, 0),
         calibrated=name in pipeline.calibrated,
-        aside=name in pipeline.excluded,
-        shared=camera.has_two_publishers,
+        excluded=name in pipeline.excluded,
+        duplicate_publisher=camera.has_two_publishers,
     )

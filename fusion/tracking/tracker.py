@@ -17,7 +17,7 @@ from fusion.monitoring.extrinsics_monitor import ExtrinsicsMonitor
 from fusion.monitoring.geometry_check import GeometryCheck
 from fusion.monitoring.inspection import Inspection
 from fusion.protocol.messages import RobotPose, ShardPoses, TrackingState
-from fusion.protocol.shards import Shard, states_of, told_of
+from fusion.protocol.shards import Shard, shard_poses_of, states_of
 from fusion.tracking.acquisition import BIRTH, BIRTH_S, MAX_CHI2, SLACK_PX, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction, mean_of_bodies, misfit
@@ -274,7 +274,9 @@ class Tracker:
         """For the other shards, after `advance`: where this one's robots are."""
         assert self._t_ns is not None
         known = np.array([status is not None for status in self.status], bool)
-        return told_of(self.names, self._t_ns, self.states, self.status, np.flatnonzero(known & self.owned))
+        return shard_poses_of(
+            self.names, self._t_ns, self.states, self.status, np.flatnonzero(known & self.owned)
+        )
 
     def follow(self, told: ShardPoses) -> None:
         """Another shard's robots are there: their detections are its own, and not for ours."""

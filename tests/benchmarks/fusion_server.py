@@ -111,7 +111,9 @@ def tell(minute: int, stream: Stream[FusionStatus], load: Load) -> float:
     status = stream.latest()
     assert status is not None
     tracked = sum(state == "tracked" for state in status.robots.values()) / load.robots
-    what = f"{status.memory_mb:.2f} MB, {status.cpu:.0%} of a core, {status.instants_per_s:.1f} instants a second"
+    what = (
+        f"{status.memory_mb:.2f} MB, {status.cpu:.0%} of a core, {status.frame_sets_per_s:.1f} poses a second"
+    )
     print(f"{minute:3d} min: {what}, {tracked:.0%} tracked, faults {status.faults or 'none'}", flush=True)
     return status.memory_mb
 

@@ -99,18 +99,18 @@ class Said:
 
     def status(self, cameras: tuple[str, ...] = ("north",), misfits: dict[str, float] | None = None) -> None:
         health = CameraHealth(
-            fps=29.97, lateness_ms=5.1, residual_px=0.08, used=200, unused=3, late=1, calibrated=True
+            fps=29.97, lateness_ms=5.1, residual_px=0.08, assigned=200, unassigned=3, late=1, calibrated=True
         )
         message = FusionStatus(
             t_ns=time.time_ns(),
-            instants_per_s=30.0,
+            frame_sets_per_s=30.0,
             latency_ms=7.7,
             cpu=0.12,
             memory_mb=140.0,
             cameras=dict.fromkeys(cameras, health),
             robots={"rover": "tracked"},
             faults={"camera unknown": 4},
-            misfits=misfits or {},
+            geometry_residuals_px=misfits or {},
         )
         self.put(self.keys.fusion_status, encode(message))
 

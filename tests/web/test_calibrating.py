@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from calib.rig.recording import read_wave, save_wave
+from calib.rig.recording import read_detections, save_wand_recording
 from calib.rig.rig import load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.errors import ConfigError
@@ -59,7 +59,7 @@ def test_a_wave_in_the_page_places_the_cameras(played: Played, view: View, files
         page.get_by_text("; no server is there to take it").wait_for(timeout=SOLVED_MS)
         page.get_by_text("grade").first.wait_for(timeout=20_000)
         page.get_by_role("button", name="Wave the wand").wait_for(timeout=20_000)
-    kept = {(m.camera, m.t_ns) for m in read_wave(files.rig.with_name("rig.wave.mcap"))}
+    kept = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
     assert kept <= {(m.camera, m.t_ns) for m in sent}
     assert len(kept) > len(sent) / 2
     found = load_rig(files.rig)
@@ -69,7 +69,7 @@ def test_a_wave_in_the_page_places_the_cameras(played: Played, view: View, files
 
 def test_what_goes_wrong_with_a_wave_is_said_and_the_wave_is_kept(tmp_path: Path, files: Files):
     wave = tmp_path / "rig.wave.mcap"
-    save_wave(wave, "test", record(ARENA, 2.0))
+    save_wand_recording(wave, "test", record(ARENA, 2.0))
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
     before = files.rig.read_bytes()
     with pytest.raises(WebError, match=r"symmetric.*; the wave is kept as .*rig\.wave\.mcap"):

@@ -20,7 +20,7 @@ def test_what_is_published_is_kept(played: Played, feed: Feed):
     assert latest.poses["rover"].message.position == (0.5, -0.25, 0.125)
     assert latest.cameras["north"].message.dropped == 2
     assert latest.status is not None
-    assert latest.status.message.cameras["north"].used == 200
+    assert latest.status.message.cameras["north"].assigned == 200
     assert latest.coverage["north"].share == 2 / 64
     assert latest.received["frames north"] == 1
     assert not latest.faults

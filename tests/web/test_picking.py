@@ -87,7 +87,7 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, Picking]):
         name.fill("wide")
         wait_for(lambda: picking._name.value == "wide")
         define = page.get_by_role("button", name="Define it")
-        click(define.click, page, "the server looks for wide, of 3 markers")
+        click(define.click, page, "the server now tracks wide, with 3 markers")
     until(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
     robot = client.change_robots()["wide"]
     assert robot.diameter_m == 0.12

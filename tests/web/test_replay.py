@@ -127,7 +127,7 @@ def test_what_is_no_recording_is_told(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"none.mcap can't be read: No such file.*check the path"):
         RecordingPlayer(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("no recording")
-    with pytest.raises(ConfigError, match="is no MCAP recording"):
+    with pytest.raises(ConfigError, match="is not an MCAP recording"):
         RecordingPlayer(tmp_path / "text.mcap")
     with RecordingWriter(tmp_path / "other.mcap") as writer:
         writer.put("weather", b"rain", START_NS)

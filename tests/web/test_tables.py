@@ -40,7 +40,14 @@ def test_the_tables_show_what_was_sent(played: Played, feed: Feed):
 def test_a_camera_that_does_not_count_is_told():
     """Silent, not placed, or moved; else what its node advises."""
     health = CameraHealth(
-        fps=30.0, lateness_ms=5.0, residual_px=None, used=0, unused=0, late=0, calibrated=True, aside=True
+        fps=30.0,
+        lateness_ms=5.0,
+        residual_px=None,
+        assigned=0,
+        unassigned=0,
+        late=0,
+        calibrated=True,
+        excluded=True,
     )
     own = CameraStatus(
         camera="north",
@@ -59,7 +66,7 @@ def test_a_camera_that_does_not_count_is_told():
     def advice(health: CameraHealth, now: float = 0.0) -> str:
         status = FusionStatus(
             t_ns=0,
-            instants_per_s=30.0,
+            frame_sets_per_s=30.0,
             latency_ms=None,
             cpu=0.1,
             memory_mb=100.0,
@@ -70,10 +77,13 @@ def test_a_camera_that_does_not_count_is_told():
         latest = Latest(now=now, cameras={"north": Seen(own, 0.0)}, status=Seen(status, 0.0))
         return tabulate_cameras(latest).rows[0].note
 
-    assert advice(health) == "moved: set aside until it is placed anew"
+    assert advice(health) == "moved: excluded until it is recalibrated"
     assert advice(msgspec.structs.replace(health, calibrated=False)) == "not placed"
-    assert advice(msgspec.structs.replace(health, aside=False, shared=True)) == "two nodes have this name"
-    assert advice(msgspec.structs.replace(health, aside=False)) == "too dark"
+    assert (
+        advice(msgspec.structs.replace(health, excluded=False, duplicate_publisher=True))
+        == "two nodes have this name"
+    )
+    assert advice(msgspec.structs.replace(health, excluded=False)) == "too dark"
     assert advice(health, now=2 * STALE_S) == "away"
 
 
@@ -119,7 +129,7 @@ def test_a_server_that_left_is_told(played: Played, feed: Feed):
     token = played.session.liveliness().declare_token(played.keys.fusion_alive)
     played.status()
     wait_for(lambda: feed.latest().status and feed.latest().server_alive)
-    assert describe_server(feed.latest()).startswith("30 instants/s, latency 7.7 ms")
+    assert describe_server(feed.latest()).startswith("30 poses/s, latency 7.7 ms")
     token.undeclare()
     wait_for(lambda: not feed.latest().server_alive)
     assert describe_server(feed.latest()) == "the server is away"

@@ -89,7 +89,7 @@ def page(view: View) -> Iterator[Page]:
 def play(played: Played) -> None:
     """One moment of an arena: four cameras, two robots, three markers."""
     for k, name in enumerate(four_cameras().cameras):
-        played.camera(name, advice="too dark" if k == 0 else "moved: set aside until it is placed anew")
+        played.camera(name, advice="too dark" if k == 0 else "moved: excluded until it is recalibrated")
         played.detections(name, [(100.0 * k, 50.0)])
     played.status(tuple(four_cameras().cameras))
     played.pose("rover", (0.5, 0.0, 0.1))
@@ -121,7 +121,7 @@ def test_a_browser_shows_the_arena(played: Played, view: View, page: Page):
     key = played.keys.snapshot("east")
     camera = played.session.declare_queryable(key, lambda query: query.reply(key, jpeg))
     with playing(played):
-        for text in ("rover", "coasting", "north", "30 instants/s", "latency ms: camera 3.0, network 0.2"):
+        for text in ("rover", "coasting", "north", "30 poses/s", "latency ms: camera 3.0, network 0.2"):
             page.get_by_text(text).first.wait_for(timeout=20_000)
     page.get_by_text("too dark").first.wait_for(timeout=20_000)
     tables = "[...document.querySelectorAll('table')].map(t => t.offsetWidth - t.parentElement.clientWidth)"

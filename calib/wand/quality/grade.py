@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.plan.precision import SIGMA_PX, PrecisionMap, map_precision
 from calib.rig.camera import Camera, transform
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words
-from calib.rig.triangulation import Joint
+from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
+from calib.rig.triangulation import JointCovariance
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.outcome import WandCalibration
 from calib.wand.quality.blame import lens_to_blame, pose_px
@@ -161,7 +161,7 @@ class RigQuality:
             figures = {
                 "median": self.expected.typical_mm,
                 "worst": self.expected.worst_mm,
-                "height": self.expected.z,
+                "height": self.expected.grid.z,
             }
             expected = {"expected_mm": {name: round(value, 3) for name, value in figures.items()}}
         return {
@@ -224,8 +224,8 @@ def assess(
         low, high = np.quantile(wave[:, :2], [0.02, 0.98], axis=0)
         placed = [result.rig.cameras[name] for name in result.names]
         size = joint.shape[0] * joint.shape[1]
-        doubt = Joint(result.adjusted.problem.free, joint.reshape(size, size))
-        expected = map_precision(placed, low, high, height_m, sigma_px, doubt)
+        doubt = JointCovariance(result.adjusted.problem.free, joint.reshape(size, size))
+        expected = map_precision(placed, FloorGrid.covering(low, high, height_m), sigma_px, doubt)
     off = None if length is None or extent == 0 else abs(length) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     return RigQuality(cameras, unplaced, off, expected)

@@ -20,7 +20,7 @@ constexpr int kMaxReweights = 4;
 constexpr double kRelative = 0.05;  // distance of an agreeing crossing from its ellipse, radii, and
 constexpr double kAbsolute = 0.5;   // pixels
 
-struct Weights {
+struct CrossingWeights {
     alignas(4 * kLanes) float at[Crossings::kMost]{};
 };
 
@@ -46,7 +46,7 @@ struct ConicEquations {
     Vector<6> g;
 };
 
-ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weights,
+ROUNDEL_CLONES void accumulate(const Crossings& crossings, const CrossingWeights& weights,
                                ConicEquations& equations) {
     Lanes H[6][6] = {}, g[5] = {};
     for (int k = 0; k < crossings.count; k += kLanes) {
@@ -64,7 +64,7 @@ ROUNDEL_CLONES void accumulate(const Crossings& crossings, const Weights& weight
     }
 }
 
-std::optional<Conics> solve(const Crossings& crossings, const Weights& weights) {
+std::optional<Conics> solve(const Crossings& crossings, const CrossingWeights& weights) {
     ConicEquations equations;
     accumulate(crossings, weights, equations);
     const Cholesky<6> factor(equations.H);
@@ -107,7 +107,7 @@ ROUNDEL_CLONES void measure(const Crossings& crossings, const Conics& c, const C
 
 /// Sets the weights by the distance from the ellipses. Returns the number of crossings that agree, of the
 /// circle with fewer of them.
-int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) {
+int reweigh(const Crossings& crossings, const Conics& conics, CrossingWeights& weights) {
     const ConicFrame frame(conics);
     Distances distances;
     measure(crossings, conics, frame, distances);
@@ -121,13 +121,13 @@ int reweigh(const Crossings& crossings, const Conics& conics, Weights& weights) 
 }
 
 /// Initial weights: from near the centre, the ratios of unoccluded rays are similar.
-Weights initial_weights(const Crossings& crossings) {
+CrossingWeights initial_weights(const Crossings& crossings) {
     std::array<float, kRays> ratios;
     int n = 0;
     for (int k = 0; k < crossings.count; ++k)
         if (crossings.inner[k] == 0) ratios[size_t(n++)] = crossings.ratio[k];
     std::nth_element(ratios.begin(), ratios.begin() + n / 2, ratios.begin() + n);
-    Weights weights;
+    CrossingWeights weights;
     for (int k = 0; k < crossings.count; ++k)
         weights.at[k] = redescend((crossings.ratio[k] - ratios[size_t(n / 2)]) * 10);
     return weights;
@@ -135,8 +135,8 @@ Weights initial_weights(const Crossings& crossings) {
 
 /// Iteratively reweighted least squares. The number of crossings that agree must grow in each iteration, to
 /// at least `least`.
-std::optional<Conics> iterate(const Crossings& crossings, const Weights& first, int least) {
-    Weights weights = first;
+std::optional<Conics> iterate(const Crossings& crossings, const CrossingWeights& first, int least) {
+    CrossingWeights weights = first;
     std::optional<Conics> conics;
     for (int k = 0, agree = 0; k < kMaxReweights && 2 * agree < crossings.count; ++k) {
         conics = solve(crossings, weights);
@@ -172,11 +172,11 @@ float ratio_spread(const Crossings& crossings, uint16_t rays) {
 /// Starts from the visible part whose ellipses agree with the most crossings.
 std::optional<Conics> fit_visible_part(const Crossings& crossings) {
     int most = kMinAgreeOccluded - kMaxReweights;  // fewer would not pass `iterate`
-    std::optional<Weights> best;
+    std::optional<CrossingWeights> best;
     for (const uint16_t part : kVisibleParts) {
         if (crossings.count_of(part) < kMinOfPart || ratio_spread(crossings, part) > kMaxRatioSpread)
             continue;
-        Weights weights;
+        CrossingWeights weights;
         for (int k = 0; k < crossings.count; ++k) weights.at[k] = float(part >> crossings.ray[k] & 1);
         const auto conics = solve(crossings, weights);
         if (!conics || !ConicFrame(*conics).is_valid()) continue;

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m calib` end to end: files in, a rig out; faults are one line and exit code 2."""
+"""`python -m calib` end to end: files in, a rig out; errors are one line and exit code 2."""
 
 import json
 import resource
@@ -19,7 +19,7 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import Arena, assert_near, record, ring
-from tests.calib.world.test_world_frame import L_FRAME, elsewhere, lie_still
+from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
@@ -30,33 +30,33 @@ def calib(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str
 
 
 @pytest.fixture
-def waved(tmp_path: Path) -> Arena:
-    """An arena whose intrinsics, wand and observations lie in `tmp_path`."""
-    arena = ring()
-    save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
+def arena(tmp_path: Path) -> Arena:
+    """An arena; its intrinsics, wand and observations are in `tmp_path`."""
+    ring_arena = ring()
+    save_rig(ring_arena.intrinsics, tmp_path / "lenses.yaml")
     (tmp_path / "wand.yaml").write_text(WAND_YAML)
-    write_observations(tmp_path / "observations.csv", record(arena, 6.0, sigma_px=0.1, numbered=True))
-    return arena
+    write_observations(tmp_path / "observations.csv", record(ring_arena, 6.0, sigma_px=0.1, numbered=True))
+    return ring_arena
 
 
 def wand_options(folder: Path) -> list[object]:
     return ["--wand", folder / "wand.yaml", "--rig", folder / "lenses.yaml", "--out", folder / "rig.yaml"]
 
 
-def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
+def test_wand_then_world_from_a_csv(tmp_path: Path, arena: Arena):
     done = calib("wand", *wand_options(tmp_path), "--observations", tmp_path / "observations.csv")
     assert done.returncode == 0, done.stderr
     assert "residual" in done.stdout
     rig = load_rig(tmp_path / "rig.yaml")
-    assert_near(rig, waved.truth, 3e-3, 1.5e-3)  # as without the file: noise is 0.1 px
+    assert_near(rig, arena.truth, 3e-3, 1.5e-3)  # as without the file: noise is 0.1 px
     assert rig.calibration["cameras"]["cam0"]["observations"] > 50
-    rows = [f"{n},{','.join(map(str, c.matrix()[:3, 3]))}" for n, c in waved.truth.cameras.items()]
+    rows = [f"{n},{','.join(map(str, c.matrix()[:3, 3]))}" for n, c in arena.truth.cameras.items()]
     (tmp_path / "survey.csv").write_text("\n".join(["camera,x,y,z", *rows]))
     surveyed = ("--positions", tmp_path / "survey.csv", "--out", tmp_path / "world.yaml")
     done = calib("world", "--rig", tmp_path / "rig.yaml", *surveyed)
     assert done.returncode == 0, done.stderr
     for name, camera in load_rig(tmp_path / "world.yaml").cameras.items():
-        truth = waved.truth.cameras[name].matrix()
+        truth = arena.truth.cameras[name].matrix()
         assert camera.matrix()[:3, 3] == pytest.approx(truth[:3, 3], abs=5e-3)
 
 
@@ -74,8 +74,8 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, waved: Arena):
         ("observations.csv", "t_ns,camera,u,v\n0,cam0,1,1\n0,cam1,1,1\n", "in no frame"),
     ],
 )
-def test_a_fault_is_one_line_and_nothing_is_overwritten(
-    tmp_path: Path, waved: Arena, file: str, text: str, fault: str
+def test_an_error_is_one_line_and_nothing_is_overwritten(
+    tmp_path: Path, arena: Arena, file: str, text: str, fault: str
 ):
     rows = (tmp_path / "observations.csv").read_text().splitlines()
     unnumbered = [row.rsplit(",", 1)[0] for row in rows]
@@ -90,8 +90,8 @@ def test_a_fault_is_one_line_and_nothing_is_overwritten(
     assert (tmp_path / "rig.yaml").read_text() == "precious"
 
 
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path, waved: Arena):
-    """A process that may write no file beyond 1000 bytes meets what a full disk does."""
+def test_a_full_disk_changes_no_file(tmp_path: Path, arena: Arena):
+    """A limit of 1000 bytes per file acts like a full disk."""
     (tmp_path / "rig.yaml").write_text("precious")
     before = sorted(tmp_path.iterdir())
     done = calib(
@@ -107,34 +107,34 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path, waved: Arena):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_check_judges_a_rig_and_writes_only_what_is_asked_for(tmp_path: Path, waved: Arena):
-    """The rig of the recording itself: it stands as it says, halves agree, and the figures land in the copy."""
+def test_check_judges_a_rig_and_writes_only_to_the_given_files(tmp_path: Path, arena: Arena):
+    """By the recording that it was calibrated from: poses and halves agree, and the copy of the rig has the figures."""
     write_observations(
-        tmp_path / "observations.csv", record(waved, 16.0, sigma_px=0.1, numbered=True, free_running=False)
+        tmp_path / "observations.csv", record(arena, 16.0, sigma_px=0.1, numbered=True, free_running=False)
     )
     observations = ("--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0
     before = (tmp_path / "rig.yaml").read_text()
-    wrote = ("--out", tmp_path / "checked.yaml", "--maps", tmp_path / "maps")
+    outputs = ("--out", tmp_path / "checked.yaml", "--maps", tmp_path / "maps")
     done = calib(
-        "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *wrote
+        "check", "--rig", tmp_path / "rig.yaml", "--wand", tmp_path / "wand.yaml", *observations, *outputs
     )
     assert done.returncode == 0, done.stderr
-    for said in ("the two halves of the recording agree", "the rig and the recording agree", "grade "):
-        assert said in done.stdout
+    for words in ("the two halves of the recording agree", "the rig and the recording agree", "grade "):
+        assert words in done.stdout
     assert (tmp_path / "rig.yaml").read_text() == before
     check = load_rig(tmp_path / "checked.yaml").calibration["check"]
     assert check["halves"]["agree"]
     assert check["expected_mm"]["median"] < 2
-    names = {f"{name}.png" for name in (*waved.truth.cameras, "expected")}
+    names = {f"{name}.png" for name in (*arena.truth.cameras, "expected")}
     assert {path.name for path in (tmp_path / "maps").iterdir()} == names
     assert all(cv2.imread(str(tmp_path / "maps" / name)) is not None for name in names)
 
 
-def test_only_one_camera_is_placed_anew(tmp_path: Path, waved: Arena):
-    """By the same wave it is placed again; the others stay, to the last digit; a stranger is named."""
+def test_only_calibrates_one_camera_and_leaves_the_others(tmp_path: Path, arena: Arena):
+    """From the same recording; the other cameras are unchanged, and an unknown camera is named."""
     write_observations(
-        tmp_path / "observations.csv", record(waved, 12.0, sigma_px=0.1, numbered=True, sized=False)
+        tmp_path / "observations.csv", record(arena, 12.0, sigma_px=0.1, numbered=True, sized=False)
     )
     options = ("--wand", tmp_path / "wand.yaml", "--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *options[2:]).returncode == 0
@@ -150,11 +150,11 @@ def test_only_one_camera_is_placed_anew(tmp_path: Path, waved: Arena):
     assert "cam77" in wrong.stderr
 
 
-def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
-    """Observations of an L and its YAML in, the true world out; what fixes no world is one line, and no file."""
+def test_an_l_shaped_frame_fixes_the_world(tmp_path: Path):
+    """The true world results from observations of an L and its YAML; mirrored and collinear points are refused."""
     arena = ring()
-    save_rig(elsewhere(arena.truth), tmp_path / "rig.yaml")
-    write_observations(tmp_path / "floor.csv", lie_still(arena, L_FRAME))
+    save_rig(in_another_world(arena.truth), tmp_path / "rig.yaml")
+    write_observations(tmp_path / "floor.csv", detect_landmarks(arena, L_FRAME))
     (tmp_path / "l.yaml").write_text(f"diameter_m: 0.1\nmarkers: {list(L_FRAME.values())}\n")
     options = ["--rig", tmp_path / "rig.yaml", "--observations", tmp_path / "floor.csv", "--out"]
     done = calib("world", "--frame", tmp_path / "l.yaml", *options, tmp_path / "world.yaml")
@@ -164,7 +164,7 @@ def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
     mirrored = {name: [y, x, z] for name, (x, y, z) in L_FRAME.items()}
     (tmp_path / "m.yaml").write_text(f"diameter_m: 0.1\nmarkers: {list(mirrored.values())}\n")
     done = calib("world", "--frame", tmp_path / "m.yaml", *options, tmp_path / "none.yaml")
-    assert (done.returncode, "the places are mirrored" in done.stderr) == (2, True)
+    assert (done.returncode, "mirrored" in done.stderr) == (2, True)
     (tmp_path / "line.csv").write_text("name,x,y,z\na,0,0,0\nb,1,0,0\nc,2,0,0\n")
     done = calib("world", "--points", tmp_path / "line.csv", *options, tmp_path / "none.yaml")
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
@@ -173,41 +173,41 @@ def test_a_frame_on_the_floor_fixes_the_world(tmp_path: Path):
 
 
 @pytest.mark.parametrize("word", ["undo", "--undo"])
-def test_undo_brings_the_rig_before_back(tmp_path: Path, waved: Arena, word: str):
+def test_undo_restores_the_previous_rig(tmp_path: Path, arena: Arena, word: str):
     before = (tmp_path / "rig.yaml", tmp_path / "rig.1.yaml")
     for path in before:
         shutil.copy(tmp_path / "lenses.yaml", path)
     (tmp_path / "rig.yaml").write_text("a mistake")
     done = calib(word, "--rig", tmp_path / "rig.yaml")
-    assert (done.returncode, "is again rig.1.yaml" in done.stdout) == (0, True), done.stderr
+    assert (done.returncode, "rig.1.yaml" in done.stdout) == (0, True), done.stderr
     assert load_rig(tmp_path / "rig.yaml") == load_rig(tmp_path / "lenses.yaml")
     assert (tmp_path / "rig.undone.yaml").read_text() == "a mistake"
     done = calib(word, "--rig", tmp_path / "rig.yaml")
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
 
 
-def test_a_folder_of_one_camera_or_of_a_stranger_is_named(tmp_path: Path, waved: Arena):
+def test_a_folder_of_one_camera_or_of_an_unknown_one_is_refused(tmp_path: Path, arena: Arena):
     frames = tmp_path / "frames"
     (frames / "cam0").mkdir(parents=True)
     done = calib("wand", *wand_options(tmp_path), "--frames", frames)
     assert (done.returncode, "one camera, 'cam0'" in done.stderr) == (2, True)
     (frames / "north").mkdir()
     done = calib("wand", *wand_options(tmp_path), "--frames", frames)
-    assert (done.returncode, "north is no camera of the rig" in done.stderr) == (2, True)
+    assert (done.returncode, "'north'" in done.stderr) == (2, True)
 
 
-def test_frames_of_a_foreign_arena(tmp_path: Path, shared_data: Callable[[str], Path]):
-    """Four free-running cameras, rendered elsewhere: every camera within 3 mm and 0.1 degrees."""
+def test_frames_of_an_arena_from_another_renderer(tmp_path: Path, shared_data: Callable[[str], Path]):
+    """Four free-running cameras: the error of every camera is below 3 mm and 0.1 degrees."""
     recording = shared_data("arena_small")
-    told = json.loads((recording / "truth.json").read_text())["cameras"]
-    lenses = {name: _camera(entry) for name, entry in told.items()}
-    truth = {name: _camera(entry, placed=True) for name, entry in told.items()}
+    truths = json.loads((recording / "truth.json").read_text())["cameras"]
+    lenses = {name: _camera(entry) for name, entry in truths.items()}
+    truth = {name: _camera(entry, placed=True) for name, entry in truths.items()}
     save_rig(Rig(cameras=lenses), tmp_path / "lenses.yaml")
     (tmp_path / "wand.yaml").write_text(WAND_YAML)
     done = calib("wand", *wand_options(tmp_path), "--frames", recording / "wand")
     assert done.returncode == 0, done.stderr
     found = load_rig(tmp_path / "rig.yaml")
-    assert set(found.placed()) == set(told)
+    assert set(found.placed()) == set(truths)
     assert_near(found, Rig(cameras=truth), 3e-3, np.radians(0.1))
 
 
@@ -225,10 +225,10 @@ def _camera(entry: dict, placed: bool = False) -> Camera:
     )
 
 
-def test_intrinsics_refuse_what_is_no_board_or_no_image(tmp_path: Path):
+def test_intrinsics_refuse_invalid_boards_and_images(tmp_path: Path):
     out = ("--out", tmp_path / "rig.yaml")
     done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5by4", *out)
-    assert (done.returncode, "is no board" in done.stderr) == (2, True)
+    assert (done.returncode, "is not a board" in done.stderr) == (2, True)
     (tmp_path / "cam0").mkdir()
     cv2.imwrite(str(tmp_path / "cam0" / "1.png"), np.zeros((40, 60), np.uint8))
     done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)

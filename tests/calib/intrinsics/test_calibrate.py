@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A board rendered through a known lens gives that lens back."""
+"""Calibration from a board that is rendered through a known lens recovers that lens."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import BoardView, adjust_lens
-from calib.intrinsics.board import BoardFinder, ChessboardFinder, make_board, make_finder
-from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge
-from calib.intrinsics.guided_capture import show_board
+from calib.intrinsics.board import CharucoFinder, ChessboardFinder, make_charuco_board, make_finder
+from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge_lenses
+from calib.intrinsics.guided_capture import capture_views
 from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.camera import Camera
@@ -37,7 +37,7 @@ Pose = tuple[NDArray, NDArray]
 
 @cache
 def pixel_rays() -> Array:
-    """Viewing rays of half pixels, from a coarse grid."""
+    """Viewing rays of half pixels, interpolated from a coarse grid."""
     v, u = np.mgrid[0:97, 0:129] * 10.0
     coarse = LENS.rays(np.column_stack([(u.ravel() - 0.5) / 2, (v.ravel() - 0.5) / 2])).reshape(97, 129, 3)
     x, y = np.meshgrid(np.arange(1280, dtype=np.float32) / 10, np.arange(960, dtype=np.float32) / 10)
@@ -45,9 +45,9 @@ def pixel_rays() -> Array:
 
 
 def render(turn: NDArray, shift: NDArray) -> NDArray[np.uint8]:
-    """The board turned by `turn`, its middle at `shift`, seen through LENS; drawn at twice the size and reduced."""
+    """The board rotated by `turn`, with its centre at `shift`, seen through LENS; rendered at twice the size."""
     size = (int(0.3 * SCALE), int(0.25 * SCALE))
-    picture = cv2.copyMakeBorder(make_board(SPEC).generateImage(size), 60, 60, 60, 60, 0, value=255)
+    picture = cv2.copyMakeBorder(make_charuco_board(SPEC).generateImage(size), 60, 60, 60, 60, 0, value=255)
     rays = pixel_rays()
     R = rotation_from_vector(turn)
     distance = (shift @ R[:, 2]) / (rays @ R[:, 2])
@@ -64,7 +64,7 @@ SIDES = [
         np.array([0.3 * np.cos(k), 0.22 * np.sin(1.7 * k), 0.8 + 0.02 * (k % 5)]),
     )
     for k in range(24)
-]  # turns and shifts of BOARD's middle, all over the image
+]  # rotations and translations of BOARD, all over the image
 
 
 def see_through(model: Model) -> Lens:
@@ -76,7 +76,7 @@ def see_through(model: Model) -> Lens:
 
 
 def look(lens: Lens, poses: list[Pose], sigma_px: float, seed: int = 0) -> list[BoardView]:
-    """BOARD's corners through a lens, with noise; those outside of the image are not seen."""
+    """Views of BOARD through a lens, with noise; corners outside of the image are missing."""
     rng = np.random.default_rng(seed)
     views = []
     for k, (turn, shift) in enumerate(poses):
@@ -88,7 +88,7 @@ def look(lens: Lens, poses: list[Pose], sigma_px: float, seed: int = 0) -> list[
 
 
 def corners_of_the_image() -> list[Pose]:
-    """The board near each corner and side, tilted a little."""
+    """Poses of the board near each corner and side of the image, slightly tilted."""
     return [
         (np.array([0.3 * v, -0.3 * u, 0.1 * u * v]), np.array([0.42 * u, 0.3 * v, 0.75]))
         for u in (-1, -0.5, 0, 0.5, 1)
@@ -97,7 +97,7 @@ def corners_of_the_image() -> list[Pose]:
 
 
 def board_poses(tilt: float, count: int = 16) -> list[Pose]:
-    """Turn and shift of the board, tilted to all sides."""
+    """Rotations and translations of the board, tilted in all directions."""
     rng = np.random.default_rng(3)
     return [
         (
@@ -112,8 +112,8 @@ def name_all(images: list[NDArray[np.uint8]]) -> Iterator[tuple[str, NDArray[np.
     return ((f"{k}.png", image) for k, image in enumerate(images))
 
 
-def corner_rms(finder: BoardFinder, images: list[NDArray[np.uint8]], poses: list[Pose]) -> float:
-    """Root mean square distance, pixels, of the corners found from where the true lens and poses put them."""
+def corner_rms(finder: CharucoFinder, images: list[NDArray[np.uint8]], poses: list[Pose]) -> float:
+    """Root mean square reprojection error, pixels, of the detected corners for the true lens and poses."""
     squares = []
     for image, (turn, shift) in zip(images, poses, strict=True):
         if found := finder.find(image):
@@ -122,10 +122,10 @@ def corner_rms(finder: BoardFinder, images: list[NDArray[np.uint8]], poses: list
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def test_a_known_lens_comes_back():
-    """The truth is among what least squares may choose, so its residual is at most the truth's: no tolerance. 16 views
-    of corners that are found to 0.15 px a coordinate fix the focal length to 0.5 %."""
-    poses, finder = board_poses(0.6), BoardFinder(make_board(SPEC))
+def test_a_known_lens_is_recovered():
+    """The truth is a candidate of least squares, so the residual is at most that of the truth: no tolerance. 16 views
+    of corners to 0.15 px per coordinate fix the focal length to 0.5 %."""
+    poses, finder = board_poses(0.6), CharucoFinder(make_charuco_board(SPEC))
     images = [render(*pose) for pose in poses]
     lens = calibrate_lens("cam0", name_all(images), finder)
     assert lens.rms_px < corner_rms(finder, images, poses)
@@ -138,8 +138,8 @@ def test_a_known_lens_comes_back():
     assert np.abs(lens.camera.project(rays) - grid).max() < 4
 
 
-def test_an_inverted_print_is_found():
-    finder = BoardFinder(make_board(SPEC))
+def test_an_inverted_board_is_found():
+    finder = CharucoFinder(make_charuco_board(SPEC))
     image = render(np.array([0.2, 0.1, 0.0]), np.array([0.0, 0.0, 0.5]))
     for picture in (image, cv2.bitwise_not(image).astype(np.uint8)):
         found = finder.find(picture)
@@ -149,7 +149,7 @@ def test_an_inverted_print_is_found():
 
 @pytest.mark.parametrize("model", COEFFICIENTS)
 def test_exact_without_noise(model: Model):
-    """The prior is what remains: corners that are exact, weighed against lenses that are not, to 0.02 px."""
+    """Only the prior causes an error: corners are exact, and the prior pulls the lens by 0.02 px."""
     lens = see_through(model)
     views = BoardViews("cam0", BOARD)
     views.views, views.size, views.frames = look(lens, SIDES, 0.0), (lens.width, lens.height), 24
@@ -161,9 +161,9 @@ def test_exact_without_noise(model: Model):
 
 
 @pytest.mark.parametrize("model", COEFFICIENTS)
-def test_the_lens_is_as_uncertain_as_it_says(model: Model):
-    """Squared Mahalanobis errors of the parameters follow chi-square, 4 + D degrees each; the prior, wider than these
-    lenses are odd, may make them smaller by its share, which is nearly nothing in 24 views."""
+def test_the_covariance_of_the_lens_is_honest(model: Model):
+    """Squared Mahalanobis errors of the parameters follow chi-square with 4 + D degrees each; the prior reduces them
+    by next to nothing with 24 views."""
     truth, total, runs = see_through(model), 0.0, 12
     for seed in range(runs):
         views = look(truth, SIDES, 0.2, seed)
@@ -174,8 +174,8 @@ def test_the_lens_is_as_uncertain_as_it_says(model: Model):
     assert low < total < high
 
 
-def test_bad_views_are_left_out_by_name():
-    """Two views in motion blur, their corners smeared by 5 px: they go, and are named; the lens is the same."""
+def test_bad_views_are_rejected_by_name():
+    """Two views with motion blur, whose corners have noise of 5 px, are rejected, and the lens stays the same."""
     truth = see_through("pinhole")
     views = BoardViews("cam0", BOARD)
     good = look(truth, SIDES, 0.1)
@@ -188,8 +188,8 @@ def test_bad_views_are_left_out_by_name():
     assert found.camera.fx == pytest.approx(truth.fx, abs=4 * found.camera.lens_sigma[0])
 
 
-def test_views_that_fix_no_lens_are_refused():
-    finder = BoardFinder(make_board(SPEC))
+def test_too_few_parallel_or_mixed_views_are_refused():
+    finder = CharucoFinder(make_charuco_board(SPEC))
     with pytest.raises(CalibrationError, match="parallel views can't fix a lens; tilt"):
         calibrate_lens("cam0", name_all([render(*pose) for pose in board_poses(0.0, 8)]), finder)
     with pytest.raises(CalibrationError, match="in 0 of 9 frames"):
@@ -198,8 +198,8 @@ def test_views_that_fix_no_lens_are_refused():
         calibrate_lens("cam0", name_all([np.zeros((48, 64), np.uint8), np.zeros((49, 64), np.uint8)]), finder)
 
 
-def test_views_in_one_corner_are_refused_with_what_to_show():
-    """A small board far away, tilted well, but always in the upper left."""
+def test_views_in_one_corner_are_refused_with_advice():
+    """A distant board, well tilted, but always in the upper left."""
     truth = see_through("pinhole")
     views = BoardViews("cam0", BOARD)
     corner = [(turn, np.array([-1.5, -1.1, 2.4]) + 0.1 * np.sin(shift)) for turn, shift in SIDES]
@@ -209,7 +209,7 @@ def test_views_in_one_corner_are_refused_with_what_to_show():
 
 
 def test_a_chessboard_is_found():
-    """Corners of a drawn chessboard, to a tenth of a pixel; part of it is not enough."""
+    """The corners of a drawn chessboard are found to a tenth of a pixel; a partial view is not found."""
     finder = make_finder("chessboard:5x4:0.03")
     squares = np.kron(np.indices((5, 6)).sum(axis=0) % 2, np.ones((60, 60))) * 200 + 25
     image = cv2.copyMakeBorder(squares.astype(np.uint8), 80, 80, 80, 80, 0, value=225).astype(np.uint8)
@@ -226,25 +226,25 @@ def test_a_chessboard_is_found():
 @pytest.mark.parametrize(
     "text", ["charuco:5by4", "chessboard:9x6", "chess:9x6:0.02", "charuco:5x4:0.05:2", "chessboard:9x2:0.02"]
 )
-def test_no_board_is_refused(text: str):
-    with pytest.raises(ConfigError, match=f"--board {text} is no board"):
+def test_an_invalid_board_is_refused(text: str):
+    with pytest.raises(ConfigError, match=f"--board {text} is not a board"):
         make_finder(text)
 
 
-def test_a_running_camera_is_asked_until_it_is_enough():
-    """Repeated views are not taken twice; the end comes by itself, well before the pictures end."""
-    truth, told = see_through("pinhole"), []
+def test_a_capture_ends_when_the_views_suffice():
+    """Repeated views are added once, and the capture ends well before the images do."""
+    truth, shown = see_through("pinhole"), []
     everywhere = [*SIDES, *corners_of_the_image()]
-    views = BoardViews("cam0", Replay(look(truth, [p for p in everywhere for _ in range(2)] * 3, 0.05)))
+    views = BoardViews("cam0", ViewReplay(look(truth, [p for p in everywhere for _ in range(2)] * 3, 0.05)))
     blank = np.zeros((truth.height, truth.width), np.uint8)
-    pictures = ((f"snapshot {k}", blank) for k in range(6 * len(everywhere)))
-    said = show_board(views, pictures, "pinhole", told.append)
-    assert said.startswith("that is enough")
+    images = ((f"snapshot {k}", blank) for k in range(6 * len(everywhere)))
+    reason = capture_views(views, images, "pinhole", shown.append)
+    assert reason.startswith("there are enough views")
     assert len(views.views) <= len(everywhere)
-    assert len(told) < 2 * len(everywhere) + 2
+    assert len(shown) < 2 * len(everywhere) + 2
 
 
-def test_the_residual_map_is_a_picture():
+def test_residuals_are_drawn():
     truth = see_through("pinhole")
     views = look(truth, SIDES, 0.2)
     residuals = np.concatenate(adjust_lens(truth, views).residuals)
@@ -256,8 +256,9 @@ def test_the_residual_map_is_a_picture():
 
 
 def test_lenses_of_webcams(shared_data: Callable[[str], Path]):
-    """Real views, of a board far away: what the lens claims to know must cover what another session's lens says.
-    Three sigmas of both, and that session's are not known: taken as equal, 3 sqrt(2) of ours, in the image's middle."""
+    """Real views of a distant board: the projection uncertainty covers the difference from another session's lens.
+    Three sigmas of both; those of the other session are unknown and taken as equal: 3 sqrt(2) of ours, in the middle
+    of the image."""
     folder = shared_data("webcams")
     other = load_rig(folder / "cameras.yaml").cameras["cam_0"]
     every_second = islice(read_frames(folder / "cam_0.mp4"), 0, None, 2)
@@ -266,17 +267,17 @@ def test_lenses_of_webcams(shared_data: Callable[[str], Path]):
     assert any("hardly in the" in warning for warning in found.warnings())
     middle = np.array([[u, v] for u in (480, 640, 800) for v in (240, 360, 480)], float)
     off = found.camera.project(other.rays(middle)) - middle
-    off -= off.mean(axis=0)  # a turn of the camera, which the pose would take up
-    assert np.linalg.norm(off, axis=1).max() < 3 * np.sqrt(2) * found.unknown_px[2:4, 3:5].max() * np.sqrt(2)
+    off -= off.mean(axis=0)  # a rotation of the camera, which its pose absorbs
+    assert np.linalg.norm(off, axis=1).max() < 3 * np.sqrt(2) * found.sigma_px[2:4, 3:5].max() * np.sqrt(2)
 
 
 def test_merging_keeps_other_cameras():
     other = Camera(width=10, height=10, fx=9.0, fy=9.0, cx=5.0, cy=5.0)
-    assert list(merge(Rig(cameras={"cam9": other}), {}).cameras) == ["cam9"]
+    assert list(merge_lenses(Rig(cameras={"cam9": other}), {}, {}).cameras) == ["cam9"]
 
 
-class Replay:
-    """A finder that has seen everything before."""
+class ViewReplay:
+    """A finder that returns given views, one after the other."""
 
     def __init__(self, views: list[BoardView]) -> None:
         self._views = iter(views)

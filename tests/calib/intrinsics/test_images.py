@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures come out of folders, videos and running cameras, each with a name."""
+"""Images of folders, videos and running cameras have names."""
 
 import threading
 from functools import partial
@@ -38,30 +38,30 @@ def test_folders_and_videos_are_found_and_read(tmp_path: Path):
         find_cameras(tmp_path, "west")
 
 
-def test_a_running_camera_is_asked(endpoint: str):
-    """The camera's own answer, in the quality that is asked for."""
-    asked = threading.Event()
+def test_a_running_camera_sends_snapshots(endpoint: str):
+    """With the camera's own encoder, in the requested quality."""
+    requested = threading.Event()
 
     def answer(query) -> bytes:
-        asked.set()
+        requested.set()
         return encode_jpeg(IMAGE, parse_quality(query.parameters))
 
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         key = Keys("test").snapshot("north")
         queryable = router.declare_queryable(key, partial(respond, answer=answer))
-        pictures = take_snapshots(client, "test", "north", 20.0)
-        (first, image), (second, _) = next(pictures), next(pictures)
+        images = take_snapshots(client, "test", "north", 20.0)
+        (first, image), (second, _) = next(images), next(images)
         queryable.undeclare()
-    assert asked.is_set()
+    assert requested.is_set()
     assert (first, second) == ("snapshot 0", "snapshot 1")
     assert np.abs(image.astype(int) - IMAGE).max() <= 8  # JPEG of quality 95 on a ramp
 
 
-@pytest.mark.parametrize(("seconds", "patience_s"), [(60.0, 0.2), (0.2, 60.0)])
-def test_a_camera_that_is_not_there_is_named(endpoint: str, seconds: float, patience_s: float):
-    """Whichever is over first."""
+@pytest.mark.parametrize(("seconds", "silent_s"), [(60.0, 0.2), (0.2, 60.0)])
+def test_a_missing_camera_is_named(endpoint: str, seconds: float, silent_s: float):
+    """After either time limit."""
     with (
         open_client([endpoint]) as client,
-        pytest.raises(CameraError, match="camera 'north' sends no pictures"),
+        pytest.raises(CameraError, match="camera 'north' sends no images"),
     ):
-        next(take_snapshots(client, "test", "north", seconds, patience_s))
+        next(take_snapshots(client, "test", "north", seconds, silent_s))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Live calibration: detections are collected past bytes that are none, and the rig reaches who listens."""
+"""Detections are collected past invalid messages, and subscribers receive the published rig."""
 
 import threading
 
 import pytest
 
 from calib.errors import CalibrationError
-from calib.live.collect import collect, publish
+from calib.live.collect import collect_with_progress, publish_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import dump_rig
 from camera_node.protocol.messages import Keys, decode, encode
@@ -35,14 +35,14 @@ def test_collects_and_publishes(endpoint: str):
 
         thread = threading.Thread(target=send)
         thread.start()
-        heard = collect(client, "test", 3.0, "looking")
+        collected = collect_with_progress(client, "test", 3.0, "collecting")
         thread.join(10)
-        assert (len(heard.messages), heard.bad) == (len(messages), 1)
-        assert publish(client, "test", arena.truth)
+        assert (len(collected.messages), collected.invalid) == (len(messages), 1)
+        assert publish_rig(client, "test", arena.truth)
         assert arrived.wait(10)
         assert rigs[0].yaml == dump_rig(arena.truth)
 
 
-def test_silence_is_a_fault_with_advice(endpoint: str):
+def test_no_detections_is_an_error_that_names_the_key(endpoint: str):
     with open_client([endpoint]) as client, pytest.raises(CalibrationError, match="no detections on test/"):
-        collect(client, "test", 0.1, "looking")
+        collect_with_progress(client, "test", 0.1, "collecting")

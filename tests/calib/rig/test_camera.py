@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How pixels change with points, poses and lenses, against differences."""
+"""Jacobians of pixels by points, poses and lenses agree with central differences."""
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ LENSES = {
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_derivatives_are_those_of_a_step_of_the_state(lens: Lens):
-    """Central differences are off by the square of the step over that of the scene, and by rounding over the step:
-    1e-3 of 800 px per unit at most."""
+def test_jacobians_agree_with_steps_of_the_state(lens: Lens):
+    """The error of central differences is the squared step over the squared size of the scene, plus rounding over the
+    step: at most 1e-3 of 800 px per unit."""
     rng, h = np.random.default_rng(1), 1e-6
     points = np.column_stack([rng.uniform(-1, 1, (6, 2)), rng.uniform(1, 4, 6)])
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
@@ -44,13 +44,13 @@ def test_derivatives_are_those_of_a_step_of_the_state(lens: Lens):
 
 
 def reshaped(lens: Lens, by: np.ndarray) -> Lens:
-    """With other log fx / fy, the mean of both logarithms kept, and other distortion numbers after k1."""
+    """The lens with another log fx / fy at the same mean, and other distortion coefficients after k1."""
     parameters = with_distortion(lens).parameters
     parameters[:2] *= np.exp([by[0] / 2, -by[0] / 2])
     parameters[5:8] += by[1:]
     return lens.with_parameters(parameters)
 
 
-def test_what_is_behind_the_camera_has_no_derivative():
+def test_jacobians_are_nan_behind_the_camera():
     for part in pixel_jacobians(LENSES["pinhole"], [[0.0, 0.0, -1.0]]):
         assert np.isnan(part).all()

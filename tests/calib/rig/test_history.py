@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A rig that was in force is never lost: it is kept before it is replaced, and comes back."""
+"""A rig is backed up before it is replaced, and undo restores it."""
 
 from pathlib import Path
 
 import pytest
 
 from calib.errors import CalibrationError
-from calib.rig.history import keep, predecessors, undo
+from calib.rig.history import back_up, list_backups, undo
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.errors import ConfigError
 from tests.calib.synthetic import ring
 
 
 def numbered(k: int) -> Rig:
-    """A rig that is told from others by its note."""
+    """A rig that differs from others in its date."""
     return Rig(cameras=ring(2).truth.cameras, calibration={"date": k})
 
 
-def test_saving_keeps_and_undo_goes_back_step_by_step(tmp_path: Path):
+def test_saving_backs_up_and_undo_restores_step_by_step(tmp_path: Path):
     path = tmp_path / "rig.yaml"
-    kept = [save_rig(numbered(k), path) for k in range(12)]
-    assert kept[0] is None
-    assert [p.name for p in predecessors(path)] == [f"rig.{k}.yaml" for k in range(1, 12)]  # 10 after 9
+    backups = [save_rig(numbered(k), path) for k in range(12)]
+    assert backups[0] is None
+    assert [p.name for p in list_backups(path)] == [f"rig.{k}.yaml" for k in range(1, 12)]  # 10 after 9
     for k in reversed(range(11)):
         undo(path)
         assert load_rig(path).calibration["date"] == k
@@ -31,7 +31,7 @@ def test_saving_keeps_and_undo_goes_back_step_by_step(tmp_path: Path):
     assert load_rig(path).calibration["date"] == 0
 
 
-def test_a_deleted_rig_comes_back_too(tmp_path: Path):
+def test_undo_restores_a_deleted_rig(tmp_path: Path):
     path = tmp_path / "rig.yaml"
     for k in range(2):
         save_rig(numbered(k), path)
@@ -40,15 +40,15 @@ def test_a_deleted_rig_comes_back_too(tmp_path: Path):
     assert load_rig(path).calibration["date"] == 0
 
 
-def test_strangers_beside_it_are_left_alone(tmp_path: Path):
+def test_other_files_in_the_folder_are_ignored(tmp_path: Path):
     for name in ("rig.old.yaml", "rig.yaml.1", "myrig.3.yaml", "rig.2.yml"):
         (tmp_path / name).write_text("mine")
     path = tmp_path / "rig.yaml"
     path.write_text("first")
-    assert keep(path) == tmp_path / "rig.1.yaml"
-    assert keep(tmp_path / "none.yaml") is None
+    assert back_up(path) == tmp_path / "rig.1.yaml"
+    assert back_up(tmp_path / "none.yaml") is None
 
 
-def test_no_folder_is_a_fault_in_one_line(tmp_path: Path):
+def test_undo_in_a_missing_folder_is_a_config_error(tmp_path: Path):
     with pytest.raises(ConfigError, match="folder"):
         undo(tmp_path / "nowhere" / "rig.yaml")

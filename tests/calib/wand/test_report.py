@@ -7,14 +7,14 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from calib.commands.report import print_report
+from calib.commands.report import camera_table, print_report
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.quality.lens_change import describe, find_changes
 from tests.calib.wave import Wave, record
 
 
-def test_a_lens_that_was_off_is_told_with_its_correction():
+def test_a_lens_that_was_off_is_told_with_its_correction(capsys: pytest.CaptureFixture[str]):
     """One camera's focal length is 1 % off in the file. What is told of it is true to four of its own sigmas, is what
     the rig has, and no other lens is accused."""
     wave = Wave(
@@ -39,9 +39,9 @@ def test_a_lens_that_was_off_is_told_with_its_correction():
     )
     assert lines[-1] == "as they were, within 2 sigmas: the lenses of cam00, cam01, cam03, cam04"
     assert result.as_dict()["adjusted_lenses"]["cam02"]["before"]["fx"] == change.before.fx
-    text = StringIO()
-    print_report(result, assess(result, wave.wand), Console(width=80, file=text))
-    told = text.getvalue()
-    assert lines[1] in told
-    table = [line for line in told.splitlines() if line.startswith((" camera", " cam0"))]
+    quality, text = assess(result, wave.wand), StringIO()
+    print_report(result, quality)
+    assert lines[1] in capsys.readouterr().out
+    Console(width=80, file=text).print(camera_table(result, quality))
+    table = [line for line in text.getvalue().splitlines() if line.startswith((" camera", " cam0"))]
     assert len(table) == 6  # at 80 columns no cell is folded

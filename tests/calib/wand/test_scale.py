@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.__main__ import execute
 from calib.commands.check import placed, split
 from calib.errors import CalibrationError
-from calib.live.wand_session import try_part
+from calib.live.wand_session import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement
@@ -140,7 +140,8 @@ def test_a_check_and_the_trials_of_a_live_wave_know_the_distance(tmp_path: Path)
     arena = ring(3, wand=LIGHT)
     messages, true = record(arena, 20.0, sigma_px=0.1, sized=False), apart(arena, "cam0", "cam1")
     told = Distance("cam0", "cam1", true)
-    given, missing = (try_part(arena.intrinsics, LIGHT, d, messages, 1.0) for d in (told, None))
+    sessions = [WandSession(rig=arena.intrinsics, wand=LIGHT, distance=d) for d in (told, None)]
+    given, missing = (compute_trial(session, messages, 1.0) for session in sessions)
     assert given.expected_mm is not None
     assert missing.expected_mm is None
     save_rig(arena.intrinsics, tmp_path / "rig.yaml")

@@ -20,9 +20,10 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.bridges.ros2 import Ros2Node, ros2, ros_name
+from fusion.bridges.ros2 import Ros2Node, ros_name
 from fusion.bridges.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
 from fusion.client.arena import Arena
+from fusion.commands.ros2 import ros2
 from fusion.protocol.messages import RobotPose
 from tests.conftest import free_port
 
@@ -214,7 +215,7 @@ def test_robots_whose_names_ros_can_not_tell_apart_are_counted():
         node = Ros2Node(session)
         for name in ("rover-2", "rover_2", "rover_2"):
             node.publish(draw_pose(name), "world")
-        assert node.faults == {"poses of 'rover_2', whose name ROS can't tell from 'rover-2'": 2}
+        assert node.faults == {"poses of 'rover_2', which has the same ROS name as 'rover-2'": 2}
 
 
 @pytest.mark.parametrize("domain", ["-1", "233", "lab"])
@@ -229,7 +230,7 @@ def test_a_domain_that_is_none_is_refused(domain, monkeypatch):
 
 @pytest.mark.parametrize("namespace", ["a-b", "1st", "a//b", "*"])
 def test_a_namespace_that_is_none_is_refused(namespace):
-    with pytest.raises(ConfigError, match="is no namespace of ROS"):
+    with pytest.raises(ConfigError, match="is no ROS namespace"):
         ros2(namespace=namespace)
 
 
@@ -242,7 +243,7 @@ def test_silence_is_told_once_and_its_end_too():
         arena = threading.Thread(target=repeat, args=(server, [POSE], done))
         arena.start()
         try:
-            assert "there are poses again" in process.stderr.readline()
+            assert "receiving poses again" in process.stderr.readline()
         finally:
             done.set()
             arena.join(DEADLINE_S)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.client.measure import Standing, find_standing, robot_of
+from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
 from fusion.model.robots import distances, load_robots, require_distinct
 from fusion.protocol.messages import Markers
-from tests.conftest import free_port
+from tests.conftest import ROOT, free_port
 from tests.fusion.conftest import fuse
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
@@ -29,8 +29,8 @@ def watched(arena: Arena, n: int = 30) -> list[Markers]:
 def test_what_is_measured_is_what_stands_there():
     """0.1 px is at most 0.6 mm a marker and instant here, and a median of 30 has 1.25 / sqrt(30) of that: distances are
     within 5 sigma of it and the rounding, 1 mm. The frame is the one promised: origin, z and x."""
-    markers = find_standing(watched(Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)))
-    robot = robot_of(markers, WIDE.diameter_m)
+    markers = find_stationary_markers(watched(Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)))
+    robot = robot_from_markers(markers, WIDE.diameter_m)
     R, p = WIDE_MOTION(0.0)
     true = p + WIDE.points @ R.T
     order = [int(np.argmin(np.linalg.norm(true - q, axis=1))) for q in markers.position]
@@ -45,7 +45,7 @@ def test_what_is_measured_is_what_stands_there():
 def test_a_robot_as_measured_is_tracked_where_it_stands():
     """The position is the markers' middle and z is the prints' own, within 1 mm and what 1 mm turns 0.2 m by."""
     arena = Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)
-    measured = {"b": robot_of(find_standing(watched(arena)), WIDE.diameter_m)}
+    measured = {"b": robot_from_markers(find_stationary_markers(watched(arena)), WIDE.diameter_m)}
     pose = fuse(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
     R, p = WIDE_MOTION(0.0)
     assert pose.state == "tracked"
@@ -64,7 +64,7 @@ def test_what_moves_or_comes_and_goes_does_not_stand():
         "stands": line((-0.5, 0.3, 0.2)),
     }
     arena = Arena(robots, motions, sigma_px=0.1, hidden=lambda name, marker, t: name == "hides" and t > 0.3)
-    markers = find_standing(watched(arena))
+    markers = find_stationary_markers(watched(arena))
     assert np.abs(markers.position - [[-0.5, 0.3, 0.2]]).max() < 2e-3
     assert len(markers.within((-0.5, 0.3, 0.2), 0.1).position) == 1
     assert len(markers.within((0.5, 0.3, 0.2), 0.1).position) == 0
@@ -74,7 +74,7 @@ def test_what_moves_or_comes_and_goes_does_not_stand():
 def test_z_is_up_where_no_print_tells(turn: float):
     """Of markers in a plane that nothing tells the sides of, in either order about it."""
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1 * turn, 0.1], [-0.1, -0.1 * turn, 0.1]])
-    robot = robot_of(Standing(points, UNKNOWN), 0.1)
+    robot = robot_from_markers(StationaryMarkers(points, UNKNOWN), 0.1)
     centred = points - points.mean(0)
     assert np.allclose(robot.points @ [1, 0, 0], centred[:, 0], atol=1e-4), "x along the first marker"
     assert np.allclose(robot.points @ [0, 1, 0], centred[:, 1], atol=1e-4), (
@@ -85,18 +85,18 @@ def test_z_is_up_where_no_print_tells(turn: float):
 def test_prints_tell_z_where_markers_are_no_plane():
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
     normal = np.array([0.1, 0.0, 1.0]) / np.linalg.norm([0.1, 0.0, 1.0])
-    robot = robot_of(Standing(points, np.tile(normal, (4, 1))), 0.1)
+    robot = robot_from_markers(StationaryMarkers(points, np.tile(normal, (4, 1))), 0.1)
     height = (points - points.mean(0)) @ normal
     assert np.allclose(robot.points[:, 2], height, atol=1e-4)
 
 
 def test_what_makes_no_robot_is_said():
-    nothing = Standing(np.empty((0, 3)), np.empty((0, 3)))
-    with pytest.raises(FusionError, match="no marker of no robot stands there: hold the robot still"):
-        robot_of(nothing, 0.1)
+    nothing = StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
+    with pytest.raises(FusionError, match="no stationary unlabeled marker found there; hold the robot still"):
+        robot_from_markers(nothing, 0.1)
     with pytest.raises(FusionError, match=r"make no robot: .*one line"):
-        robot_of(Standing(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN), 0.1)
-    assert len(find_standing([]).position) == 0
+        robot_from_markers(StationaryMarkers(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN), 0.1)
+    assert len(find_stationary_markers([]).position) == 0
 
 
 def command(endpoint: str, *words: str) -> list[str]:
@@ -109,7 +109,7 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
         words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
         assert done.returncode == 0, done.stderr
-        assert "the server looks for b, of 3 markers" in done.stdout
+        assert "the server now tracks b, with 3 markers" in done.stdout
         until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
         robots = client.change_robots()
         assert set(robots) == {"a", "b"}
@@ -141,3 +141,20 @@ def test_what_can_not_be_defined_is_said_in_one_line(words, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+LIGHT = """
+import sys
+import fusion.__main__, fusion.client.arena, fusion.client.define
+import fusion.commands.define, fusion.commands.ros2, fusion.commands.undo
+heavy = {"gtsam", "scipy", "viser", "mcap", "fusion.server", "fusion.tracking"} & set(sys.modules)
+sys.exit(", ".join(sorted(heavy)) or 0)
+"""
+
+
+def test_clients_and_bridges_import_neither_the_server_nor_its_libraries():
+    """A robot's computer has none of them: the client, `define`, `undo`, `ros2`, and the help of the server."""
+    for words in (["-c", LIGHT], ["-X", "importtime", "-m", "fusion", "--help"]):
+        done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        assert "gtsam" not in done.stderr

@@ -76,7 +76,7 @@ def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
         words = [sys.executable, "-m", "fusion", "undo", "--connect", server.endpoints[0], "--arena", "test"]
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-        assert done.stdout == "cam1 is back where it stood, and is not watched any more\n"
+        assert done.stdout == "cam1 has its previous pose again and is no longer monitored\n"
         until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)
         assert server.pipeline.tracker is not None
         assert server.pipeline.tracker.watch.held == {"cam1"}

@@ -14,9 +14,11 @@ from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
+from fusion.commands.record import record
+from fusion.commands.replay import replay
 from fusion.protocol.messages import Robots
-from fusion.recordings.record import read_recording, record
-from fusion.recordings.run import fuse_recording, replay
+from fusion.recordings.record import read_recording
+from fusion.recordings.run import OfflineArena, fuse_recording
 from fusion.tracking.result import Fused
 from fusion.tracking.tracker import Limits
 from tests.fusion.conftest import errors, poses_of
@@ -43,7 +45,11 @@ def write(path: Path, arena: Arena, n: int = 20) -> list:
 def test_a_replay_is_what_was(tmp_path):
     """The same bytes of poses as from the messages themselves, and again from the replay's own recording."""
     arrivals = write(tmp_path / "in.mcap", MOVING)
-    told = [pose for f in fuse_recording(arrivals, MOVING.cameras, MOVING.robots) for pose in f.poses]
+    told = [
+        pose
+        for f in fuse_recording(arrivals, OfflineArena(MOVING.cameras, MOVING.robots))
+        for pose in f.poses
+    ]
     assert len(told) > 10
     for source, out in (("in.mcap", "once.mcap"), ("once.mcap", "twice.mcap")):
         assert replay(tmp_path / source, out=tmp_path / out) == 0
@@ -99,7 +105,9 @@ def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[Fused]:
     arrivals = [(message.t_ns, message) for message in arena.messages(n)]
     arrivals.sort(key=lambda arrival: arrival[0])
     limits = Limits(sigma_floor_px=1e-3)
-    return list(fuse_recording(arrivals, arena.cameras, arena.robots, limits=limits, smooth=smooth))
+    return list(
+        fuse_recording(arrivals, OfflineArena(arena.cameras, arena.robots, limits=limits, smooth=smooth))
+    )
 
 
 def test_smoothing_is_better_and_honest():

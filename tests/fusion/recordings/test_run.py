@@ -15,8 +15,9 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from fusion.__main__ import main
+from fusion.commands.run import run
 from fusion.model.robots import Robot
-from fusion.recordings.run import COLUMNS, run
+from fusion.recordings.report import COLUMNS
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 
 ARENA = Arena(
@@ -54,7 +55,7 @@ def test_observations_become_poses(recording, capsys):
     ("fault", "said"),
     [
         ("no rig", "does not exist"),
-        ("unplaced", "places no camera"),
+        ("unplaced", "no camera in"),
         ("broken", "not valid YAML"),
         ("no input", "either --frames"),
     ],

@@ -166,7 +166,7 @@ def test_two_nodes_of_one_name_are_noticed_and_a_restarted_one_is_not(second, sh
             other = msgspec.structs.replace(message, t_ns=message.t_ns + 7_000_000, seq=100 + k)
             path.take(other, other.t_ns)
     status = path.status()
-    assert status.cameras["cam0"].shared == shared
+    assert status.cameras["cam0"].duplicate_publisher == shared
     assert ("two nodes publish as camera cam0" in caplog.text) == shared
 
 

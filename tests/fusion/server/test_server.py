@@ -16,7 +16,7 @@ from calib.rig.rig import Rig
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.messages import FusionStatus, RobotPose
 from fusion.server.server import Server
 from fusion.tracking.tracker import Limits
 from tests.conftest import ROOT
@@ -121,12 +121,19 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
     settings = msgspec.structs.replace(config(tmp_path), limits=Limits(lateness_ms=50))
     with Server(settings) as server, connected(server) as client:
         poses: list[RobotPose] = []
+        statuses: list[FusionStatus] = []
         client.robot("a").on_pose(poses.append)
+        client.status().on_message(statuses.append)  # subscribed before the server runs, to miss none
         send_in_real_time(server, 30)
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
-            until(lambda: client.status(DEADLINE_S).next().instants_per_s > 0)
+            until(
+                lambda: (
+                    client.status(DEADLINE_S).next()
+                    and any(status.frame_sets_per_s > 0 for status in statuses)
+                )
+            )
             assert (sum(server.pipeline.synchronizer.late.values()) > 0) == drops
             assert drops or any(pose.state == "tracked" for pose in poses)
         finally:

@@ -8,10 +8,11 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.plan.precision import map_precision
 from calib.rig.camera import PER_CAMERA, POSE
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
-from calib.rig.triangulation import Joint, camera_jacobians, point_covariances, triangulate_point
+from calib.rig.precision_map import FloorGrid, map_precision
+from calib.rig.precision_plot import draw_precision
+from calib.rig.triangulation import JointCovariance, camera_jacobians, point_covariances, triangulate_point
 from calib.wand.bundle_adjustment.problem import State
 from calib.wand.calibrate import calibrate
 from calib.wand.outcome import WandCalibration
@@ -40,7 +41,8 @@ def test_expected_errors_are_honest():
         uv = [_see(camera.matrix(), camera, xi, point) for camera, xi in zip(cameras, off, strict=True)]
         error = triangulate_point(cameras, np.array(uv) + 0.1 * rng.standard_normal((4, 2))) - point
         total += float(
-            error @ np.linalg.solve(point_covariances(cameras, point, 0.1, Joint(POSE, C))[0], error)
+            error
+            @ np.linalg.solve(point_covariances(cameras, point, 0.1, JointCovariance(POSE, C))[0], error)
         )
     low, high = chi2.ppf([0.001, 0.999], 3 * runs)
     assert low < total < high
@@ -81,16 +83,16 @@ def test_parallel_rays_fix_no_point():
 
 def test_a_map_tells_where_it_is_good_and_where_nobody_sees():
     cameras = ring(4).truth.cameras
-    told = map_precision(list(cameras.values()), [-15, -15], [15, 15], 0.1)
-    middle = told.sigma_mm[np.ix_(np.abs(told.y) < 2.5, np.abs(told.x) < 2.5)]
+    told = map_precision(list(cameras.values()), FloorGrid.covering([-15, -15], [15, 15], 0.1))
+    middle = told.sigma_mm[np.ix_(np.abs(told.grid.y) < 2.5, np.abs(told.grid.x) < 2.5)]
     assert np.isfinite(middle).all()
     assert middle.max() < 3  # 0.1 px at 5 m and 520 px is 1 mm a camera
     assert np.isinf(told.sigma_mm[0, 0])
     assert 0 < told.covered < 1
     lines = told.lines()
-    assert len(lines) == len(told.y) + 2
+    assert len(lines) == len(told.grid.y) + 2
     assert "·" in lines[1]
-    picture = told.draw(cameras)
+    picture = draw_precision(told, cameras)
     assert picture.ndim == 3
     assert (picture != picture[0, -1]).any(axis=2).mean() > 0.2
 

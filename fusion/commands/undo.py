@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion undo`: a camera that the server placed anew stands again where it stood."""
+"""`fusion undo`: restores the camera that the server recalibrated last."""
 
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from camera_node.terminal import say
 from fusion.client.arena import Arena
 
 
@@ -15,7 +16,7 @@ def undo(
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
 ) -> int:
-    """Take back the last pose that the running server found of a moved camera, which it then leaves alone.
+    """Undo the last recalibration of a moved camera by the running server, which no longer monitors that camera.
 
     Args:
         connect: the server's Zenoh endpoints.
@@ -24,6 +25,6 @@ def undo(
     """
     with Arena.connect(*connect, arena=arena, zenoh_config=zenoh_config) as client:
         before, after = client.rig(), client.undo_correction()
-    moved = [name for name in after.cameras if before and after.cameras[name] != before.cameras.get(name)]
-    print(f"{', '.join(moved) or 'the camera'} is back where it stood, and is not watched any more")
+    changed = [name for name in after.cameras if before and after.cameras[name] != before.cameras.get(name)]
+    say(f"{', '.join(changed) or 'the camera'} has its previous pose again and is no longer monitored")
     return 0

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion replay`: a recording (MCAP) into `poses.csv` or another recording."""
+
+from pathlib import Path
+
+from camera_node.terminal import say, track
+from fusion.recordings.record import read_recording
+from fusion.recordings.replay import cameras_of, robots_of, write_recording
+from fusion.recordings.report import Summary, write_poses
+from fusion.recordings.run import OfflineArena, fuse_recording
+
+
+def replay(
+    recording: Path,
+    /,
+    *,
+    out: Path,
+    rig: Path | None = None,
+    robots: Path | None = None,
+    rate_hz: float | None = None,
+    smooth: bool = False,
+) -> int:
+    """Fuse a recording (MCAP) again, by the code that runs live, each message at its time of arrival.
+
+    Args:
+        recording: the MCAP file.
+        out: the file to write: poses.csv, or .mcap with the same detections and new poses and markers.
+        rig: a rig.yaml instead of the recorded one.
+        robots: a robots.yaml instead of the recorded one.
+        rate_hz: poses a second; without it the rate of the fastest camera.
+        smooth: estimate each pose from the whole recording, not only from the frames before it.
+    """
+    recorded = read_recording(recording)
+    cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
+    arena = OfflineArena(cameras, declared, rate_hz, smooth=smooth)
+    summary = Summary(faults=recorded.faults)
+    fused = track(fuse_recording(recorded.detections, arena, summary), "fusing")
+    if out.suffix == ".mcap":
+        write_recording(recording, out, fused)
+    else:
+        write_poses(out, fused)
+    for line in (*summary.lines(arena.robots), f"wrote {out}"):
+        say(line)
+    return 0

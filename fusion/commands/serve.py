@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion`: the live server."""
+
+import contextlib
+import signal
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from camera_node.config import write_atomically
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Fuse what an arena's cameras publish into robot poses, until stopped; this is the arena's Zenoh router.
+
+    Other commands, python -m fusion NAME --help: run, record and replay are for recordings; define measures a new
+    robot in the arena; undo undoes the recalibration of a moved camera; ros2 publishes the robots to ROS 2.
+    """
+
+    config: Path | None = None
+    """arena.yaml; the options below override it."""
+    arena: str | None = None
+    """The arena's name, the first part of all Zenoh keys."""
+    listen: tuple[str, ...] | None = None
+    """Zenoh endpoints to listen on, such as tcp/0.0.0.0:7447; the operating system chooses port 0."""
+    endpoints_file: Path | None = None
+    """A file to write once the server listens: the endpoints at which it is reached, one a line."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+    rig: Path | None = None
+    """rig.yaml; without one the server waits for a calibration to be published."""
+    robots: Path | None = None
+    """robots.yaml."""
+    rate_hz: float | None = None
+    """Poses a second; without it the rate of the fastest camera."""
+    shard: str | None = None
+    """Such as 2/3, the second of three processes that share the robots; the first one listens."""
+
+    def run(self) -> int:
+        """Serve until Ctrl-C or SIGTERM."""
+        from fusion.server.config import (  # not at the top: --help needs no GTSAM
+            ArenaConfig,
+            load_arena,
+            override,
+        )
+        from fusion.server.server import Server
+
+        settings = asdict(self)
+        path, endpoints_file = settings.pop("config"), settings.pop("endpoints_file")
+        config = override(load_arena(path) if path else ArenaConfig(), **settings)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt), Server(config) as server:
+            if endpoints_file:
+                write_atomically(endpoints_file, "".join(f"{endpoint}\n" for endpoint in server.endpoints))
+            server.run()
+        return 0
