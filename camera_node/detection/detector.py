@@ -118,17 +118,10 @@ class Detector:
         """Detect all roundels in a grey image.
 
         Args:
-<<<<<<< HEAD
-            image: (h, w), uint8; its rows need not be contiguous in memory.
-
-        Raises:
-            ValueError: the array is not such an image; `camera_node.sources.grey.to_grey` converts other formats.
-=======
             image: (h, w), uint8; its rows may be apart in memory.
 
         Raises:
             ValueError: the array is not a grey image; `camera_node.sources.grey.to_grey` converts other formats.
->>>>>>> main
         """
         if image.dtype != np.uint8 or image.ndim != 2:
             raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")

@@ -25,13 +25,8 @@ def shape_of(dual: Array) -> Array:
 def covariance_through(lens: Lens, ellipses: Array, covariance: Array) -> Array:
     """Transform covariances of ellipse and disc centre from raw pixels to the normalised image plane.
 
-<<<<<<< HEAD
-    `ellipses` are (N, 5) u, v, major, minor, angle and `covariance` (N, 7, 7) is `DetectedRoundels.pose_cov`. The
-    lens is approximated as affine over a roundel. Returns (N, 7, 7).
-=======
     `ellipses` are (N, 5) u, v, major, minor, angle and `covariance` (N, 7, 7) is `DetectedRoundels.pose_cov`. The lens
     is approximated as affine over a roundel. Returns (N, 7, 7).
->>>>>>> main
     """
     J = _lens_derivative(lens, ellipses[:, :2])
     A = _root(ellipses)
