@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -19,7 +20,7 @@ struct FrameColumns {
             uv.insert(uv.end(), {fit.outer.x, fit.outer.y});
             axes_px.insert(axes_px.end(), {fit.outer.major, fit.outer.minor});
             angle_rad.push_back(fit.outer.angle), ratio.push_back(fit.ratio);
-            contrast.push_back(fit.bright - fit.dark);
+            contrast.push_back(fit.contrast());
             offset_px.insert(offset_px.end(), {fit.offset_x, fit.offset_y});
             for (int i = 0; i < kPoseCount; ++i)  // rounding makes the halves differ: the upper one counts
                 for (int j = 0; j < kPoseCount; ++j)

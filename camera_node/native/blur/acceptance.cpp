@@ -20,8 +20,7 @@ constexpr double kMaxReach = 2.5;       // at most so many minor axes
 
 bool is_accepted(const RoundelFit& fit, const AcceptanceContext& context) {
     const Symmetric centre = fit.centre_covariance();
-    return is_within_limits(fit, context.limits) &&
-           fit.edge_residual < std::hypot(1.2 * context.noise, kMisfit * (fit.bright - fit.dark)) &&
+    return is_within_limits(fit, context.limits) && fit.is_explained(context.noise, kMisfit) &&
            fit.support > kMinSupport &&
            std::hypot(fit.motion_x, fit.motion_y) < kMaxMotion * fit.outer.major &&
            std::sqrt(centre.xx + centre.yy) < kMaxSigma * fit.outer.minor;
@@ -31,8 +30,8 @@ bool is_similar(double value, double last) { return value < kMaxChange * last &&
 
 /// From frame to frame neither the levels nor the view change much.
 bool is_similar(const RoundelFit& fit, const RoundelFit& last) {
-    return is_similar(fit.bright - fit.dark, last.bright - last.dark) &&
-           is_similar(fit.outer.major, last.outer.major) && is_similar(fit.outer.minor, last.outer.minor);
+    return is_similar(fit.contrast(), last.contrast()) && is_similar(fit.outer.major, last.outer.major) &&
+           is_similar(fit.outer.minor, last.outer.minor);
 }
 
 }  // namespace

@@ -99,9 +99,7 @@ class MovingFitter : GaussNewton<kMovingCount> {
 };
 
 RoundelFit MovingFitter::fit() const {
-    auto pose = factor_->inverse_tail<kPoseCount>();
-    for (auto& row : pose)
-        for (double& value : row) value *= square(noise_);
+    const auto pose = scaled(factor_->inverse_tail<kPoseCount>(), square(noise_));
     RoundelFit fit = make_fit(still(p_), pose, pixels_.origin_x, pixels_.origin_y);
     fit.motion_x = p_[kMotionX], fit.motion_y = p_[kMotionY];
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);

@@ -49,9 +49,9 @@ ROUNDEL_CLONES void add_up(const MovingPixels& pixels, const MovingModel& model,
 }
 
 /// The path of a disc's centre, for distances of points from it in radii of the disc.
-class Path {
+class DiscPath {
   public:
-    explicit Path(const MovingParameters& p) : p_(still(p)) {
+    explicit DiscPath(const MovingParameters& p) : p_(still(p)) {
         det_ = p_[kAxx] * p_[kAyy] - p_[kAxy] * p_[kAxy];
         to_radii(p[kMotionX], p[kMotionY], u_, v_);
         length_ = u_ * u_ + v_ * v_ + 1e-12;
@@ -82,7 +82,7 @@ void append(const ImageView& image, int x, int y, MovingPixels& to) {
 }  // namespace
 
 void select_moving(const ImageView& image, const MovingParameters& p, int limit, MovingPixels& pixels) {
-    const Path path(p);
+    const DiscPath path(p);
     const Eigen axes = eigen(circle_image(still(p), 1).shape);
     const double a = std::sqrt(axes.first), b = std::sqrt(axes.second);
     const double reach = 1 + kMargin / b, x0 = p[kStill + kX], y0 = p[kStill + kY];

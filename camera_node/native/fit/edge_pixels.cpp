@@ -18,8 +18,6 @@ constexpr int kMinRows = 10;         // fewer do not determine an ellipse
 constexpr int kWideRows = 3;         // every third row uses the wide band
 constexpr double kNegligible = 0.5;  // grey levels: the largest effect of another edge
 
-double square(double x) { return x * x; }
-
 /// The images of the edges that the band uses.
 struct EdgeImages {
     CircleImage of[kEdges];

@@ -14,8 +14,6 @@ namespace roundel {
 constexpr double kMinBlur = 0.29;       // pixels: standard deviation of the pixel's own width
 constexpr double kShortestFocal = 400;  // pixels: no lens in use has a stronger perspective
 
-inline double square(double x) { return x * x; }
-
 /// The parameters of an initial guess, in a frame with its origin at pixel (x, y). A is the symmetric square
 /// root that maps the unit circle to the ellipse.
 inline Parameters initial_parameters(const InitialGuess& guess, int origin_x, int origin_y, double blur) {

@@ -222,9 +222,7 @@ PoseCovariance PhotometricFitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= print_effect_[i] * print_effect_[j];
-    for (auto& row : inverse)
-        for (double& value : row) value *= square(noise_);
-    return inverse;
+    return scaled(inverse, square(noise_));
 }
 
 RoundelFit PhotometricFitter::fit() const {

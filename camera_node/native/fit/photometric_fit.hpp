@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <array>
+#include <cmath>
 #include <optional>
 #include <span>
 
@@ -24,6 +25,12 @@ struct InitialGuess {
 /// centre + A u, |u| = 1) and of the offset x, y from its centre to the image of the disc's centre; pixels.
 using PoseCovariance = std::array<Vector<kPoseCount>, kPoseCount>;
 
+inline PoseCovariance scaled(PoseCovariance covariance, double factor) {
+    for (auto& row : covariance)
+        for (double& value : row) value *= factor;
+    return covariance;
+}
+
 /// A roundel fitted to the grey levels around its edges.
 struct RoundelFit {
     Ellipse outer;
@@ -39,6 +46,11 @@ struct RoundelFit {
     bool unoccluded = false;  // the fit uses the unmodified image, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
+    double contrast() const { return bright - dark; }
+    /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
+    bool is_explained(double image_noise, double misfit) const {
+        return edge_residual < std::hypot(1.2 * image_noise, misfit * contrast());
+    }
     /// Covariances of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {pose_cov[0][0], pose_cov[0][1], pose_cov[1][1]}; }
     Symmetric offset_covariance() const { return {pose_cov[5][5], pose_cov[5][6], pose_cov[6][6]}; }

@@ -33,6 +33,8 @@ struct Sides {
 };
 constexpr Sides kSidesOf[kEdges] = {{kDark, kBright}, {kBright, kDark}, {kBright, kGround}};
 
+inline double square(double x) { return x * x; }
+
 /// The image of the circle |X| = r, from its dual conic M diag(r^2, r^2, -1) M^T, M = [A + c g^T, c; g^T, 1]
 /// (Hartley and Zisserman, result 2.14). Its points are centre + S^(1/2) u, |u| = 1, with S = `shape`.
 struct CircleImage {

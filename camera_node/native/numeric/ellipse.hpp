@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <cmath>
 
 namespace roundel {
 
@@ -20,6 +21,10 @@ struct Eigen {
     double first, second, angle;
 };
 
-Eigen eigen(const Symmetric& matrix);
+inline Eigen eigen(const Symmetric& matrix) {
+    const double mean = (matrix.xx + matrix.yy) / 2, half = (matrix.xx - matrix.yy) / 2;
+    const double spread = std::hypot(half, matrix.xy);
+    return {mean + spread, mean - spread, std::atan2(matrix.xy + 0.0, half) / 2};
+}
 
 }  // namespace roundel

@@ -39,8 +39,8 @@ struct Normal {
     Lanes tail, density;
 };
 
-/// Minimax polynomials in t^2 on [-3.5, 3.5]. The error of the tail is 3e-5 there and 2e-4 beyond, that of
-/// the density 3e-3; the density is 0 beyond. Independent terms are faster than Horner's scheme.
+/// Approximating polynomials in t^2 on [-3.5, 3.5]. The error of the tail is 3e-5 there and 2e-4 beyond, that
+/// of the density 3e-3; the density is 0 beyond. Independent terms are faster than Horner's scheme.
 ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
     const Lanes above = t > -3.5f ? t : all(-3.5f), z = above < 3.5f ? above : all(3.5f);
     const Lanes u = z * z, uu = u * u;

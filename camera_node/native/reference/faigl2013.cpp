@@ -7,16 +7,32 @@
 #include <optional>
 #include <stdexcept>
 
+#include "numeric/ellipse.hpp"
+#include "reference/segments.hpp"
+
 namespace roundel {
 
 namespace {
+
+/// A dark segment with a bright one inside that passes the tests of Section III-B.
+struct SegmentPair {
+    int dark, bright;  // numbers of the segments
+    Moments disc;      // of both together: the outer disc
+};
 
 Symmetric covariance(const Moments& m) {
     const double x = m.x / m.n, y = m.y / m.n;
     return {m.xx / m.n - x * x, m.xy / m.n - x * y, m.yy / m.n - y * y};
 }
 
-bool is_whole(const Segment& s, int width, int height) {
+/// Section III-C: a disc's covariance matrix has the eigenvalues axis^2 / 16 along its axes.
+Ellipse covariance_ellipse(const Moments& disc) {
+    const Eigen e = eigen(covariance(disc));
+    return {disc.x / disc.n, disc.y / disc.n, 4 * std::sqrt(e.first), 4 * std::sqrt(std::max(e.second, 0.0)),
+            e.angle};
+}
+
+bool is_inside_image(const Segment& s, int width, int height) {
     return s.left > 0 && s.top > 0 && s.right < width - 1 && s.bottom < height - 1;
 }
 
@@ -32,8 +48,9 @@ bool is_inside(const Segment& inner, const Segment& outer) {
            inner.bottom < outer.bottom;
 }
 
-}  // namespace
-
+/// Section III-B, area against bounding box. The image of a slanted disc, turned by any angle, covers
+/// pi/4 sqrt(1 - rho^2) of its upright box; rho is the correlation of its pixels' x and y. With upright axes
+/// this is the paper's pi/4. True within 30 %.
 bool fills_its_box(const Segment& outer, const Moments& disc) {
     const Symmetric c = covariance(disc);
     const double upright = c.det() / (c.xx * c.yy);  // 1 - rho^2
@@ -41,34 +58,28 @@ bool fills_its_box(const Segment& outer, const Moments& disc) {
     return upright > 0 && std::abs(disc.n / expected - 1) < 0.3;
 }
 
+/// Section III-B, concentricity: the distance of the centres of the disc and of the bright segment is below a
+/// tenth of the minor axis (perspective separates them by less) plus half a pixel for small segments.
 bool are_concentric(const Moments& disc, const Moments& inner) {
     const double apart = std::hypot(disc.x / disc.n - inner.x / inner.n, disc.y / disc.n - inner.y / inner.n);
     return apart < 0.1 * covariance_ellipse(disc).minor + 0.5;
 }
 
+/// Section III-B, area ratio: sqrt(inner area / disc area) is the ratio of the diameters at any slant. True
+/// if it agrees with a print's ratio; blur moves each edge of a small segment by up to half a pixel.
 bool has_area_ratio(const Moments& disc, const Moments& inner, const RoundelLimits& limits) {
     const double ratio = std::sqrt(inner.n / disc.n);
     const double tolerance = limits.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
     return limits.ratio_error(ratio) < tolerance;
 }
 
-Ellipse covariance_ellipse(const Moments& disc) {
-    const Eigen e = eigen(covariance(disc));
-    return {disc.x / disc.n, disc.y / disc.n, 4 * std::sqrt(e.first), 4 * std::sqrt(std::max(e.second, 0.0)),
-            e.angle};
-}
-
-double distance_by_principal_axis(double diameter, double major) {
-    if (!(major > 0)) throw std::invalid_argument("the major axis must be above 0");
-    return diameter / major;
-}
-
+/// All pairs of segments that pass Section III-B. Segments that touch the image's border are excluded.
 std::vector<SegmentPair> find_pairs(const Segments& segments, int width, int height,
                                     const RoundelLimits& limits) {
     std::vector<SegmentPair> pairs;
     for (int k = 0; k < int(segments.list.size()); ++k) {
         const Segment& outer = segments.list[size_t(k)];
-        if (!outer.dark || !is_whole(outer, width, height) || !has_size(outer, limits)) continue;
+        if (!outer.dark || !is_inside_image(outer, width, height) || !has_size(outer, limits)) continue;
         const Moments& m = outer.moments;
         const int centre = segments.at(int(std::lround(m.x / m.n)), int(std::lround(m.y / m.n)));
         const Segment& inner = segments.list[size_t(centre)];
@@ -80,8 +91,6 @@ std::vector<SegmentPair> find_pairs(const Segments& segments, int width, int hei
     }
     return pairs;
 }
-
-namespace {
 
 /// Repeats the search for a pair in the window around it, under its own threshold theta = (m_d + m_b) / 2.
 std::optional<InitialGuess> rethreshold(const ImageView& image, const Segment& outer, double theta,
@@ -104,6 +113,11 @@ std::optional<InitialGuess> rethreshold(const ImageView& image, const Segment& o
 }
 
 }  // namespace
+
+double distance_by_principal_axis(double diameter, double major) {
+    if (!(major > 0)) throw std::invalid_argument("the major axis must be above 0");
+    return diameter / major;
+}
 
 std::vector<InitialGuess> PaperSearch::find(const ImageView& image, double min_contrast,
                                             const RoundelLimits& limits) const {

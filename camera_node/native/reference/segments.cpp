@@ -15,14 +15,14 @@ Moments& Moments::operator+=(const Moments& other) {
 namespace {
 
 /// Sums over the pixels [begin, end) of row `y`, in closed form.
-Moments run_moments(const Run& run, double y) {
+Moments run_moments(const SegmentRun& run, double y) {
     const double n = run.end - run.begin, middle = (run.begin + run.end - 1) / 2.0;
     const double x = n * middle;
     return {n, x, n * y, n * (middle * middle + (n * n - 1) / 12), x * y, n * y * y};
 }
 
 /// Appends the runs of a row; its mask is 1 at dark pixels.
-void append_runs(const uint8_t* mask, int width, std::vector<Run>& runs) {
+void append_runs(const uint8_t* mask, int width, std::vector<SegmentRun>& runs) {
     for (int x = 0; x < width;) {
         const uint8_t side = mask[x];
         const uint64_t eight = side * 0x0101010101010101u;
@@ -38,7 +38,7 @@ void append_runs(const uint8_t* mask, int width, std::vector<Run>& runs) {
 }
 
 /// The root of a run's set (union-find with path halving).
-int find_root(std::vector<Run>& runs, int k) {
+int find_root(std::vector<SegmentRun>& runs, int k) {
     while (runs[size_t(k)].segment != k) {
         int& parent = runs[size_t(k)].segment;
         parent = runs[size_t(parent)].segment;
@@ -47,16 +47,16 @@ int find_root(std::vector<Run>& runs, int k) {
     return k;
 }
 
-void join(std::vector<Run>& runs, int a, int b) {
+void join(std::vector<SegmentRun>& runs, int a, int b) {
     a = find_root(runs, a), b = find_root(runs, b);
     runs[size_t(std::max(a, b))].segment = std::min(a, b);
 }
 
 /// Joins the runs of one row [middle, end) with those of the row above [begin, middle).
-void join_rows(std::vector<Run>& runs, int begin, int middle, int end) {
+void join_rows(std::vector<SegmentRun>& runs, int begin, int middle, int end) {
     for (int above = begin, below = middle; above < middle && below < end;) {
-        const Run a = runs[size_t(above)],
-                  b = runs[size_t(below)];  // runs cover their rows, so these two touch
+        const SegmentRun a = runs[size_t(above)],
+                         b = runs[size_t(below)];  // runs cover their rows, so these two touch
         if (a.dark == b.dark) join(runs, above, below);
         if (a.end == b.end && above + 1 < middle && a.dark != b.dark)  // two bright runs meet at a corner
             a.dark ? join(runs, above + 1, below) : join(runs, above, below + 1);
@@ -65,7 +65,7 @@ void join_rows(std::vector<Run>& runs, int begin, int middle, int end) {
     }
 }
 
-void include(Segment& segment, const Run& run, int y) {
+void include(Segment& segment, const SegmentRun& run, int y) {
     segment.left = std::min(segment.left, run.begin);
     segment.right = std::max(segment.right, run.end - 1);
     segment.top = std::min(segment.top, y);
@@ -78,7 +78,7 @@ void number_segments(Segments& segments) {
     auto& runs = segments.runs;
     for (size_t y = 0; y + 1 < segments.row_begin.size(); ++y)
         for (int k = segments.row_begin[y]; k < segments.row_begin[y + 1]; ++k) {
-            Run& run = runs[size_t(k)];
+            SegmentRun& run = runs[size_t(k)];
             const bool root = run.segment == k;
             run.segment = root ? int(segments.list.size()) : runs[size_t(run.segment)].segment;
             if (root) segments.list.emplace_back().dark = run.dark;
@@ -90,7 +90,7 @@ void number_segments(Segments& segments) {
 
 int Segments::at(int x, int y) const {
     const auto begin = runs.begin() + row_begin[size_t(y)], end = runs.begin() + row_begin[size_t(y) + 1];
-    return std::upper_bound(begin, end, x, [](int value, const Run& run) { return value < run.end; })
+    return std::upper_bound(begin, end, x, [](int value, const SegmentRun& run) { return value < run.end; })
         ->segment;
 }
 
@@ -118,7 +118,7 @@ double mean_level(const ImageView& image, const Segments& segments, int segment)
     double sum = 0;
     for (int y = s.top; y <= s.bottom; ++y)
         for (int k = segments.row_begin[size_t(y)]; k < segments.row_begin[size_t(y) + 1]; ++k) {
-            const Run& run = segments.runs[size_t(k)];
+            const SegmentRun& run = segments.runs[size_t(k)];
             if (run.segment != segment) continue;
             for (int x = run.begin; x < run.end; ++x) sum += image.row(y)[x];
         }

@@ -24,7 +24,7 @@ struct Segment {
 };
 
 /// Pixels [begin, end) of a row on one side of the threshold.
-struct Run {
+struct SegmentRun {
     int begin, end, segment;
     bool dark;
 };
@@ -32,7 +32,7 @@ struct Run {
 /// All dark and all bright segments of an image, as runs in the order of the rows. Dark pixels are
 /// 4-connected and bright pixels 8-connected, so that a thin bright line separates dark segments.
 struct Segments {
-    std::vector<Run> runs;
+    std::vector<SegmentRun> runs;
     std::vector<int> row_begin;  // (height + 1) first run of each row
     std::vector<Segment> list;
     /// The number of the segment that contains a pixel of the image.

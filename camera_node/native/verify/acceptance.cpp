@@ -38,7 +38,7 @@ struct Tolerance {
 /// larger ones.
 bool has_small_residuals(const RoundelFit& fit, double noise, const Tolerance& tolerance) {
     const double misfit = tolerance.misfit * std::clamp(fit.outer.major / 30, 1.0, tolerance.max_growth);
-    return fit.edge_residual < std::hypot(1.2 * noise, misfit * (fit.bright - fit.dark));
+    return fit.is_explained(noise, misfit);
 }
 
 /// Whether ring and hole have the right levels. The fit uses pixels near the edges only, so several thin
@@ -51,7 +51,7 @@ bool has_levels(const ImageView& image, const RoundelFit& fit) {
 /// Whether white surrounds the ring, as on a card. Otherwise any dark disc with a light spot would pass.
 bool has_card(const RoundelFit& fit) {
     const double off = std::abs(fit.p[kGround] - fit.bright);
-    return fit.p[kCard] > kMinCard || off < kSameLevel * (fit.bright - fit.dark);
+    return fit.p[kCard] > kMinCard || off < kSameLevel * fit.contrast();
 }
 
 /// Whether both edges follow their ellipses. The width of a letter's stroke varies around the letter; that of
@@ -83,7 +83,7 @@ bool has_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
 
 /// Whether ragged edges may be the reason that a fit was rejected.
 bool may_be_ragged(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_ratio(fit, limits) && fit.bright - fit.dark >= limits.min_contrast / 2 &&
+    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast / 2 &&
            fit.support >= kRaggedSupport;
 }
 
@@ -98,7 +98,7 @@ std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess&
 }  // namespace
 
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_ratio(fit, limits) && fit.bright - fit.dark >= limits.min_contrast && fit.dark > -kOverflow &&
+    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kOverflow &&
            fit.bright < 255 + kOverflow && fit.outer.major >= limits.min_diameter &&
            fit.outer.major <= limits.max_diameter;
 }

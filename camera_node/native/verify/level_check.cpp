@@ -10,7 +10,7 @@ namespace roundel {
 
 LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
-    const double contrast = fit.bright - fit.dark, edge = 2 * fit.blur;  // levels further away are constant
+    const double contrast = fit.contrast(), edge = 2 * fit.blur;  // levels further away are constant
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
     LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
@@ -29,7 +29,7 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
 
 bool is_bullseye(const ImageView& image, const RoundelFit& fit) {
     // Blur makes thin rings less dark.
-    const float theta = float(fit.bright - 0.3 * (fit.bright - fit.dark));
+    const float theta = float(fit.bright - 0.3 * fit.contrast());
     const Ellipse& e = fit.outer;
     float least = 1e9f, most = 0;
     for (int k = 0; k < kRays; k += 2) {

@@ -59,14 +59,9 @@ class SectorView {
     const RoundelFit& fit_;
 };
 
-/// Whether the noise and `misfit`, over the contrast, explain the residuals on the ring's edges.
-bool has_residuals_below(const RoundelFit& fit, double noise, double misfit) {
-    return fit.edge_residual < std::hypot(1.2 * noise, misfit * (fit.bright - fit.dark));
-}
-
 /// The sectors in which the ring shows a level that is neither ink nor paper.
 Sectors find_foreign(const SectorView& view, const RoundelFit& fit, double noise) {
-    const double limit = std::max(kForeign, kForeignSigmas * noise / (fit.bright - fit.dark));
+    const double limit = std::max(kForeign, kForeignSigmas * noise / fit.contrast());
     const double ring = (1 - fit.ratio) * fit.outer.minor / 2;
     Sectors foreign = 0;
     for (const double share : {0.3, 0.5, 0.7})
@@ -128,11 +123,11 @@ bool has_print_ratio(const RoundelFit& fit, std::span<const double> ratios) {
 }  // namespace
 
 bool is_explained_by_noise(const RoundelFit& fit, double noise) {
-    return has_residuals_below(fit, noise, kNoiseMisfit);
+    return fit.is_explained(noise, kNoiseMisfit);
 }
 
 bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noise) {
-    return misfit.occlusion(noise, kOcclusion * (fit.bright - fit.dark)).any();
+    return misfit.occlusion(noise, kOcclusion * fit.contrast()).any();
 }
 
 std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGuess& input) {
@@ -142,7 +137,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     std::optional<EdgeMisfit> misfit = input.misfit;
     for (const double slack : kSlacks) {
         if (!misfit) misfit.emplace(image, fit.p);
-        const OcclusionMask mask = misfit->occlusion(input.noise, slack * (fit.bright - fit.dark));
+        const OcclusionMask mask = misfit->occlusion(input.noise, slack * fit.contrast());
         if (masks_too_much(mask)) return std::nullopt;
         if (mask == guess.occlusion) continue;
         guess = {fit.outer, fit.ratio, fit.dark, fit.bright, guess.print_ratios, mask};
@@ -150,7 +145,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
         if (!rest) return std::nullopt;
         fit = *rest, misfit.reset();
     }
-    if (!has_residuals_below(fit, input.noise, kRestMisfit)) return std::nullopt;
+    if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     if (input.known) return fit;
     const SectorView view(image, fit);
     if (!has_print_ratio(fit, guess.print_ratios)) return std::nullopt;

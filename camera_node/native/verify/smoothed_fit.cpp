@@ -43,8 +43,7 @@ std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGues
     std::optional<RoundelFit> fit = fit_photometric({smooth.data(), width, height, width}, moved);
     if (!fit) return fit;
     fit->outer.x += left, fit->outer.y += top;
-    for (auto& row : fit->pose_cov)
-        for (double& value : row) value *= kInflation;
+    fit->pose_cov = scaled(fit->pose_cov, kInflation);
     return fit;
 }
 

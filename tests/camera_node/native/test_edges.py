@@ -10,7 +10,7 @@ from tests.conftest import ROOT
 from tests.native import build
 
 NATIVE = ROOT / "camera_node" / "native"
-SOURCES = "edge_pixels", "normal_equations", "ellipse"
+SOURCES = "edge_pixels", "normal_equations"
 
 
 def test_separate_edges_and_the_whole_give_the_same_normal_equations(tmp_path: Path):
