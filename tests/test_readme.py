@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from tests.calib.intrinsics.test_calibrate import SPEC, board_poses, render
+from tests.calib.boards import SPEC, board_poses, render
 from tests.conftest import ROOT, free_port
 from tests.waiting import wait_for_port
 

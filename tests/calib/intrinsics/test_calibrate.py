@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Calibration from a board that is rendered through a known lens recovers that lens."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import cache
 from itertools import islice
 from pathlib import Path
 
@@ -15,47 +14,24 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import BoardView, adjust_lens
-from calib.intrinsics.board import CharucoFinder, ChessboardFinder, make_charuco_board, make_finder
-from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge_lenses
+from calib.intrinsics.board import (
+    BoardFinder,
+    CharucoFinder,
+    ChessboardFinder,
+    make_charuco_board,
+    make_finder,
+)
+from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, merge_lenses
+from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.guided_capture import capture_views
 from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
-from camera_node.arrays import Array
 from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
-
-LENS = Lens(
-    width=640, height=480, fx=520.0, fy=523.0, cx=325.0, cy=236.0, distortion=(-0.12, 0.04, 0.0, 0.0, 0.0)
-)
-SPEC = "charuco:6x5:0.05:0.75:DICT_4X4_50"
-SCALE = 1200  # board pixels a metre
-Pose = tuple[NDArray, NDArray]
-
-
-@cache
-def pixel_rays() -> Array:
-    """Viewing rays of half pixels, interpolated from a coarse grid."""
-    v, u = np.mgrid[0:97, 0:129] * 10.0
-    coarse = LENS.rays(np.column_stack([(u.ravel() - 0.5) / 2, (v.ravel() - 0.5) / 2])).reshape(97, 129, 3)
-    x, y = np.meshgrid(np.arange(1280, dtype=np.float32) / 10, np.arange(960, dtype=np.float32) / 10)
-    return cv2.remap(coarse, x, y, cv2.INTER_LINEAR).reshape(-1, 3).astype(float)
-
-
-def render(turn: NDArray, shift: NDArray) -> NDArray[np.uint8]:
-    """The board rotated by `turn`, with its centre at `shift`, seen through LENS; rendered at twice the size."""
-    size = (int(0.3 * SCALE), int(0.25 * SCALE))
-    picture = cv2.copyMakeBorder(make_charuco_board(SPEC).generateImage(size), 60, 60, 60, 60, 0, value=255)
-    rays = pixel_rays()
-    R = rotation_from_vector(turn)
-    distance = (shift @ R[:, 2]) / (rays @ R[:, 2])
-    on_board = (rays * distance[:, None] - shift) @ R[:, :2] + [0.15, 0.125]
-    where = (on_board * SCALE - 0.5 + 60).astype(np.float32).reshape(960, 1280, 2)
-    big = cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderValue=128)
-    return cv2.resize(big, (640, 480), interpolation=cv2.INTER_AREA).astype(np.uint8)
-
+from tests.calib.boards import LENS, SPEC, Pose, board_poses, render
 
 BOARD = ChessboardFinder(8, 6, 0.05)
 SIDES = [
@@ -96,20 +72,17 @@ def corners_of_the_image() -> list[Pose]:
     ]
 
 
-def board_poses(tilt: float, count: int = 16) -> list[Pose]:
-    """Rotations and translations of the board, tilted in all directions."""
-    rng = np.random.default_rng(3)
-    return [
-        (
-            tilt * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.2]),
-            np.array([0.14 * np.cos(k), 0.1 * np.sin(1.7 * k), 0.55 + 0.1 * rng.random()]),
-        )
-        for k in range(count)
-    ]
-
-
 def name_all(images: list[NDArray[np.uint8]]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     return ((f"{k}.png", image) for k, image in enumerate(images))
+
+
+def calibrate_lens(
+    name: str, images: Iterable[tuple[str, NDArray[np.uint8]]], finder: BoardFinder
+) -> CalibratedLens:
+    views = BoardViews(name, finder)
+    for image_name, image in images:
+        views.add(image_name, image)
+    return views.solve()
 
 
 def corner_rms(finder: CharucoFinder, images: list[NDArray[np.uint8]], poses: list[Pose]) -> float:
