@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from calib.commands.inputs import read_recording, require_one
+from calib.commands.inputs import WandOptions
 from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
@@ -17,7 +17,7 @@ from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.quality.grade import assess
 from calib.wand.result import WandCalibration
-from calib.wand.scale import SIGMA_M, Distance
+from calib.wand.scale import Distance
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -25,42 +25,23 @@ from camera_node.terminal import progress_console, say
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class Check(WandOptions):
     """Judge a rig by a wand recording: whether the cameras still have the rig's poses, whether two halves of the
     recording agree, how precise the rig is where robots drive, and which camera limits it. Nothing is written without
     --maps or --out."""
 
     rig: Path
     """The rig to judge."""
-    wand: Path = Path("configs/wand.yaml")
-    """The wand of the recording: diameter_m and markers, metres."""
-    frames: Path | None = None
-    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
-    observations: Path | None = None
-    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
-    recording: Path | None = None
-    """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
-    distance: tuple[str, str, float] | None = None
-    """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
-    distance_sigma: float = SIGMA_M
-    """Standard deviation of that distance, metres."""
-    height: float = 0.1
-    """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
-    maps: Path | None = None
-    """A folder for images: each camera's residuals and where to wave next, and the expected errors."""
     out: Path | None = None
     """Write the rig with the results in its `calibration` to this file."""
 
     def execute(self) -> None:
         """Calibrate from the whole recording and from its halves, and compare."""
-        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
-        require_one({**files, "--recording MCAP": self.recording})
+        self.require_recording()
         if self.out is not None:
             check_folder(self.out)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
-        distance = Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
-        messages = read_recording(rig, self.frames, self.observations, self.recording, wand)
-        figures = self._judge(rig, wand, messages, distance)
+        figures = self._judge(rig, wand, self.read_recording(rig, wand), self.measured_distance(rig))
         if self.out is not None:
             calibration = {**rig.calibration, "check": {**provenance(), **figures}}
             write_rig(msgspec.structs.replace(rig, calibration=calibration), self.out)
@@ -90,7 +71,7 @@ def _compare_halves(
     exact = distance and replace(distance, sigma_m=0.0)
     try:
         with progress_console().status("calibrating camera poses from each half"):
-            first, second = (calibrate(rig, wand, half, exact) for half in split(messages))
+            first, second = (calibrate(rig, wand, half, exact) for half in split_halves(messages))
             agreement = compare_calibrations(*(CameraPoses.of_calibration(half) for half in (first, second)))
     except CalibrationError as error:
         say(f"warning: the halves of the recording can't be compared: {error}")
@@ -111,7 +92,7 @@ def _compare_with_rig(rig: Rig, result: WandCalibration) -> Agreement | None:
     return agreement
 
 
-def split(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detections]]:
+def split_halves(messages: Sequence[Detections]) -> tuple[list[Detections], list[Detections]]:
     """The two halves of a recording, by time."""
     times = [message.t_ns for message in messages]
     middle = (min(times) + max(times)) // 2

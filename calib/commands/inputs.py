@@ -1,16 +1,58 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Checks the options by which a subcommand takes its input, and reads recordings of wands and roundels."""
+"""The options by which subcommands take their input, and the reading of recordings."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import CalibrationError
 from calib.rig.recording import read_detections
 from calib.rig.rig import Rig
+from calib.wand.scale import SIGMA_M, Distance
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandOptions:
+    """The options of every calibration from a wand recording."""
+
+    wand: Path = Path("configs/wand.yaml")
+    """The wand: diameter_m and markers, metres."""
+    frames: Path | None = None
+    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
+    observations: Path | None = None
+    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    recording: Path | None = None
+    """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
+    distance: tuple[str, str, float] | None = None
+    """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
+    distance_sigma: float = SIGMA_M
+    """Standard deviation of that distance, metres."""
+    height: float = 0.1
+    """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
+    maps: Path | None = None
+    """A folder for images: each camera's residuals and where to wave next, and the expected errors."""
+
+    def require_recording(self, **others: object) -> None:
+        """Raise ConfigError unless exactly one recording is given, or one of the `others`, which are flags by name."""
+        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
+        flags = {f"--{name}": value for name, value in others.items()}
+        require_one({**files, "--recording MCAP": self.recording, **flags})
+
+    def read_recording(self, rig: Rig, wand: Body) -> list[Detections]:
+        """The detections of the given recording; see `read_recording`."""
+        return read_recording(rig, self.frames, self.observations, self.recording, wand)
+
+    def measured_distance(self, rig: Rig) -> Distance | None:
+        """The given distance.
+
+        Raises:
+            CalibrationError: it is not a distance of two of the rig's cameras.
+        """
+        return Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
 
 
 def require_one(options: Mapping[str, object], purpose: str = "") -> None:

@@ -11,7 +11,7 @@ from rich.live import Live
 from zenoh import Session
 
 from calib.commands.connection import Connection, Server
-from calib.commands.inputs import read_recording, require_one, require_positive
+from calib.commands.inputs import WandOptions, require_positive
 from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_recalibration, print_report, show_progress
 from calib.live.collect import CollectedFrames
@@ -21,7 +21,7 @@ from calib.rig.rig import Rig, load_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
-from calib.wand.scale import SIGMA_M, Distance
+from calib.wand.scale import Distance
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
@@ -30,58 +30,37 @@ from camera_node.terminal import console, progress_console, say
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wand:
+class Wand(WandOptions):
     """Calibrate camera poses from a wand that is waved in front of the cameras."""
 
-    wand: Path = Path("configs/wand.yaml")
-    """The wand: diameter_m and markers, metres."""
     rig: Path
     """Intrinsics of every camera; its poses are used with --only."""
     out: Path
     """The file for the rig with poses; a previous file is saved as rig.1.yaml, ..."""
-    frames: Path | None = None
-    """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
-    observations: Path | None = None
-    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
-    recording: Path | None = None
-    """Or read a recording (MCAP) of --live or of python -m fusion record."""
     live: bool = False
-    """Or collect from the running cameras, publish the result to the server, and save the wand recording beside --out
+    """Collect from the running cameras, publish the result to the server, and save the wand recording beside --out
     (rig.wave.mcap)."""
     seconds: float | None = None
     """Collect for this long; by default until more frames would not improve the result, at most three minutes."""
     only: str | None = None
     """Calibrate the pose of this camera only, from a short recording; the other cameras keep theirs."""
-    distance: tuple[str, str, float] | None = None
-    """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
-    distance_sigma: float = SIGMA_M
-    """Standard deviation of that distance, metres."""
-    height: float = 0.1
-    """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
-    maps: Path | None = None
-    """A folder for images: each camera's residuals and where to wave next, and the expected errors."""
     server: Server = field(default_factory=Connection)
 
     def execute(self) -> None:
         """Calibrate and write the rig; nothing is written unless two cameras or more are placed."""
         check_folder(self.out)
-        files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
-        require_one({**files, "--recording MCAP": self.recording, "--live": self.live})
+        self.require_recording(live=self.live)
         require_positive(self.seconds)
         rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
-        distance = self._check_distance(rig)
-        if self.live:
-            self._calibrate_live(rig, wand, distance)
-        else:
-            messages = read_recording(rig, self.frames, self.observations, self.recording, wand)
-            self._calibrate(rig, wand, messages, distance)
-
-    def _check_distance(self, rig: Rig) -> Distance | None:
         if self.distance is not None and self.only is not None:
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"
             )
-        return Distance.of(self.distance, self.distance_sigma, list(rig.cameras))
+        distance = self.measured_distance(rig)
+        if self.live:
+            self._calibrate_live(rig, wand, distance)
+        else:
+            self._calibrate(rig, wand, self.read_recording(rig, wand), distance)
 
     def _calibrate(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None

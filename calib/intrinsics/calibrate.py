@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Calibrates a lens from views of a board (Zhang 2000): selects views, rejects outliers, and checks the result."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -17,7 +17,6 @@ from calib.intrinsics.adjustment import (
 )
 from calib.intrinsics.board import BoardFinder
 from calib.intrinsics.calibrated_lens import CalibratedLens, projection_sigma_px
-from calib.intrinsics.images import NamedImage
 from calib.rig.camera import Camera
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.rig import Rig
@@ -35,20 +34,6 @@ MAX_SIGMA = (
 )
 MAX_VIEW_RMS = 3.0  # of a view, in medians over views: beyond, it is an outlier (motion blur, a bent board)
 TILT = "tilt the board by 30 degrees in all directions, and show it in every part of the image"
-
-
-def calibrate_lens(
-    name: str, images: Iterable[NamedImage], finder: BoardFinder, model: Model = "pinhole"
-) -> CalibratedLens:
-    """Calibrate the lens of camera `name` from named images of a board.
-
-    Raises:
-        CalibrationError: too few views, views that can't fix a lens, or images of different sizes.
-    """
-    views = BoardViews(name, finder)
-    for image_name, image in images:
-        views.add(image_name, image)
-    return views.solve(model)
 
 
 class BoardViews:

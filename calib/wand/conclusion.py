@@ -119,7 +119,6 @@ def _build_report(
         ],
         unplaced=placement.unplaced,
         wand_poses=len(adjusted.problem.knot_s),
-        scale=adjusted.scale,
         length_mean_mm=float(np.mean(lengths)) * 1e3 if len(lengths) else None,
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
         outliers=_list_outliers(names, observations, adjusted),

@@ -44,13 +44,11 @@ class FrameTable:
 
     Attributes:
         camera: (F,) index of the camera.
-        t_s: (F,) timestamp of the middle of the exposure, seconds after `origin_ns`.
-        origin_ns: the first timestamp.
+        t_s: (F,) timestamp of the middle of the exposure, seconds after the first frame.
     """
 
     camera: Index
     t_s: Array
-    origin_ns: int
 
     def period_s(self) -> float:
         """Return the median time between consecutive frames of a camera, seconds; 0 if no camera has two."""
@@ -107,9 +105,8 @@ def gather(
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
     camera_of, t_ns, bound_us, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
-    origin_ns = min(t_ns)
     camera = np.array([index[name] for name in camera_of], np.intp)
-    frames = FrameTable(camera, (np.array(t_ns) - origin_ns) * 1e-9, origin_ns)
+    frames = FrameTable(camera, (np.array(t_ns) - min(t_ns)) * 1e-9)
     tables = [_read_column(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
     uv, cov, axes_px, angle_rad, number = tables
     frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])

@@ -76,7 +76,6 @@ class WandReport:
         cameras: of the placed cameras.
         unplaced: the reason for each camera without a pose.
         wand_poses: number of estimated poses of the wand.
-        scale: residuals over the standard deviations that the detector gives.
         length_mean_mm, length_std_mm: measured less nominal lengths of the wand; None with one marker.
         outliers: the rejected marker centres, worst first.
         metric: whether the scale is known.
@@ -89,7 +88,6 @@ class WandReport:
     cameras: list[CameraReport]
     unplaced: dict[str, str]
     wand_poses: int
-    scale: float
     length_mean_mm: float | None
     length_std_mm: float | None
     outliers: list[Outlier]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The real server's memory by the minute: `python -m tests.benchmarks.fusion_server [--minutes 10]`.
+"""Memory of the live server over time: `python -m tests.benchmarks.fusion_server [--minutes 10]`.
 
-`python -m fusion` runs as a process of its own; detections come to it over Zenoh on loopback, each when it is due.
+`python -m fusion` runs as a separate process and receives detections over Zenoh on loopback in real time.
 """
 
 import subprocess
@@ -34,11 +34,12 @@ DELAY_NS = 5_000_000  # from an exposure until its detections are sent
 
 
 def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 30.0) -> None:
-    """Print what the server tells of itself at each minute's end, and by how much its memory grew in a minute.
+    """Print the server's status at the end of each minute, and the growth of its memory per minute.
 
     Args:
         minutes: of real time.
-        robots: of 4 markers each, with a tenth of the detections missing, a false one a frame and 5 of nobody.
+        robots: of 4 markers each; a tenth of the detections is missing, each frame has a false one, 5 markers are
+            unlabeled.
         cameras: free-running.
         hz: of each camera.
     """
@@ -54,18 +55,18 @@ def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 
         status.next(DEADLINE_S)
         for sent_s in publish(load, session, 60 * minutes):
             if sent_s >= 60 * minute:
-                memory.append(tell(minute, status, load))
+                memory.append(print_status(minute, status, load))
                 minute += 1
-    kept = memory[1:]  # what is filled once is filled in the first minute
-    if len(kept) > 1:
+    steady = memory[1:]  # caches are filled in the first minute
+    if len(steady) > 1:
         print(
-            f"{np.polyfit(np.arange(len(kept)), kept, 1)[0]:.3f} MB a minute after the first; goal: flat, 0.1 MB"
+            f"{np.polyfit(np.arange(len(steady)), steady, 1)[0]:.3f} MB a minute after the first; goal: flat, 0.1 MB"
         )
 
 
 @contextmanager
 def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
-    """The server of the load's rig and robots."""
+    """A server with the load's rig and robots."""
     save_rig(Rig(cameras=load.rig), folder / "rig.yaml")
     bodies = {name: msgspec.to_builtins(body) for name, body in load.bodies.items()}
     (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
@@ -81,7 +82,7 @@ def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
 
 
 def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[float]:
-    """Send all detections, each when it is due; yields the seconds since the start after each."""
+    """Publish all detections in real time; yield the seconds since the start after each."""
     keys, pause = Keys(ARENA), threading.Event()
     publishers = {name: session.declare_publisher(keys.detections(name)) for name in load.rig}
     scene, begun_ns = list(load.messages(SCENE_S)), time.time_ns()
@@ -96,7 +97,7 @@ def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[floa
 
 
 def there_and_back(scene: list[Detections]) -> Iterator[tuple[Detections, int]]:
-    """A scene's detections, played forwards and backwards without end, and when: it takes time to make them."""
+    """A scene's detections, forwards and backwards for ever, and their times: new ones would take too long to make."""
     for turn in count():
         for message in scene if turn % 2 == 0 else reversed(scene):
             t_ns = message.t_ns - START_NS
@@ -106,15 +107,15 @@ def there_and_back(scene: list[Detections]) -> Iterator[tuple[Detections, int]]:
             )
 
 
-def tell(minute: int, stream: Stream[FusionStatus], load: Load) -> float:
-    """Print the server's last status; its memory in MB."""
+def print_status(minute: int, stream: Stream[FusionStatus], load: Load) -> float:
+    """Print the server's last status; return its memory in MB."""
     status = stream.latest()
     assert status is not None
     tracked = sum(state == "tracked" for state in status.robots.values()) / load.robots
-    what = (
+    figures = (
         f"{status.memory_mb:.2f} MB, {status.cpu:.0%} of a core, {status.frame_sets_per_s:.1f} poses a second"
     )
-    print(f"{minute:3d} min: {what}, {tracked:.0%} tracked, faults {status.faults or 'none'}", flush=True)
+    print(f"{minute:3d} min: {figures}, {tracked:.0%} tracked, faults {status.faults or 'none'}", flush=True)
     return status.memory_mb
 
 

@@ -17,7 +17,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at
 from camera_node.protocol.messages import Detections
-from tests.calib.synthetic import WAND, outlines
+from tests.calib.synthetic import WAND, outlines, with_sizes
 
 EPOCH_S = 1_000.0
 
@@ -168,7 +168,8 @@ def _detect(
         numbers = (rows % count).astype(np.int32) if scenario.numbered else None
         roundels = Roundels.from_points(uv[rows], max(scenario.sigma_px, 0.02), numbers)
         if scenario.sized:
-            roundels = _with_sizes(roundels, axes[rows], angle[rows])
+            full_axes = np.sort(axes[rows], axis=1)[:, ::-1]
+            roundels = with_sizes(roundels, full_axes, angle[rows])
         frames.append(roundels)
     return frames
 
@@ -180,9 +181,3 @@ def _place(camera: Camera, scenario: WandScenario, path: WandPath, t_s: Array) -
     T = invert(camera.matrix())
     world = np.einsum("nij,nj->ni", R, local) + place
     return world @ T[:3, :3].T + T[:3, 3], R[:, :, 2] @ T[:3, :3].T
-
-
-def _with_sizes(roundels: Roundels, axes: Array, angle: Array) -> Roundels:
-    one = np.ones(len(roundels))
-    known = (np.sort(axes, axis=1)[:, ::-1], angle, 0.6 * one, 100 * one, roundels.id, roundels.track)
-    return Roundels(roundels.uv, roundels.cov, *known)

@@ -146,11 +146,12 @@ def _detect(
     numbers = rows.astype(np.int32) if options.numbered else None
     roundels = Roundels.from_points(uv, max(options.sigma_px, 0.02), numbers)
     if options.sized:
-        roundels = _with_sizes(roundels, axes[rows], angles[rows])
+        roundels = with_sizes(roundels, axes[rows], angles[rows])
     return _add_clutter(roundels, options.clutter, rng) if options.clutter else roundels
 
 
-def _with_sizes(roundels: Roundels, axes: Array, angles: Array) -> Roundels:
+def with_sizes(roundels: Roundels, axes: Array, angles: Array) -> Roundels:
+    """Return the roundels with full axes (n, 2), largest first, and angles (n,)."""
     one = np.ones(len(roundels))
     return Roundels(
         roundels.uv, roundels.cov, axes, angles, 0.6 * one, 100 * one, roundels.id, roundels.track
@@ -160,7 +161,7 @@ def _with_sizes(roundels: Roundels, axes: Array, angles: Array) -> Roundels:
 def _add_clutter(roundels: Roundels, count: int, rng: np.random.Generator) -> Roundels:
     false = Roundels.from_points(rng.uniform([20, 20], [780, 580], (count, 2)), 0.1)
     major = rng.uniform(10, 40, count)
-    false = _with_sizes(false, np.column_stack([major, 0.7 * major]), rng.uniform(-1.5, 1.5, count))
+    false = with_sizes(false, np.column_stack([major, 0.7 * major]), rng.uniform(-1.5, 1.5, count))
     return Roundels(*(np.concatenate([getattr(roundels, n), getattr(false, n)]) for n in Roundels.__slots__))
 
 

@@ -33,7 +33,7 @@ def with_disc_centres(
 
 
 def centre_offsets(
-    lenses: list[Lens], cameras: Array, seen: WandObservations, points: Array, radius: float
+    lenses: list[Lens], cameras: Array, observations: WandObservations, points: Array, radius: float
 ) -> Array:
     """(n, 2) pixels from the projections of discs' centres to their ellipses' centres; 0 where no ellipse of the frame
     set gives the normal.
@@ -43,18 +43,20 @@ def centre_offsets(
         points: (n, 3) centres of the discs, world.
         radius: of the discs, metres.
     """
-    offsets = np.zeros((len(seen), 2))
-    local, P = point_jacobians(lenses, cameras, seen.camera, points)
+    offsets = np.zeros((len(observations), 2))
+    local, P = point_jacobians(lenses, cameras, observations.camera, points)
     known = (
-        np.isfinite(seen.axes_px).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (local[:, 2] > 2 * radius)
+        np.isfinite(observations.axes_px).all(axis=1)
+        & np.isfinite(P).all(axis=(1, 2))
+        & (local[:, 2] > 2 * radius)
     )
     if not known.any():
         return offsets
-    normals = _find_normals(cameras, seen.select(known), P[known], points[known], radius)
-    rows = np.flatnonzero(np.isfinite(normals[seen.knot, 0]) & (local[:, 2] > 2 * radius))
+    normals = _find_normals(cameras, observations.select(known), P[known], points[known], radius)
+    rows = np.flatnonzero(np.isfinite(normals[observations.knot, 0]) & (local[:, 2] > 2 * radius))
     for c, lens in enumerate(lenses):
-        mine = rows[seen.camera[rows] == c]
-        normal = normals[seen.knot[mine]] @ cameras[c, :3, :3]
+        mine = rows[observations.camera[rows] == c]
+        normal = normals[observations.knot[mine]] @ cameras[c, :3, :3]
         offsets[mine] = np.nan_to_num(displacement(lens, local[mine], normal, radius))
     return offsets
 
@@ -74,27 +76,29 @@ def displacement(lens: Lens, points: Array, normals: Array, radius: float) -> Ar
     return lens.project(np.column_stack([centre, np.ones(len(centre))])) - lens.project(points)
 
 
-def _find_normals(cameras: Array, seen: WandObservations, P: Array, points: Array, radius: float) -> Array:
+def _find_normals(
+    cameras: Array, observations: WandObservations, P: Array, points: Array, radius: float
+) -> Array:
     """(K, 3) unit normals by frame set, world; NaN without an ellipse.
 
     A small disc's ellipse is r^2 P (I - n n') P', so its difference to r^2 P P' is r^2 (P n)(P n)', for either sign of
     n.
     """
-    turn = np.stack([np.cos(seen.angle_rad), np.sin(seen.angle_rad)], axis=1)
+    turn = np.stack([np.cos(observations.angle_rad), np.sin(observations.angle_rad)], axis=1)
     across = np.stack([-turn[:, 1], turn[:, 0]], axis=1)
-    a, b = (seen.axes_px.T / 2) ** 2
+    a, b = (observations.axes_px.T / 2) ** 2
     shape = a[:, None, None] * turn[:, :, None] * turn[:, None]
     shape += b[:, None, None] * across[:, :, None] * across[:, None]
     full = P @ np.swapaxes(P, 1, 2)
     unit = np.trace(full, axis1=1, axis2=2)
     deficit = (full - shape / radius**2) / unit[:, None, None]
     P = P / np.sqrt(unit)[:, None, None]
-    toward = cameras[seen.camera, :3, 3] - points
-    count = int(seen.knot.max()) + 1
-    normals = _try_directions(count, seen.knot, P, deficit, toward)
+    toward = cameras[observations.camera, :3, 3] - points
+    count = int(observations.knot.max()) + 1
+    normals = _try_directions(count, observations.knot, P, deficit, toward)
     for _ in range(STEPS):
-        normals = _refine(normals, seen.knot, P, deficit)
-    normals[np.bincount(seen.knot, minlength=count) == 0] = np.nan
+        normals = _refine(normals, observations.knot, P, deficit)
+    normals[np.bincount(observations.knot, minlength=count) == 0] = np.nan
     return normals
 
 

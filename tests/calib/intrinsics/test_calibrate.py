@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Calibration from a board that is rendered through a known lens recovers that lens."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -14,8 +14,15 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import BoardView, adjust_lens
-from calib.intrinsics.board import CharucoFinder, ChessboardFinder, make_charuco_board, make_finder
-from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, calibrate_lens, merge_lenses
+from calib.intrinsics.board import (
+    BoardFinder,
+    CharucoFinder,
+    ChessboardFinder,
+    make_charuco_board,
+    make_finder,
+)
+from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, merge_lenses
+from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.guided_capture import capture_views
 from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
@@ -67,6 +74,15 @@ def corners_of_the_image() -> list[Pose]:
 
 def name_all(images: list[NDArray[np.uint8]]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     return ((f"{k}.png", image) for k, image in enumerate(images))
+
+
+def calibrate_lens(
+    name: str, images: Iterable[tuple[str, NDArray[np.uint8]]], finder: BoardFinder
+) -> CalibratedLens:
+    views = BoardViews(name, finder)
+    for image_name, image in images:
+        views.add(image_name, image)
+    return views.solve()
 
 
 def corner_rms(finder: CharucoFinder, images: list[NDArray[np.uint8]], poses: list[Pose]) -> float:

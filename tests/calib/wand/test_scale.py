@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.__main__ import execute
-from calib.commands.check import split
+from calib.commands.check import split_halves
 from calib.errors import CalibrationError
 from calib.live.wand_session import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
@@ -72,7 +72,7 @@ def test_a_camera_of_a_light_that_moved_is_named():
         cameras=4, seconds=12, rate_hz=30, sized=False, both_sides=True, wand=LIGHT, seed=21
     )
     recorded = record_wave(scenario)
-    first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split(recorded.messages))
+    first, second = (calibrate(recorded.intrinsics, LIGHT, half) for half in split_halves(recorded.messages))
     moved = CameraPoses.of_calibration(second)
     moved.cameras[2, :3, 3] += 0.02 / 6 * np.array([1.0, 0.0, 0.0])  # the scale: 6 m are 1 here
     agreement = compare_calibrations(CameraPoses.of_calibration(first), moved)
@@ -88,7 +88,7 @@ def compare_halves(seed: int, off: tuple[float, float, float]) -> Agreement:
     recorded = record_wave(scenario)
     rig = roughly(recorded.intrinsics, off, seed=seed)
     return compare_calibrations(
-        *(CameraPoses.of_calibration(calibrate(rig, LIGHT, half)) for half in split(recorded.messages))
+        *(CameraPoses.of_calibration(calibrate(rig, LIGHT, half)) for half in split_halves(recorded.messages))
     )
 
 

@@ -60,7 +60,7 @@ def test_landmarks_that_match_nothing_or_in_two_ways_are_refused():
 
 
 def test_the_shipped_frame_fixes_a_world():
-    """`configs/l.yaml`: the legs differ enough to be told apart."""
+    """`configs/l.yaml`: the legs differ enough to be distinguished."""
     frame = load_yaml(ROOT / "configs" / "l.yaml", Body)
     landmarks = {str(k): point for k, point in enumerate(frame.points)}
     arena = ring()

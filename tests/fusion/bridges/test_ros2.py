@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An arena's robots in ROS 2. `rosbags` is the oracle: an implementation of ROS's messages that is none of ours."""
+"""An arena's robots in ROS 2. The oracle is `rosbags`, an independent implementation of ROS's messages."""
 
 import contextlib
 import queue
@@ -19,20 +19,19 @@ from zenoh.ext import Int64, z_deserialize
 from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
-from camera_node.protocol.session import open_router
+from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.ros2 import Ros2Node, ros_name
 from fusion.bridges.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
 from fusion.client.arena import Arena
 from fusion.commands.ros2 import ros2
 from fusion.protocol.messages import RobotPose
-from tests.conftest import free_port
 
 DEADLINE_S = 60.0
 ROS = get_typestore(Stores.ROS2_JAZZY)
 
 
 def read(data: bytes, kind: str) -> Any:
-    """What ROS reads; its fields are made at run time."""
+    """The message as ROS decodes it; its fields are created at run time."""
     return ROS.deserialize_cdr(data, kind)
 
 
@@ -56,11 +55,11 @@ POSE = draw_pose()
 
 
 @pytest.mark.parametrize("kind", TYPE_HASHES)
-def test_types_have_ros_s_own_hashes(kind):
+def test_type_hashes_are_those_of_ros(kind):
     assert ROS.hash_rihs01(kind) == f"RIHS01_{TYPE_HASHES[kind]}"
 
 
-@pytest.mark.parametrize("frame", ["", "map", "world", "arena1"])  # lengths of every remainder by four
+@pytest.mark.parametrize("frame", ["", "map", "world", "arena1"])  # lengths with every remainder modulo four
 @pytest.mark.parametrize(
     ("kind", "write"),
     [
@@ -69,40 +68,40 @@ def test_types_have_ros_s_own_hashes(kind):
         ("tf2_msgs/msg/TFMessage", lambda frame: transform(POSE, frame, "rover")),
     ],
 )
-def test_bytes_are_those_that_ros_writes(kind, write, frame):
+def test_bytes_are_those_of_ros(kind, write, frame):
     data = write(frame)
     assert bytes(ROS.serialize_cdr(read(data, kind), kind)) == data
 
 
-def test_messages_say_what_the_pose_says():
+def test_messages_have_the_values_of_the_pose():
     stamped = read(pose_stamped(POSE, "world"), "geometry_msgs/msg/PoseStamped")
-    told = read(odometry(POSE, "world", "rover"), "nav_msgs/msg/Odometry")
+    odom = read(odometry(POSE, "world", "rover"), "nav_msgs/msg/Odometry")
     (tf,) = read(transform(POSE, "world", "rover"), "tf2_msgs/msg/TFMessage").transforms
-    for message in (stamped, told, tf):
+    for message in (stamped, odom, tf):
         stamp = message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == POSE.t_ns
         assert message.header.frame_id == "world"
-    assert told.child_frame_id == tf.child_frame_id == "rover"
-    for place in (stamped.pose.position, told.pose.pose.position, tf.transform.translation):
+    assert odom.child_frame_id == tf.child_frame_id == "rover"
+    for place in (stamped.pose.position, odom.pose.pose.position, tf.transform.translation):
         assert (place.x, place.y, place.z) == POSE.position
-    for q in (stamped.pose.orientation, told.pose.pose.orientation, tf.transform.rotation):
+    for q in (stamped.pose.orientation, odom.pose.pose.orientation, tf.transform.rotation):
         assert (q.w, q.x, q.y, q.z) == POSE.quaternion_wxyz
-    R, twist = rotation_from_wxyz(POSE.quaternion_wxyz), told.twist.twist
-    forth = R @ [twist.linear.x, twist.linear.y, twist.linear.z]  # back to the world
-    assert forth == pytest.approx(POSE.velocity, rel=1e-12)
+    R, twist = rotation_from_wxyz(POSE.quaternion_wxyz), odom.twist.twist
+    v_world = R @ [twist.linear.x, twist.linear.y, twist.linear.z]
+    assert v_world == pytest.approx(POSE.velocity, rel=1e-12)
     assert R @ [twist.angular.x, twist.angular.y, twist.angular.z] == pytest.approx(POSE.angular_velocity)
-    C = told_covariance()
-    assert told.pose.covariance.reshape(6, 6) == pytest.approx(C[:6, :6], rel=1e-12)
-    assert told.twist.covariance.reshape(6, 6) == pytest.approx(C[6:, 6:], rel=1e-12)
+    C = ros_covariance()
+    assert odom.pose.covariance.reshape(6, 6) == pytest.approx(C[:6, :6], rel=1e-12)
+    assert odom.twist.covariance.reshape(6, 6) == pytest.approx(C[6:, 6:], rel=1e-12)
 
 
-def told_covariance() -> np.ndarray:
+def ros_covariance() -> np.ndarray:
     R = rotation_from_wxyz(POSE.quaternion_wxyz)
     return covariance(POSE, R, np.array([R.T @ POSE.velocity, R.T @ POSE.angular_velocity]))
 
 
-def test_covariance_is_that_of_poses_drawn_from_it():
-    """Small errors in our order, carried over by what the messages mean, spread as ROS's covariance says."""
+def test_covariance_is_that_of_sampled_poses():
+    """Small random errors in our order, converted to ROS's quantities, have the covariance of the ROS message."""
     scale, rng = 1e-4, np.random.default_rng(3)
     R, v, w = (
         rotation_from_wxyz(POSE.quaternion_wxyz),
@@ -122,15 +121,15 @@ def test_covariance_is_that_of_poses_drawn_from_it():
                 *(true.T @ (w + error[6:9]) - R.T @ w),
             ]
         )
-    told = told_covariance()
-    sd = np.sqrt(np.diag(told))
+    expected = ros_covariance()
+    sd = np.sqrt(np.diag(expected))
     ratio = np.cov(np.transpose(drawn)) / scale**2 / np.outer(sd, sd)
     # correlations of 4000 draws have a standard deviation of at most sqrt(2 / 4000) = 0.022; five of them
-    assert np.abs(ratio - told / np.outer(sd, sd)).max() < 0.11
+    assert np.abs(ratio - expected / np.outer(sd, sd)).max() < 0.11
 
 
 def ros_peer(endpoint: str) -> zenoh.Session:
-    """A session as a node of rmw_zenoh_cpp opens it: a peer that knows the router only."""
+    """A session as in rmw_zenoh_cpp: a peer that connects only to the router."""
     config = zenoh.Config()
     config.insert_json5("mode", '"peer"')
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
@@ -140,7 +139,15 @@ def ros_peer(endpoint: str) -> zenoh.Session:
 
 
 @contextlib.contextmanager
-def passing_on(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
+def routing() -> Iterator[tuple[zenoh.Session, str]]:
+    """A router and its endpoint, with a port that the operating system chooses."""
+    listen = ["tcp/127.0.0.1:0"]
+    with open_router(listen) as router:
+        yield router, listening_endpoints(router, listen)[0]
+
+
+@contextlib.contextmanager
+def bridging(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
     command = [sys.executable, "-m", "fusion", "ros2", "--connect", endpoint, "--arena", "test", *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -150,7 +157,7 @@ def passing_on(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
 
 
 def repeat(session: zenoh.Session, poses: list[RobotPose], done: threading.Event) -> None:
-    """Publish the poses again and again, as a server does."""
+    """Publish the poses repeatedly, as a server does."""
     while not done.wait(0.05):
         for pose in poses:
             session.put(Keys("test").robot_pose(pose.robot), encode(pose))
@@ -158,24 +165,24 @@ def repeat(session: zenoh.Session, poses: list[RobotPose], done: threading.Event
 
 @pytest.mark.parametrize("humble", [False, True])
 @pytest.mark.parametrize("own_router", [False, True])
-def test_a_node_of_rmw_zenoh_hears_the_robots_and_sees_the_topics(humble, own_router):
-    endpoint, ros_endpoint = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, own_router):
     options = ["--humble"] * humble
-    heard, tokens, done = queue.Queue(), queue.Queue(), threading.Event()
+    received, tokens, done = queue.Queue(), queue.Queue(), threading.Event()
     poses = [POSE, draw_pose("gone", "lost")]
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(open_router([endpoint]))
+        server, endpoint = stack.enter_context(routing())
+        ros_endpoint = endpoint
         if own_router:
-            stack.enter_context(open_router([ros_endpoint]))
+            _, ros_endpoint = stack.enter_context(routing())
             options += ["--ros", ros_endpoint]
-        ros = stack.enter_context(ros_peer(ros_endpoint if own_router else endpoint))
-        topics = ros.declare_subscriber("3/lab/**", heard.put)
+        ros = stack.enter_context(ros_peer(ros_endpoint))
+        topics = ros.declare_subscriber("3/lab/**", received.put)
         graph = ros.liveliness().declare_subscriber("@ros2_lv/3/**", tokens.put, history=True)
         arena = threading.Thread(target=repeat, args=(server, poses, done))
         arena.start()
         try:
-            with passing_on(endpoint, "--domain", "3", "--namespace", "/lab", *options):
-                samples = [heard.get(timeout=DEADLINE_S) for _ in range(6)]
+            with bridging(endpoint, "--domain", "3", "--namespace", "/lab", *options):
+                samples = [received.get(timeout=DEADLINE_S) for _ in range(6)]
                 entities = {str(tokens.get(timeout=DEADLINE_S).key_expr) for _ in range(4)}
         finally:
             topics.undeclare()
@@ -195,7 +202,7 @@ def test_a_node_of_rmw_zenoh_hears_the_robots_and_sees_the_topics(humble, own_ro
         for s in samples
         if "Odom" in str(s.key_expr)
     ]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # counted by topic
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # numbered by topic
     parts = sorted(entity.split("/")[4:] for entity in entities)
     assert parts[0] == ["0", "NN", "%", "%lab", "roundel"]
     names = {"%lab%rover%pose", "%lab%rover%odometry", "%tf"}
@@ -204,14 +211,14 @@ def test_a_node_of_rmw_zenoh_hears_the_robots_and_sees_the_topics(humble, own_ro
     assert {p[8] for p in parts[1:]} == {"::,10:,:,:,,"}
 
 
-def test_robots_whose_names_ros_can_not_tell_apart_are_counted():
+def test_robots_with_equal_ros_names_are_counted():
     assert [ros_name(n) for n in ("rover", "rover-2", "2nd", "öre")] == [
         "rover",
         "rover_2",
         "robot_2nd",
         "_re",
     ]
-    with open_router([f"tcp/127.0.0.1:{free_port()}"]) as session:
+    with routing() as (session, _):
         node = Ros2Node(session)
         for name in ("rover-2", "rover_2", "rover_2"):
             node.publish(draw_pose(name), "world")
@@ -219,7 +226,7 @@ def test_robots_whose_names_ros_can_not_tell_apart_are_counted():
 
 
 @pytest.mark.parametrize("domain", ["-1", "233", "lab"])
-def test_a_domain_that_is_none_is_refused(domain, monkeypatch):
+def test_an_invalid_domain_is_refused(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     program = subprocess.run(
         [sys.executable, "-m", "fusion", "ros2"], capture_output=True, text=True, timeout=DEADLINE_S
@@ -229,15 +236,14 @@ def test_a_domain_that_is_none_is_refused(domain, monkeypatch):
 
 
 @pytest.mark.parametrize("namespace", ["a-b", "1st", "a//b", "*"])
-def test_a_namespace_that_is_none_is_refused(namespace):
+def test_an_invalid_namespace_is_refused(namespace):
     with pytest.raises(ConfigError, match="is no ROS namespace"):
         ros2(namespace=namespace)
 
 
-def test_silence_is_told_once_and_its_end_too():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+def test_silence_is_logged_once_and_its_end_too():
     done = threading.Event()
-    with open_router([endpoint]) as server, passing_on(endpoint) as process:
+    with routing() as (server, endpoint), bridging(endpoint) as process:
         assert process.stderr is not None
         assert "no pose from arena 'test'" in process.stderr.readline()
         arena = threading.Thread(target=repeat, args=(server, [POSE], done))
@@ -249,11 +255,10 @@ def test_silence_is_told_once_and_its_end_too():
             arena.join(DEADLINE_S)
 
 
-def test_poses_of_all_robots_come_in_one_stream():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+def test_one_stream_has_the_poses_of_all_robots():
     done = threading.Event()
     poses = [POSE, msgspec.structs.replace(POSE, robot="drone")]
-    with open_router([endpoint]) as server, Arena.connect(endpoint, arena="test") as arena:
+    with routing() as (server, endpoint), Arena.connect(endpoint, arena="test") as arena:
         thread = threading.Thread(target=repeat, args=(server, poses, done))
         thread.start()
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A robot that nobody declared is measured where it stands, defined, and tracked from then on."""
+"""An undeclared robot is measured in the arena, defined, and tracked from then on."""
 
 import subprocess
 import sys
@@ -20,16 +20,16 @@ from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 UNKNOWN = np.full((3, 3), np.nan)
 
 
-def watched(arena: Arena, n: int = 30) -> list[Markers]:
-    """What a tracker that knows only the triangle, which is not there, tells of markers."""
+def markers_of(arena: Arena, n: int = 30) -> list[Markers]:
+    """The markers of a tracker that knows only the triangle, which is not there."""
     known = Arena({"a": TRIANGLE}, {"a": line((0, 0, 0))}, arena.cameras)
     return [fused.markers for fused in fuse(known, arena.frames(n))]
 
 
-def test_what_is_measured_is_what_stands_there():
-    """0.1 px is at most 0.6 mm a marker and instant here, and a median of 30 has 1.25 / sqrt(30) of that: distances are
-    within 5 sigma of it and the rounding, 1 mm. The frame is the one promised: origin, z and x."""
-    markers = find_stationary_markers(watched(Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)))
+def test_the_measured_robot_has_the_true_distances():
+    """0.1 px is at most 0.6 mm for a marker in one frame set here, and the median of 30 has 1.25 / sqrt(30) of that:
+    5 sigma and the rounding are 1 mm. Origin, z and x of the body's frame are as documented."""
+    markers = find_stationary_markers(markers_of(Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)))
     robot = robot_from_markers(markers, WIDE.diameter_m)
     R, p = WIDE_MOTION(0.0)
     true = p + WIDE.points @ R.T
@@ -42,10 +42,10 @@ def test_what_is_measured_is_what_stands_there():
     require_distinct({"a": TRIANGLE, "b": robot})
 
 
-def test_a_robot_as_measured_is_tracked_where_it_stands():
-    """The position is the markers' middle and z is the prints' own, within 1 mm and what 1 mm turns 0.2 m by."""
+def test_a_measured_robot_is_tracked_at_its_true_pose():
+    """The position is the markers' mean and z their normal, within 1 mm and 1 mm / 0.2 m."""
     arena = Arena({"b": WIDE}, {"b": WIDE_MOTION}, sigma_px=0.1)
-    measured = {"b": robot_from_markers(find_stationary_markers(watched(arena)), WIDE.diameter_m)}
+    measured = {"b": robot_from_markers(find_stationary_markers(markers_of(arena)), WIDE.diameter_m)}
     pose = fuse(Arena(measured, arena.motions, arena.cameras), arena.frames(20))[-1].poses[0]
     R, p = WIDE_MOTION(0.0)
     assert pose.state == "tracked"
@@ -53,9 +53,9 @@ def test_a_robot_as_measured_is_tracked_where_it_stands():
     assert R[:, 2] @ rotation_from_wxyz(pose.quaternion_wxyz)[:, 2] > np.cos(1e-3 / 0.2)
 
 
-def test_what_moves_or_comes_and_goes_does_not_stand():
-    """Of a robot that drives, one that creeps (25 mm in the second), one that is hidden for most of it, and one that
-    stands, the last is measured."""
+def test_only_markers_that_are_stationary_and_seen_often_are_measured():
+    """Of a robot that drives, one that creeps (25 mm in the second), one that is hidden for most of it, and a
+    stationary one, only the last is measured."""
     robots = {"moves": SINGLE, "creeps": SINGLE, "hides": SINGLE, "stands": SINGLE}
     motions = {
         "moves": line((0.5, 0.0, 0.2), (0.3, 0.0, 0.0)),
@@ -64,15 +64,15 @@ def test_what_moves_or_comes_and_goes_does_not_stand():
         "stands": line((-0.5, 0.3, 0.2)),
     }
     arena = Arena(robots, motions, sigma_px=0.1, hidden=lambda name, marker, t: name == "hides" and t > 0.3)
-    markers = find_stationary_markers(watched(arena))
+    markers = find_stationary_markers(markers_of(arena))
     assert np.abs(markers.position - [[-0.5, 0.3, 0.2]]).max() < 2e-3
     assert len(markers.within((-0.5, 0.3, 0.2), 0.1).position) == 1
     assert len(markers.within((0.5, 0.3, 0.2), 0.1).position) == 0
 
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
-def test_z_is_up_where_no_print_tells(turn: float):
-    """Of markers in a plane that nothing tells the sides of, in either order about it."""
+def test_z_is_up_where_no_normal_is_known(turn: float):
+    """Planar markers without normals, in both orders around the plane's normal."""
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1 * turn, 0.1], [-0.1, -0.1 * turn, 0.1]])
     robot = robot_from_markers(StationaryMarkers(points, UNKNOWN), 0.1)
     centred = points - points.mean(0)
@@ -82,7 +82,7 @@ def test_z_is_up_where_no_print_tells(turn: float):
     )
 
 
-def test_prints_tell_z_where_markers_are_no_plane():
+def test_z_is_the_mean_normal_of_markers_that_are_not_planar():
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
     normal = np.array([0.1, 0.0, 1.0]) / np.linalg.norm([0.1, 0.0, 1.0])
     robot = robot_from_markers(StationaryMarkers(points, np.tile(normal, (4, 1))), 0.1)
@@ -90,7 +90,7 @@ def test_prints_tell_z_where_markers_are_no_plane():
     assert np.allclose(robot.points[:, 2], height, atol=1e-4)
 
 
-def test_what_makes_no_robot_is_said():
+def test_markers_that_make_no_robot_are_refused():
     nothing = StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
     with pytest.raises(FusionError, match="no stationary unlabeled marker found there; hold the robot still"):
         robot_from_markers(nothing, 0.1)
@@ -104,7 +104,7 @@ def command(endpoint: str, *words: str) -> list[str]:
 
 
 def test_a_robot_in_a_running_arena_is_defined(tmp_path):
-    """By the command, while the other one drives on; what it prints is an entry for robots.yaml."""
+    """By the command, while the server tracks another one; the output is an entry for robots.yaml."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client):
         words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
         done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
@@ -120,7 +120,7 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
             client.change_robots(remove=["c"])
 
 
-def test_a_misspelt_command_is_answered_with_the_one_meant():
+def test_a_misspelt_command_gets_a_suggestion():
     words = [sys.executable, "-m", "fusion", "defined", "b"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
@@ -135,7 +135,7 @@ def test_a_misspelt_command_is_answered_with_the_one_meant():
         (("b", "--diameter", "0.12"), "no server of arena 'test' answers"),
     ],
 )
-def test_what_can_not_be_defined_is_said_in_one_line(words, said):
+def test_an_invalid_definition_is_reported_in_one_line(words, said):
     words = command(f"tcp/127.0.0.1:{free_port()}", *words)
     done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode == 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What may be asked of a running server: other robots, a correction taken back; and what it keeps over a restart."""
+"""Requests to a running server: changes of robots, undone corrections; and the files that survive a restart."""
 
 import json
 import os
@@ -21,8 +21,8 @@ from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, send, se
 from tests.fusion.synthetic import WIDE
 
 
-def ask(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:
-    """The reply, or the error's line."""
+def request_reply(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:
+    """The reply, or the text of the error."""
     for reply in client._session.get(key, payload=payload, timeout=DEADLINE_S):
         if reply.ok is not None:
             return reply.ok.payload.to_bytes(), ""
@@ -40,17 +40,17 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
         key = robots_key("test")
         send(server, live(ARENA.messages(30)))
         until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-        assert set(robots_of(ask(client, key)[0]).robots) == {"a"}
+        assert set(robots_of(request_reply(client, key)[0]).robots) == {"a"}
         request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
-        assert list(robots_of(ask(client, key, encode(request))[0]).robots) == ["rover", "wide"]
+        assert list(robots_of(request_reply(client, key, encode(request))[0]).robots) == ["rover", "wide"]
         assert server.pipeline.tracker is not None
         assert server.pipeline.tracker.status == ["tracked", None]
-        reply, _ = ask(client, key, json.dumps({"remove": ["wide"]}).encode())
+        reply, _ = request_reply(client, key, json.dumps({"remove": ["wide"]}).encode())
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == ["rover"]
 
 
-def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
+def test_an_invalid_change_of_robots_changes_nothing(tmp_path):
     twin = msgspec.structs.replace(ARENA.robots["a"], start_m=None)
     faults = {
         b"\x00\xff": "RobotsRequest",
@@ -61,13 +61,13 @@ def test_a_change_of_robots_that_makes_no_sense_changes_nothing(tmp_path):
     }
     with serving(config(tmp_path)) as (server, client):
         for payload, said in faults.items():
-            reply, error = ask(client, robots_key("test"), payload)
+            reply, error = request_reply(client, robots_key("test"), payload)
             assert reply is None
             assert said in error
         assert list(server.pipeline.robots) == ["a"]
 
 
-def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
+def test_undo_fails_without_a_correction_and_restores_a_corrected_camera(tmp_path):
     with serving(config(tmp_path)) as (server, client):
         with pytest.raises(FusionError, match="nothing to undo"):
             client.undo_correction()
@@ -82,7 +82,7 @@ def test_nothing_to_undo_is_said_and_a_correction_is_undone(tmp_path):
         assert server.pipeline.tracker.watch.held == {"cam1"}
 
 
-def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
+def test_a_published_rig_is_used_after_a_restart(tmp_path):
     saved = tmp_path / "rig.saved.yaml"
     settings = msgspec.structs.replace(config(tmp_path, with_rig=False), saved_rig=str(saved))
     with serving(settings) as (server, client):
@@ -94,7 +94,7 @@ def test_a_published_rig_is_in_force_after_a_restart(tmp_path):
         assert rig.cameras == ARENA.cameras
 
 
-def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
+def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path):
     given, path = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
     saved = PersistedFile("rig", str(path), load_rig, save_rig)
     config(tmp_path)  # writes rig.yaml
@@ -109,15 +109,17 @@ def test_the_newer_of_the_given_and_the_kept_rig_is_in_force(tmp_path):
     assert ActiveRig(given, saved).rig == Rig(cameras=ARENA.cameras)
 
 
-def test_robots_that_were_changed_are_in_force_after_a_restart(tmp_path):
-    """Down to none at all; a file that a person wrote later counts more."""
+def test_changed_robots_are_used_after_a_restart(tmp_path):
+    """Even if no robot is left; but a file that the user wrote later has precedence."""
     settings = msgspec.structs.replace(config(tmp_path), saved_robots=str(tmp_path / "robots.saved.yaml"))
     requests = (RobotsRequest(define={"wide": WIDE}, rename={"a": "b"}), RobotsRequest(remove=("b", "wide")))
     before = {"a"}
     for request, after in zip(requests, ({"b", "wide"}, set()), strict=True):
         with serving(settings) as (server, client):
             assert set(server.pipeline.robots) == before
-            assert set(robots_of(ask(client, robots_key("test"), encode(request))[0]).robots) == after
+            assert (
+                set(robots_of(request_reply(client, robots_key("test"), encode(request))[0]).robots) == after
+            )
         before = after
     with serving(settings) as (server, _):
         assert not server.pipeline.robots

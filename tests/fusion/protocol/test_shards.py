@@ -24,16 +24,18 @@ from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 NAMES = [f"robot_{k}" for k in range(200)]
 
 
-def test_every_robot_has_one_shard_whatever_the_others_are_called():
+def test_every_robot_has_one_shard_independent_of_the_other_names():
     shards = [Shard(k, 3) for k in (1, 2, 3)]
     owners = [[shard.owns(name) for shard in shards] for name in NAMES]
     assert all(sum(row) == 1 for row in owners)
-    assert np.sum(owners, axis=0).min() > 200 / 3 - 4 * np.sqrt(200 * 2 / 9)  # as names fall, to 4 sigma
+    assert np.sum(owners, axis=0).min() > 200 / 3 - 4 * np.sqrt(
+        200 * 2 / 9
+    )  # names are distributed at random; 4 sigma
     assert Shard.parse("2/3") == shards[1]
 
 
 @pytest.mark.parametrize("text", ["", "2", "0/2", "3/2", "1/65", "a/b", "-1/2"])
-def test_what_is_no_shard_is_said(text):
+def test_invalid_shards_are_refused(text):
     with pytest.raises(ConfigError, match="write it as 1/2"):
         Shard.parse(text)
 
@@ -43,9 +45,9 @@ def near(pose: RobotPose | None, place: tuple[float, float, float]) -> bool:
 
 
 def test_crossing_robots_of_different_shards_keep_their_detections():
-    """One passes 0.15 m over the other, a third one through both, at up to 2.4 m/s to each other: in many images their
-    markers lie among each other. Each shard hears of the other's robots an instant late, over the wire's bytes; no
-    detection is claimed by both, and all poses are right to what noise and 5 mm of unmodelled speed leave."""
+    """One robot passes 0.15 m above another, a third one above both, with relative speeds up to 2.4 m/s: in many
+    images their markers are interleaved. Each shard receives the other's robots one frame set late, as encoded bytes.
+    No detection is used by both, and all position errors are below 5 mm, the sum of noise and unmodelled motion."""
     mine, other = (next(name for name in NAMES if Shard(k, 2).owns(name)) for k in (1, 2))
     third = [name for name in NAMES if Shard(2, 2).owns(name)][1]
     motions = {
@@ -56,32 +58,32 @@ def test_crossing_robots_of_different_shards_keep_their_detections():
     robots = {mine: TRIANGLE, other: WIDE, third: Robot(diameter_m=0.12)}
     arena = Arena(robots, motions, sigma_px=0.05, distractors=2)
     trackers = [Tracker(arena.cameras, robots, shard=Shard(k, 2)) for k in (1, 2)]
-    contested = 0
-    for k, instant in enumerate(whole_instants(arena.frames(30))):
-        fused = [tracker.fuse(instant) for tracker in trackers]
-        claims = [claimed(tracker) for tracker in trackers]
-        assert not claims[0] & claims[1]
-        contested += bool(claims[0]) and bool(claims[1])
-        for tracker, hearing in zip(trackers, trackers[::-1], strict=True):
-            hearing.follow(decode(encode(tracker.tell()), ShardPoses))
+    n_shared = 0
+    for k, frame_set in enumerate(synchronize(arena.frames(30))):
+        fused = [tracker.fuse(frame_set) for tracker in trackers]
+        used = [used_detections(tracker) for tracker in trackers]
+        assert not used[0] & used[1]
+        n_shared += bool(used[0]) and bool(used[1])
+        for tracker, other_tracker in zip(trackers, trackers[::-1], strict=True):
+            other_tracker.follow(decode(encode(tracker.tell()), ShardPoses))
         poses = [pose for one in fused for pose in one.poses]
         assert len({pose.robot for pose in poses}) == len(poses)
         if k > 3:
             assert {pose.robot for pose in poses if pose.state == "tracked"} == set(robots)
             assert np.abs(errors(arena, poses)[:, 3:]).max() < 5e-3
-    assert contested > 20
+    assert n_shared > 20
 
 
-def whole_instants(frames: list[CalibratedFrame]) -> list[FrameSet]:
-    """Of a whole run, in order."""
-    gathered = FrameSynchronizer(PERIOD_NS)
+def synchronize(frames: list[CalibratedFrame]) -> list[FrameSet]:
+    """All frame sets of a run, in order."""
+    synchronizer = FrameSynchronizer(PERIOD_NS)
     for frame in frames:
-        gathered.add(frame)
-    return gathered.finish()
+        synchronizer.add(frame)
+    return synchronizer.finish()
 
 
-def claimed(tracker: Tracker) -> set[int]:
-    """The sightings that a shard used for its own robots in the last instant."""
+def used_detections(tracker: Tracker) -> set[int]:
+    """The detections that a shard used for its own robots in the last frame set."""
     assert tracker._last is not None
     _, _, matches, _ = tracker._last
     return set(matches.sighting[tracker.owned[tracker.catalogue.robot[matches.disc]]].tolist())
@@ -91,18 +93,18 @@ def claimed(tracker: Tracker) -> set[int]:
     "wrong",
     [{"motion": b"\0" * 8}, {"states": ()}, {"covariance": b"\xff" * 576}, {"motion": b"\0" * 104}],
 )
-def test_what_can_be_no_robots_of_a_shard_is_refused(wrong: dict):
-    told = ShardPoses(
+def test_invalid_shard_poses_are_refused(wrong: dict):
+    poses = ShardPoses(
         t_ns=0, robots=("a",), states=("tracked",), motion=np.ones(13).tobytes(), covariance=b"\0" * 576
     )
-    assert decode(encode(told), ShardPoses) == told
+    assert decode(encode(poses), ShardPoses) == poses
     with pytest.raises(MessageError):
-        decode(encode(msgspec.structs.replace(told, **wrong)), ShardPoses)
+        decode(encode(msgspec.structs.replace(poses, **wrong)), ShardPoses)
 
 
-def test_two_shards_on_loopback_track_each_its_own(tmp_path):
-    """Two constellations and a single marker of the other shard's close by; each pose comes from one shard, all are
-    right once their speeds are known, and the leading shard labels the markers of both."""
+def test_two_shards_on_loopback_each_track_their_own_robots(tmp_path):
+    """Two constellations, and a single marker of the other shard nearby. Each pose is published by one shard, all are
+    right once the velocities are known, and the leading shard labels the markers of both."""
     mine = next(name for name in NAMES if Shard(1, 2).owns(name))
     other = next(name for name in NAMES if Shard(2, 2).owns(name))
     single = [name for name in NAMES if Shard(2, 2).owns(name)][1]
@@ -124,8 +126,8 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
             labels: set[int] = set()
             markers.on_message(lambda message: labels.update(message.robot_index().tolist()))
 
-            def all_are_told() -> bool:
-                """Frames of this moment, paced by the answer: the shards must keep hearing of each other."""
+            def are_all_right() -> bool:
+                """Publish frames of the present time, paced by the replies, so that the shards stay synchronized."""
                 send(server, live(arena.messages(1), ago_ns=0))
                 with contextlib.suppress(NetworkError):
                     markers.next(0.04)
@@ -135,7 +137,7 @@ def test_two_shards_on_loopback_track_each_its_own(tmp_path):
                     2,
                 }
 
-            until(all_are_told)
+            until(are_all_right)
             assert server.pipeline.tracker is not None
             assert second.pipeline.tracker is not None
             assert server.pipeline.tracker.owned.tolist() == [True, False, False]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Recordings: what is written is read, a replay is what was, smoothing knows the future."""
+"""Recordings: reading returns what was written, a replay repeats the poses, smoothing uses later frames."""
 
 import csv
 import threading
@@ -42,24 +42,24 @@ def write(path: Path, arena: Arena, n: int = 20) -> list:
     return arrivals
 
 
-def test_a_replay_is_what_was(tmp_path):
-    """The same bytes of poses as from the messages themselves, and again from the replay's own recording."""
+def test_a_replay_repeats_the_poses(tmp_path):
+    """Byte for byte: from the messages, from their recording, and from the recording that the replay writes."""
     arrivals = write(tmp_path / "in.mcap", MOVING)
-    told = [
+    expected = [
         pose
         for f in fuse_recording(arrivals, OfflineArena(MOVING.cameras, MOVING.robots))
         for pose in f.poses
     ]
-    assert len(told) > 10
+    assert len(expected) > 10
     for source, out in (("in.mcap", "once.mcap"), ("once.mcap", "twice.mcap")):
         assert replay(tmp_path / source, out=tmp_path / out) == 0
-        assert list(map(encode, read_recording(tmp_path / out).poses)) == list(map(encode, told))
+        assert list(map(encode, read_recording(tmp_path / out).poses)) == list(map(encode, expected))
     replay(tmp_path / "in.mcap", out=tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
-        assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in told]
+        assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in expected]
 
 
-def test_of_a_recording_that_was_cut_off_the_beginning_is_read(tmp_path):
+def test_a_truncated_recording_is_read_up_to_its_end(tmp_path):
     write(tmp_path / "whole.mcap", MOVING, 200)
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "half.mcap").write_bytes(data[: len(data) * 9 // 10])
@@ -70,7 +70,7 @@ def test_of_a_recording_that_was_cut_off_the_beginning_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no MCAP at all"])
-def test_what_is_no_recording_is_said(tmp_path, content):
+def test_files_that_are_no_recordings_are_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "x.mcap").write_bytes(content)
     with pytest.raises(ConfigError, match=r"x\.mcap"):
@@ -81,12 +81,12 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     with serving(config(tmp_path)) as (server, client):
         done = threading.Event()
 
-        def keep_sending() -> None:
+        def publish() -> None:
             while not done.is_set():
                 send(server, live(ARENA.messages(3)))
                 client.status(60.0).next()
 
-        sender = threading.Thread(target=keep_sending)
+        sender = threading.Thread(target=publish)
         sender.start()
         try:
             record(tmp_path / "live.mcap", connect=server.endpoints, arena="test", seconds=4.0)
@@ -110,9 +110,9 @@ def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[Fused]:
     )
 
 
-def test_smoothing_is_better_and_honest():
-    """Velocities gain most where cameras fire together, for then the filter has them from the past alone. Squared
-    errors of pose in the middle of 8 runs: chi-square with 6 degrees, mean 6 +- 4 sqrt(12 / 8)."""
+def test_smoothing_is_more_accurate_and_its_covariance_is_consistent():
+    """Velocities improve most if the cameras are synchronous, because the filter then has them from the past only. The
+    squared Mahalanobis errors of pose in the middle of 8 runs: chi-square with 6 degrees, mean 6 +- 4 sqrt(12 / 8)."""
     robots = {"a": msgspec.structs.replace(TRIANGLE, motion="ground")}
     squares, speeds = [], {True: [], False: []}
     for seed in range(8):
@@ -128,7 +128,7 @@ def test_smoothing_is_better_and_honest():
     assert np.mean(speeds[True]) < 0.8 * np.mean(speeds[False])
 
 
-def test_smoothing_keeps_instants_and_states():
+def test_smoothing_preserves_frame_sets_and_states():
     arena = Arena(MOVING.robots, MOVING.motions, sigma_px=0.1, hidden=lambda robot, marker, t: 0.3 < t < 0.75)
     plain, better = smoothed(arena, False, 30), smoothed(arena, True, 30)
     assert [f.t_ns for f in plain] == [f.t_ns for f in better]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion run`: recordings in, poses.csv out; bad input is one line and exit code 2."""
+"""`fusion run` writes poses.csv; invalid input gives one line and exit code 2."""
 
 import csv
 import json
@@ -60,7 +60,7 @@ def test_observations_become_poses(recording, capsys):
         ("no input", "either --frames"),
     ],
 )
-def test_bad_input_is_one_line(recording, fault, said, monkeypatch, capsys):
+def test_invalid_input_is_reported_in_one_line(recording, fault, said, monkeypatch, capsys):
     if fault == "no rig":
         recording["rig"].unlink()
     elif fault == "unplaced":
@@ -75,16 +75,15 @@ def test_bad_input_is_one_line(recording, fault, said, monkeypatch, capsys):
     with pytest.raises(SystemExit) as exited:
         main()
     assert exited.value.code == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert len(told.strip().splitlines()) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
 
 
-def test_a_recording_by_another_renderer(shared_data, tmp_path):
-    """Three robots seen by four free-running cameras, camera poses as true: 3 mm RMS, as is asked of an arena.
+def test_a_recording_of_another_renderer(shared_data, tmp_path):
+    """Three robots and four free-running cameras with their true poses: at most 3 mm RMS, the goal for an arena.
 
-    Measured: 0.2 mm; of robot_b 1.5 mm, because of two instants in which one or two cameras see it slanted by 75 to 80
-    degrees.
+    Measured: 0.2 mm; 1.5 mm for robot_b, because in two frame sets one or two cameras see it under 75 to 80 degrees.
     """
     folder = shared_data("arena_small")
     truth = json.loads((folder / "truth.json").read_text())

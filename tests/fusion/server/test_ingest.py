@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a network may bring: counted, never fatal, and bounded in time and memory."""
+"""Any input from the network is counted or harmless, and bounded in time and memory."""
 
 import time
 
@@ -29,22 +29,22 @@ KEYS = Keys("x")
 NS = 10**9
 
 
-class Path:
-    """A message's way through the server, without a network."""
+class Pipeline:
+    """The server from a message to the tracker, without a network."""
 
     def __init__(self, arena: Arena = ARENA) -> None:
         self.arena, self.statistics = arena, ServerStatistics(150.0)
-        self.intake, self.instants = Ingest(KEYS, self.statistics), FrameSynchronizer(PERIOD_NS)
+        self.ingest, self.synchronizer = Ingest(KEYS, self.statistics), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 
     def take(self, message: Detections, received_ns: int) -> list[Fused]:
-        """The instants that were complete then."""
-        frame = self.intake.receive(
+        """The frame sets that were complete then."""
+        frame = self.ingest.receive(
             encode(message), KEYS.detections(message.camera), received_ns, self.arena.cameras
         )
         if frame is not None:
-            self.instants.add(frame)
-        fused = [self.tracker.fuse(instant) for instant in self.instants.take(received_ns)]
+            self.synchronizer.add(frame)
+        fused = [self.tracker.fuse(frame_set) for frame_set in self.synchronizer.take(received_ns)]
         self.tracker.inspect()
         return fused
 
@@ -56,10 +56,10 @@ class Path:
         return self.statistics.report(time.time_ns(), PipelineStatus())
 
 
-def play(path: Path, messages: list[Detections]) -> list[Fused]:
-    """All messages, each 5 ms after its exposure."""
+def play(pipeline: Pipeline, messages: list[Detections]) -> list[Fused]:
+    """The fused frame sets of all messages, each of which arrives 5 ms after its exposure."""
     ordered = sorted(messages, key=lambda message: message.t_ns)
-    return [fused for m in ordered for fused in path.take(m, m.t_ns + 5_000_000)]
+    return [fused for m in ordered for fused in pipeline.take(m, m.t_ns + 5_000_000)]
 
 
 def states(fused: list[Fused], robot: str = "a") -> list[str]:
@@ -70,8 +70,8 @@ odd = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-45, 1e30, 3e38, 8.
 columns = st.lists(st.tuples(*[odd] * 8), max_size=6)
 
 
-def strange(rows: list, **header) -> Detections:
-    """A message whose columns hold just these numbers."""
+def message_of(rows: list, **header) -> Detections:
+    """A message with these numbers in its columns."""
     table = np.array(rows, float).reshape(-1, 8)
     n, none = len(table), np.full(len(table), -1, np.int32)
     cov = np.zeros((n, 2, 2))
@@ -87,15 +87,15 @@ def strange(rows: list, **header) -> Detections:
     st.sampled_from([0, 1, -1, START_NS, START_NS + NS, START_NS + 3600 * NS, 2**62]),
     st.sampled_from(["cam0", "cam3", "other", ""]),
 )
-def test_numbers_of_any_kind_are_counted_or_harmless(rows, t_ns, camera):
-    """Between good frames, and in good frames of the same camera; the robot's poses stay finite."""
-    path = Path()
+def test_any_numbers_are_counted_or_harmless(rows, t_ns, camera):
+    """Bad messages among good ones of the same cameras: all poses stay finite."""
+    pipeline = Pipeline()
     good = sorted(ARENA.messages(10), key=lambda message: message.t_ns)
-    fused = play(path, good[:30])
-    fused += path.take(strange(rows, camera=camera, seq=3, t_ns=t_ns), START_NS + NS // 10)
-    near = strange(rows, camera="cam1", seq=900, t_ns=good[30].t_ns + 1)
-    fused += path.take(near, good[30].t_ns + 2)
-    fused += play(path, good[30:])
+    fused = play(pipeline, good[:30])
+    fused += pipeline.take(message_of(rows, camera=camera, seq=3, t_ns=t_ns), START_NS + NS // 10)
+    near = message_of(rows, camera="cam1", seq=900, t_ns=good[30].t_ns + 1)
+    fused += pipeline.take(near, good[30].t_ns + 2)
+    fused += play(pipeline, good[30:])
     for f in fused:
         for pose in f.poses:
             pose.check()
@@ -103,9 +103,9 @@ def test_numbers_of_any_kind_are_counted_or_harmless(rows, t_ns, camera):
         f.markers.check()
 
 
-def test_frames_full_of_roundels_cost_no_more_than_their_number():
-    """4096 in each of four cameras, at random places: a search among them would take minutes."""
-    path, rng = Path(), np.random.default_rng(2)
+def test_frames_with_the_most_roundels_take_bounded_time():
+    """4096 in each of four cameras, at random places: acquisition among them would take minutes."""
+    pipeline, rng = Pipeline(), np.random.default_rng(2)
     flood = []
     for k, message in enumerate(ARENA.messages(12)):
         uv = rng.uniform([0, 0], [800, 600], (MAX_ROUNDELS, 2))
@@ -114,64 +114,64 @@ def test_frames_full_of_roundels_cost_no_more_than_their_number():
         )
         flood.append(msgspec.structs.replace(full, t_ns=message.t_ns) if k % 12 >= 6 else message)
     begun = time.process_time()
-    fused = play(path, flood)
+    fused = play(pipeline, flood)
     assert len(fused) > 9
     assert time.process_time() - begun < 5.0
 
 
-def test_ten_thousand_names_leave_room_for_the_cameras_of_the_rig():
-    path = Path()
+def test_ten_thousand_unknown_names_do_not_displace_the_cameras_of_the_rig():
+    pipeline = Pipeline()
     message = ARENA.messages(1)[0]
     for k in range(10_000):
-        path.take(msgspec.structs.replace(message, camera=f"ghost{k}"), message.t_ns)
-    assert "tracked" in states(play(path, ARENA.messages(12)))
-    status = path.status()
+        pipeline.take(msgspec.structs.replace(message, camera=f"ghost{k}"), message.t_ns)
+    assert "tracked" in states(play(pipeline, ARENA.messages(12)))
+    status = pipeline.status()
     assert len(status.cameras) == MAX_UNCALIBRATED + len(ARENA.cameras)
     assert status.faults["too many cameras"] == 10_000 - MAX_UNCALIBRATED
 
 
 @pytest.mark.parametrize("jump_ns", [-3600 * NS, 3600 * NS, NS])
 def test_a_camera_whose_clock_jumps_does_not_disturb_the_others(jump_ns):
-    """One of four cameras, from its tenth frame on: refused, and robots stay tracked by the other three."""
-    path, arrivals = Path(), []
+    """One of four cameras, from its tenth frame on: its frames are refused, the other three keep robots tracked."""
+    pipeline, arrivals = Pipeline(), []
     for message in ARENA.messages(30):
         jumps = message.camera == "cam2" and message.t_ns > START_NS + 10 * PERIOD_NS
         stamp = message.t_ns + (jump_ns if jumps else 0)
         arrivals.append((message.t_ns + 5_000_000, msgspec.structs.replace(message, t_ns=stamp)))
     arrivals.sort(key=lambda arrival: arrival[0])
-    fused = [f for now_ns, message in arrivals for f in path.take(message, now_ns)]
-    assert sum(path.faults.values()) == 19
+    fused = [f for now_ns, message in arrivals for f in pipeline.take(message, now_ns)]
+    assert sum(pipeline.faults.values()) == 19
     assert set(states(fused)[2:]) == {"tracked"}
     late = [f for f in fused if f.t_ns > START_NS + 12 * PERIOD_NS]
     assert len(late) > 8
     assert all(len(pose.cameras) == 3 for f in late for pose in f.poses if pose.robot == "a")
 
 
-def test_a_frame_that_comes_twice_counts_once():
-    path, twice = Path(), [m for message in ARENA.messages(10) for m in (message, message)]
-    fused = play(path, twice)
-    assert path.faults == {"duplicate frame": 40}
-    once = play(Path(), ARENA.messages(10))
+def test_a_duplicate_frame_is_used_once():
+    pipeline, twice = Pipeline(), [m for message in ARENA.messages(10) for m in (message, message)]
+    fused = play(pipeline, twice)
+    assert pipeline.faults == {"duplicate frame": 40}
+    once = play(Pipeline(), ARENA.messages(10))
     assert [f.poses for f in fused] == [f.poses for f in once]
 
 
 @pytest.mark.parametrize(("second", "shared"), [(False, False), (True, True)])
-def test_two_nodes_of_one_name_are_noticed_and_a_restarted_one_is_not(second, shared, caplog):
-    path = Path()
+def test_two_nodes_with_one_name_are_reported_and_a_restarted_one_is_not(second, shared, caplog):
+    pipeline = Pipeline()
     mine = [m for m in ARENA.messages(20) if m.camera == "cam0"]
     for k, message in enumerate(mine):
         restarted = 0 if k >= 10 else 5000
-        path.take(msgspec.structs.replace(message, seq=restarted + k), message.t_ns)
+        pipeline.take(msgspec.structs.replace(message, seq=restarted + k), message.t_ns)
         if second:
             other = msgspec.structs.replace(message, t_ns=message.t_ns + 7_000_000, seq=100 + k)
-            path.take(other, other.t_ns)
-    status = path.status()
+            pipeline.take(other, other.t_ns)
+    status = pipeline.status()
     assert status.cameras["cam0"].duplicate_publisher == shared
     assert ("two nodes publish as camera cam0" in caplog.text) == shared
 
 
-def test_what_cannot_be_an_outline_is_unknown():
-    message = strange([[400, 300, 1, 1, 8.0, 9.0, 0.1, 0.6]], camera="cam0", seq=0, t_ns=START_NS)
-    frame = Path().intake.receive(encode(message), KEYS.detections("cam0"), START_NS, ARENA.cameras)
+def test_impossible_outlines_become_nan():
+    message = message_of([[400, 300, 1, 1, 8.0, 9.0, 0.1, 0.6]], camera="cam0", seq=0, t_ns=START_NS)
+    frame = Pipeline().ingest.receive(encode(message), KEYS.detections("cam0"), START_NS, ARENA.cameras)
     assert isinstance(frame, CalibratedFrame)
     assert np.isnan(frame.roundels.axes_px).all()

@@ -125,9 +125,12 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
         client.robot("a").on_pose(poses.append)
         client.status().on_message(statuses.append)  # subscribed before the server runs, to miss none
         send_in_real_time(server, 30)
+        done = threading.Event()
+        server.transport.enqueue(done.set)  # after all frames
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
+            assert done.wait(DEADLINE_S)
             until(
                 lambda: (
                     client.status(DEADLINE_S).next()

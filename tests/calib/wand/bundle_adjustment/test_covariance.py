@@ -6,7 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calib.commands.check import split
+from calib.commands.check import split_halves
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.result import WandCalibration
@@ -35,7 +35,7 @@ def with_correlated_errors(messages: list[Detections], seed: int) -> list[Detect
 
 
 def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibration], Agreement]:
-    found = [calibrate(arena.intrinsics, arena.wand, half) for half in split(messages)]
+    found = [calibrate(arena.intrinsics, arena.wand, half) for half in split_halves(messages)]
     return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
 
 

@@ -25,20 +25,24 @@ def recorded(seed: int) -> SimulatedRecording:
     return record(WandScenario(cameras=6, seconds=12, rate_hz=30, seed=seed))
 
 
-def placed(seed: int, off: tuple[float, float, float], told: bool) -> WandCalibration:
+def placed(seed: int, off: tuple[float, float, float], with_sigma: bool) -> WandCalibration:
     result = calibrate(
-        roughly(recorded(seed).intrinsics, off, told, seed), WandScenario().wand, recorded(seed).messages
+        roughly(recorded(seed).intrinsics, off, with_sigma, seed),
+        WandScenario().wand,
+        recorded(seed).messages,
     )
     assert len(result.names) == 6
     return result
 
 
-@pytest.mark.parametrize(("off", "told"), [(CAREFUL, True), (OLD, False), (SHEET, False)])
-def test_covariances_of_rigs_from_inaccurate_lenses_are_right(off: tuple[float, float, float], told: bool):
+@pytest.mark.parametrize(("off", "with_sigma"), [(CAREFUL, True), (OLD, False), (SHEET, False)])
+def test_covariances_of_rigs_from_inaccurate_lenses_are_right(
+    off: tuple[float, float, float], with_sigma: bool
+):
     """The squared Mahalanobis errors of all poses, summed over recordings, are between the 0.1 % and 99.9 % quantiles
     of chi-square. With exact lenses as prior they would be 300 to 5,000 times the mean."""
     squared, degrees = np.sum(
-        [joint_error(placed(seed, off, told), recorded(seed).truth) for seed in SEEDS], axis=0
+        [joint_error(placed(seed, off, with_sigma), recorded(seed).truth) for seed in SEEDS], axis=0
     )
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
@@ -47,7 +51,7 @@ def test_exact_lenses_lose_little():
     """A recording cannot distinguish an exact lens from one that is off by less than it can measure. The covariance
     covers that, so squared errors may be small but not large, and positions are as good as with known lenses."""
     for seed in SEEDS:
-        result = placed(seed, EXACT, told=False)
+        result = placed(seed, EXACT, with_sigma=False)
         assert joint_error(result, recorded(seed).truth)[0] < chi2.ppf(0.999, 30)
         assert camera_errors(result.rig, recorded(seed).truth)[0].max() < 2e-3
 

@@ -149,7 +149,7 @@ def test_cameras_that_the_recording_contradicts_are_named_and_left_out(recorded:
     cases = [
         (scale_focal(recorded, "cam02", 1.1), recorded.messages, {"cam02": "wrong intrinsics"}),
         (Rig(cameras=swapped), recorded.messages, {"cam00": "of 'cam03'", "cam03": "of 'cam00'"}),
-        (rig, mirrored, {"cam01": "that agree are needed"}),
+        (rig, mirrored, {"cam01": "consistent ones are needed"}),
     ]
     for given, messages, expected in cases:
         result = calibrate(given, wand, messages)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from calib.commands.check import split
+from calib.commands.check import split_halves
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
@@ -56,7 +56,7 @@ def test_halves_of_a_recording_agree_until_a_camera_moves():
     arena = ring(3)
     messages, lenses = record(arena, 10.0, sigma_px=0.1), roughly(arena.intrinsics, CAREFUL, with_sigma=True)
     first, second = (
-        CameraPoses.of_calibration(calibrate(lenses, arena.wand, half)) for half in split(messages)
+        CameraPoses.of_calibration(calibrate(lenses, arena.wand, half)) for half in split_halves(messages)
     )
     assert compare_calibrations(first, second).holds
     moved = _move(arena, "cam1", 0.01)

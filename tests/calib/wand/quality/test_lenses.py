@@ -22,12 +22,12 @@ def misfit(rig: Rig, seed: int) -> Misfit | None:
     return find_misfit(result.names, result.adjusted, result.observations)
 
 
-@pytest.mark.parametrize(("off", "told"), [(CAREFUL, True), (OLD, False)])
+@pytest.mark.parametrize(("off", "with_sigma"), [(CAREFUL, True), (OLD, False)])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_lenses_that_the_adjustment_corrects_are_not_named(
-    off: tuple[float, float, float], told: bool, seed: int
+    off: tuple[float, float, float], with_sigma: bool, seed: int
 ):
-    assert misfit(roughly(recorded(seed).intrinsics, off, told, seed), seed) is None
+    assert misfit(roughly(recorded(seed).intrinsics, off, with_sigma, seed), seed) is None
 
 
 @pytest.mark.parametrize(("index", "by", "named"), [(1, 8.0, "fx / fy"), (6, 0.004, "p1"), (7, 0.004, "p2")])
