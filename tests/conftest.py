@@ -18,7 +18,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
-LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py")
+LIVE_FOLDERS = ("web", "bridges", "client", "live", "node", "protocol", "server")
+LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py", "test_record.py", "test_publish.py")
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _locked_ports: list[IO[str]] = []
 NICENESS = 10  # of tests that only compute
@@ -28,9 +29,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def is_live(item: pytest.Item) -> bool:
-    """Whether the result of a test depends on real time: it runs programs or a browser."""
+    """Whether the result of a test depends on real time: it runs sessions, programs or a browser."""
     fixtures = getattr(item, "fixturenames", ())
-    return "endpoint" in fixtures or item.path.parent.name == "web" or item.path.name in LIVE_FILES
+    return "endpoint" in fixtures or item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -28,7 +28,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built in the folder of `make setup`, so that only changed files are compiled."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [*(sys.executable, "-m", "pip", "wheel"), "--quiet", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True, timeout=300)
+    subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True, timeout=900)
     return next(folder.glob("roundel-*.whl"))
 
 
