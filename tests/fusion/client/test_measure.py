@@ -13,9 +13,9 @@ from fusion.errors import FusionError
 from fusion.model.robots import distances, load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import ROOT, free_port
-from tests.fusion.conftest import track
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
+from tests.fusion.tracks import track
 
 UNKNOWN = np.full((3, 3), np.nan)
 

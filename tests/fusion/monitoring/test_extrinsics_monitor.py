@@ -8,8 +8,8 @@ import pytest
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.conftest import errors
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.fusion.tracks import errors
 
 MOVE_S = 0.7
 ROBOTS = {"a": TRIANGLE, "b": WIDE}

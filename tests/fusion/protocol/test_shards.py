@@ -19,9 +19,9 @@ from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
-from tests.fusion.conftest import errors
 from tests.fusion.serving import DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.fusion.tracks import errors
 
 NAMES = [f"robot_{k}" for k in range(200)]
 

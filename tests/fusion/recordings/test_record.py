@@ -21,9 +21,9 @@ from fusion.protocol.messages import Robots
 from fusion.recordings.record import read_recording
 from fusion.recordings.run import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
-from tests.fusion.conftest import errors, poses_of
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
+from tests.fusion.tracks import errors, poses_of
 
 MOVING = Arena(
     {"a": TRIANGLE}, {"a": line((0.2, -0.3, 0.4), (0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0))}, sigma_px=0.1

@@ -19,8 +19,8 @@ from tests.benchmarks.fusion_accuracy import accuracy
 from tests.benchmarks.fusion_grouping import cold_grouping
 from tests.benchmarks.fusion_load import DIAMETER_M, Load
 from tests.benchmarks.fusion_swaps import identity
-from tests.fusion.conftest import errors, track
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line, ring
+from tests.fusion.tracks import errors, track
 
 
 def twin(start: tuple[float, float, float]) -> Robot:

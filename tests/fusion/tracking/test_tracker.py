@@ -8,8 +8,8 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.conftest import errors, track
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
+from tests.fusion.tracks import errors, track
 
 TIGHT = Limits(sigma_floor_px=1e-3)
 MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), tilt=(0.1, -0.2, 0.4))
