@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ class DetectorSettings:
         ConfigError: a setting is out of its range.
     """
 
-    inner_ratios: tuple[float, ...] = (0.6, 0.41)
+    inner_ratios: Sequence[float] = (0.6, 0.41)
     ratio_tolerance: float = 0.08
     min_diameter_px: float = 8.0
     max_diameter_px: float = 400.0
@@ -74,6 +74,18 @@ class DetectorSettings:
         )
 
 
+class SettingKeywords(TypedDict, total=False):
+    """The fields of `DetectorSettings` as keywords of `Detector`, for editors and type checkers."""
+
+    inner_ratios: Sequence[float]
+    ratio_tolerance: float
+    min_diameter_px: float
+    max_diameter_px: float
+    min_contrast: float
+    search_share: float
+    mask: Sequence[ArrayLike]
+
+
 class Detector:
     """Finds roundels in a sequence of grey images and tracks them from frame to frame.
 
@@ -89,7 +101,9 @@ class Detector:
         ConfigError: a setting is out of its range.
     """
 
-    def __init__(self, *, detector: Literal["chords", "paper"] = "chords", **settings: Any) -> None:
+    def __init__(
+        self, *, detector: Literal["chords", "paper"] = "chords", **settings: Unpack[SettingKeywords]
+    ) -> None:
         if detector not in ("chords", "paper"):
             raise ConfigError(f"there is no detector '{detector}'; choose chords or paper")
         used = DetectorSettings(**settings)
@@ -110,7 +124,8 @@ class Detector:
         Raises:
             ConfigError: a setting is out of its range.
         """
-        other = Detector(**{"detector": self._name, **self.settings, **changes})
+        changed: dict[str, Any] = {**self.settings, **changes}
+        other = Detector(detector=self._name, **changed)
         other._core.take_over(self._core)
         return other
 

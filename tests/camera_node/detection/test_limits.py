@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The detector against its goals (a part of `python -m tests.benchmarks.detector`); agreement of both detectors."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.detection.detector import Detector
+from camera_node.detection.detector import Detector, DetectorSettings, SettingKeywords
 from camera_node.geometry.lens import Lens
 from tests.benchmarks.detector.accuracy import Errors, measure_cell
 from tests.benchmarks.detector.bound import bound
@@ -122,3 +124,8 @@ def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
         sigma = float(np.sqrt(np.trace(ours.cov) / 2))
         assert np.abs(ours.uv - theirs.uv).max() < sigma
         assert np.abs(ours.uv - centre).max() < 4 * sigma + 0.02
+
+
+def test_the_keywords_of_the_detector_are_its_settings():
+    """Editors and type checkers read `SettingKeywords`; `DetectorSettings` is what the detector uses."""
+    assert set(SettingKeywords.__annotations__) == {field.name for field in fields(DetectorSettings)}
