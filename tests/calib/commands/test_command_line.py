@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
+from tests.truth import true_camera
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
@@ -200,8 +199,8 @@ def test_frames_of_an_arena_from_another_renderer(tmp_path: Path, shared_data: C
     """Four free-running cameras: the error of every camera is below 3 mm and 0.1 degrees."""
     recording = shared_data("arena_small")
     truths = json.loads((recording / "truth.json").read_text())["cameras"]
-    lenses = {name: _camera(entry) for name, entry in truths.items()}
-    truth = {name: _camera(entry, placed=True) for name, entry in truths.items()}
+    lenses = {name: true_camera(entry, placed=False) for name, entry in truths.items()}
+    truth = {name: true_camera(entry) for name, entry in truths.items()}
     save_rig(Rig(cameras=lenses), tmp_path / "lenses.yaml")
     (tmp_path / "wand.yaml").write_text(WAND_YAML)
     done = calib("wand", *wand_options(tmp_path), "--frames", recording / "wand")
@@ -209,20 +208,6 @@ def test_frames_of_an_arena_from_another_renderer(tmp_path: Path, shared_data: C
     found = load_rig(tmp_path / "rig.yaml")
     assert set(found.placed()) == set(truths)
     assert_near(found, Rig(cameras=truth), 3e-3, np.radians(0.1))
-
-
-def _camera(entry: dict, placed: bool = False) -> Camera:
-    K = entry["K"]
-    return Camera(
-        width=entry["width"],
-        height=entry["height"],
-        fx=K[0][0],
-        fy=K[1][1],
-        cx=K[0][2],
-        cy=K[1][2],
-        distortion=tuple(entry["dist"]),
-        T_world_cam=Pose.from_matrix(invert(np.array(entry["T_cam_world"]))) if placed else None,
-    )
 
 
 def test_intrinsics_refuse_invalid_boards_and_images(tmp_path: Path):

@@ -10,15 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.rig.camera import Camera
 from calib.rig.rig import Rig, save_rig
-from camera_node.geometry.pose import Pose, invert
 from camera_node.sources.observations import write_observations
 from fusion.__main__ import main
 from fusion.commands.run import run
 from fusion.model.robots import Robot
 from fusion.recordings.report import COLUMNS
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
+from tests.truth import true_camera
 
 ARENA = Arena(
     {"a": TRIANGLE, "c": SINGLE},
@@ -87,7 +86,7 @@ def test_a_recording_of_another_renderer(shared_data, tmp_path):
     """
     folder = shared_data("arena_small")
     truth = json.loads((folder / "truth.json").read_text())
-    cameras = {name: _camera(entry) for name, entry in truth["cameras"].items()}
+    cameras = {name: true_camera(entry) for name, entry in truth["cameras"].items()}
     save_rig(Rig(cameras=cameras), tmp_path / "rig.yaml")
     size = truth["robots"]["outer_diameter_m"]
     markers = truth["robots"]["markers_m"]
@@ -112,17 +111,3 @@ def test_a_recording_of_another_renderer(shared_data, tmp_path):
         rms = np.sqrt(((mine[inside, 1:] - true) ** 2).sum(1).mean())
         assert len(mine) > 20
         assert rms < 3e-3
-
-
-def _camera(entry: dict) -> Camera:
-    K = entry["K"]
-    return Camera(
-        width=entry["width"],
-        height=entry["height"],
-        fx=K[0][0],
-        fy=K[1][1],
-        cx=K[0][2],
-        cy=K[1][2],
-        distortion=tuple(entry["dist"]),
-        T_world_cam=Pose.from_matrix(invert(np.array(entry["T_cam_world"]))),
-    )
