@@ -16,7 +16,7 @@ import zenoh
 
 from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
-from camera_node.protocol.requests import encode_reply, parse_request, payload_of
+from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
 from camera_node.protocol.session import listening_endpoints
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
@@ -26,6 +26,7 @@ from fusion.protocol.messages import (
     ShardPoses,
     TrackingState,
     robots_key,
+    set_robots_key,
     shard_key,
     undo_key,
 )
@@ -108,7 +109,8 @@ class Server:
         keys, transport = self.keys, self.transport
         transport.subscribe(keys.detections(), self._receive_detections)
         transport.subscribe(keys.rig, self._receive_rig)
-        transport.answer_on_server_thread(robots_key(keys.arena), self._change_robots)
+        transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
+        transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
         if isinstance(self.clock, ServerClock):
@@ -228,9 +230,15 @@ class Server:
         self._publisher.publish_rig(message)
         return encode(message)
 
+    def _answer_robots(self, query: zenoh.Query) -> bytes:
+        payload = payload_of(query)
+        if payload and parse_request(payload, RobotsRequest) != RobotsRequest():
+            raise RequestError(f"send changes of robots to {set_robots_key(self.keys.arena)}")
+        return encode_reply(payload, Robots(robots=self.pipeline.robots))
+
     def _change_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
-        request = parse_request(payload, RobotsRequest) if payload else RobotsRequest()
+        request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self.pipeline.change_robots(request))
         return encode_reply(payload, Robots(robots=self.pipeline.robots))
 
