@@ -194,6 +194,7 @@ class ClockReply(msgspec.Struct, frozen=True):
 
     t_ns: int
     clock: str = ""  # empty where the server can't name it
+    monotonic_ahead_ns: int | None = None  # t_ns minus the monotonic clock of the server's machine
 
 
 def encode(message: msgspec.Struct) -> bytes:

@@ -199,8 +199,16 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def robots_key(arena: str) -> str:
-    """The key of the queryable that takes a `RobotsRequest` and answers with `Robots`."""
+    """The key of the queryable that answers with `Robots`; it changes nothing."""
     return f"{arena}/robots"
+
+
+def set_robots_key(arena: str) -> str:
+    """The key of the queryable that takes a `RobotsRequest` and answers with `Robots`.
+
+    A key of its own, because access rights cannot tell a query with a payload from one without.
+    """
+    return f"{arena}/robots/set"
 
 
 def shard_key(arena: str, index: int | str) -> str:
