@@ -45,7 +45,7 @@ def test_the_server_receives_a_camera_s_frames_and_a_viewer_its_status(lab: Lab)
 
 def test_a_viewer_reads_robots_and_an_operator_changes_them(lab: Lab):
     viewer, operator = lab.session("viewer"), lab.session("operator")
-    request = RobotsRequest(remove=["robot_b"])
+    request = RobotsRequest(remove=("robot_b",))
     assert "robot_b" in request_robots(viewer, ARENA)
     with pytest.raises(NetworkError):
         change_robots(viewer, ARENA, request, timeout_s=1.0)
