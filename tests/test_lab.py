@@ -138,10 +138,10 @@ def test_a_viewer_may_receive_all_and_change_nothing(lab: Lab):
     robots = b'{"remove": ["robot_b"]}'
     with Arena.connect(f"tls/localhost:{lab.port}", zenoh_config=lab.config("viewer")) as arena:
         assert arena.status(timeout_s=DEADLINE_S).next().version
-    assert ask(viewer, "arena/robots", robots) == []
+    assert ask(viewer, "arena/robots/set", robots) == []
     before = ask(operator, "arena/robots")
     assert b"robot_b" in before[0], "the server rejected the viewer's request"
-    assert b"robot_b" not in ask(operator, "arena/robots", robots)[0]
+    assert b"robot_b" not in ask(operator, "arena/robots/set", robots)[0]
 
 
 def test_the_operator_may_publish_a_rig(lab: Lab):

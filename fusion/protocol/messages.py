@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Index
+from camera_node.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.robots import Robot
 
@@ -53,6 +54,8 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise MessageError unless numbers are finite, the quaternion is not zero and the covariance is 12 x 12."""
+        if not is_name(self.robot):
+            raise MessageError("an invalid robot name")
         numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
         if not any(self.quaternion_wxyz):
             raise MessageError("the pose has a zero quaternion")
@@ -196,8 +199,16 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def robots_key(arena: str) -> str:
-    """The key of the queryable that takes a `RobotsRequest` and answers with `Robots`."""
+    """The key of the queryable that answers with `Robots`; it changes nothing."""
     return f"{arena}/robots"
+
+
+def set_robots_key(arena: str) -> str:
+    """The key of the queryable that takes a `RobotsRequest` and answers with `Robots`.
+
+    A key of its own, because access rights cannot tell a query with a payload from one without.
+    """
+    return f"{arena}/robots/set"
 
 
 def shard_key(arena: str, index: int | str) -> str:

@@ -11,7 +11,7 @@ from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key, undo_key
+from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key, undo_key
 
 REQUEST_S = 5.0  # the timeout of a request
 RETRY_S = 0.1
@@ -29,7 +29,19 @@ def change_robots(
         FusionError: the server refuses the request; the message is the server's.
         NetworkError: no server answers in time.
     """
-    data = _request(session, arena, robots_key(arena), encode(request), timeout_s)
+    return _robots_of(_request(session, arena, set_robots_key(arena), encode(request), timeout_s))
+
+
+def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> dict[str, Robot]:
+    """All robots that the server tracks.
+
+    Raises:
+        NetworkError: no server answers in time.
+    """
+    return _robots_of(_request(session, arena, robots_key(arena), b"", timeout_s))
+
+
+def _robots_of(data: bytes) -> dict[str, Robot]:
     try:
         return decode(data, Robots).robots
     except MessageError as error:
