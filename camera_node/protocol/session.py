@@ -17,7 +17,9 @@ log = logging.getLogger("camera_node.network")
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
-RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
+LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
+SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
@@ -84,6 +86,9 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
         "transport/unicast/open_timeout": 2000,  # `close` waits this long for a listener that is not Zenoh
+        "transport/link/tcp/so_sndbuf": SEND_BUFFER,
+        "transport/link/tls/so_sndbuf": SEND_BUFFER,
+        "transport/link/tx/queue/size/real_time": 1,  # batches
     }
     try:
         return zenoh.open(_config(zenoh_config, options))
@@ -125,7 +130,7 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
             config.insert_json5(key, "false")
     if config.get_json("scouting/delay") == "null":
         config.insert_json5("scouting/delay", "0")  # otherwise opening waits for scouting
-    for key, value in {"mode": "router", **options}.items():
+    for key, value in {"mode": "router", "transport/link/tx/lease": LEASE_MS, **options}.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
