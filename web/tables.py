@@ -165,6 +165,8 @@ def tabulate_faults(state: ArenaState) -> HtmlTable:
     """One row per reason for which the server or this viewer skipped something."""
     server = state.status.message.faults if state.status else {}
     counts = [(reason, count) for reason, count in server.items() if count]
+    cameras = state.status.message.cameras if state.status else {}
+    counts += [(f"{name}: {why}", n) for name, health in cameras.items() for why, n in health.faults.items()]
     counts += [(f"viewer: {reason}", count) for reason, count in state.faults.items()]
     return HtmlTable(("fault", "count"), [TableRow((reason, str(count)), "warn") for reason, count in counts])
 

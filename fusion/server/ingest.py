@@ -19,7 +19,9 @@ MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
 MAX_AHEAD_NS = 200_000_000  # as is one in the future: clocks are aligned to milliseconds
 MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a fault of the publisher
 MAX_BYTES = 1 << 19  # of a message; one with the most roundels has 240 kB
-MAX_DETECTIONS = 1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
+MAX_DETECTIONS = (
+    1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
+)
 HISTORY = 64  # frames of a camera
 MIN_STEPS_BACK = 4  # of sequence numbers in the history, for two publishers: a restarted node makes one
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
@@ -59,6 +61,28 @@ class Ingest:
             received_ns: when it arrived.
             cameras: the placed ones.
         """
+        message = self._decode(data, key, received_ns)
+        if message is None:
+            return None
+        name, camera = message.camera, cameras.get(message.camera)
+        if not self._is_admitted(name, camera is not None):
+            return self._refuse("too many cameras")
+        self._statistics.count_arrival(name, message.t_ns, received_ns)
+        if camera is None:
+            return self._refuse("unknown camera", name) if cameras else None
+        if (message.width, message.height) != (camera.width, camera.height):
+            return self._refuse("wrong image size", name)
+        if not self._is_new(message):
+            return self._refuse("duplicate frame", name)
+        frame = CalibratedFrame.of(message, camera, received_ns)
+        frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+        if len(frame.roundels) > MAX_DETECTIONS:
+            self._statistics.count_fault("frames with too many roundels", name)
+            return _with_strongest(frame)
+        return frame
+
+    def _decode(self, data: bytes, key: str, received_ns: int) -> Detections | None:
+        """The message, if its content, its camera and its time are possible."""
         name = self._keys.camera_in(key)
         try:
             if len(data) > MAX_BYTES:
@@ -70,22 +94,7 @@ class Ingest:
             return self._refuse("undecodable detections", name)
         if not -MAX_AHEAD_NS <= received_ns - message.t_ns <= MAX_AGE_NS:
             return self._refuse("implausible time", name)
-        camera = cameras.get(message.camera)
-        if not self._is_admitted(message.camera, camera is not None):
-            return self._refuse("too many cameras")
-        self._statistics.count_arrival(message.camera, message.t_ns, received_ns)
-        if camera is None:
-            return self._refuse("unknown camera", name) if cameras else None
-        if (message.width, message.height) != (camera.width, camera.height):
-            return self._refuse("wrong image size", name)
-        if not self._is_new(message):
-            return self._refuse("duplicate frame", name)
-        frame = CalibratedFrame.of(message, camera, received_ns)
-        frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
-        if len(frame.roundels) <= MAX_DETECTIONS:
-            return frame
-        self._statistics.count_fault("frames with too many roundels", name)
-        return _with_strongest(frame)
+        return message
 
     def _refuse(self, reason: str, camera: str | None = None) -> None:
         self._statistics.count_fault(reason, camera)

@@ -45,7 +45,6 @@ from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # resolution at which a wait for frames ends
-SLACK_NS = 50_000_000  # beyond the lateness limit: a frame set ends up to a period after its first frame
 RIG_ANSWERS_HZ = 20.0  # answers with the rig, of any number of clients
 MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
 
@@ -70,7 +69,7 @@ class Server:
         self.pipeline = TrackingPipeline(config, self.shard)
         self._ingest = Ingest(self.keys, self.statistics)
         self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
-        self._lateness_ns = round(config.limits.lateness_ms * 1e6)
+        self._max_lag_ns = max(MAX_LAG_NS, round(config.limits.lateness_ms * 1e6))
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
@@ -102,7 +101,7 @@ class Server:
         """Serve: receive, synchronize, track and publish, report the status."""
         with collecting_between_frame_sets() as collect_garbage:
             while not self._stopped.is_set():
-                is_backlogged = self.transport.receive(TICK_S, max(self._lateness_ns, MAX_LAG_NS))
+                is_backlogged = self.transport.receive(TICK_S, self._max_lag_ns)
                 now_ns = self.clock.now_ns()
                 with self._guarded("tracking"):
                     self._fuse(now_ns, is_backlogged)
@@ -112,6 +111,7 @@ class Server:
 
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
+        self._update_quotas()
         transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
         transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
@@ -204,9 +204,12 @@ class Server:
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
         self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
+        self._update_quotas()
+        return True
+
+    def _update_quotas(self) -> None:
         keys = [self.keys.detections(name) for name in self.pipeline.cameras]
         self._quotas.update(keys, self.pipeline.synchronizer.rate_hz or MAX_RATE_HZ)
-        return True
 
     # Received messages.
 
@@ -214,8 +217,8 @@ class Server:
         frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
         if frame is None:
             return
-        age_ns = received_ns - frame.t_ns
-        is_on_time = age_ns <= self._lateness_ns + SLACK_NS and self.pipeline.synchronizer.add(frame)
+        age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns
+        is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)
         self.statistics.note_lateness(frame.camera, is_on_time, age_ns * 1e-6)
 
     def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:

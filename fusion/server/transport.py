@@ -125,7 +125,7 @@ class Transport:
 
     def enqueue(self, run: Callable[[], object]) -> None:
         """Execute something on the server's thread; callable from any thread."""
-        self._put(Task("the server", self._clock.now_ns(), run, lambda: None), MESSAGES)
+        self._put(Task("the server", self._clock.now_ns(), run, run), MESSAGES)
 
     def receive(self, timeout_s: float, max_wait_ns: int) -> bool:
         """Execute the next task, waiting for it at most `timeout_s`. No exception of a task leaves this method.

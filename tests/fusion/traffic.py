@@ -96,7 +96,10 @@ class Flood:
         uv = self.rng.uniform([10, 10], [790, 590], (self.n - len(true), 2))
         axes = np.sort(self.rng.uniform(10, 30, uv.shape))[:, ::-1]
         false = msgspec.structs.asdict(Detections.pack(Roundels.from_points(uv, 0.1), **_header(message)))
-        false["axes_px"], false["angle_rad"] = axes.astype("<f4").tobytes(), np.zeros(len(uv), "<f4").tobytes()
+        false["axes_px"], false["angle_rad"] = (
+            axes.astype("<f4").tobytes(),
+            np.zeros(len(uv), "<f4").tobytes(),
+        )
         columns = ("uv", "cov", "axes_px", "angle_rad", "ratio", "contrast", "id", "track")
         return msgspec.structs.replace(message, **{c: getattr(message, c) + false[c] for c in columns})
 
