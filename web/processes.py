@@ -39,8 +39,8 @@ class Processes:
         self.stop()
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
-        """Run `python -m module arguments`."""
-        command = [sys.executable, "-m", module, *arguments]
+        """Run `python -m module arguments` until it ends, `stop` is called or this process ends, by whatever cause."""
+        command = [sys.executable, "-m", "web.child", module, *arguments]
         # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
         environment = os.environ | {
             "PYTHONUNBUFFERED": "1",
@@ -51,12 +51,14 @@ class Processes:
             # In a session of its own: Ctrl-C reaches this program only, which then stops its children.
             child = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # closed by the end of this process, which ends the child
                 stdout=log,
                 stderr=log,
                 env=environment,
                 start_new_session=True,
             )
+        if name in self._children:
+            _release(self._children[name])
         self._children[name] = child
         self._meters[name] = psutil.Process(child.pid)
 
@@ -94,6 +96,7 @@ class Processes:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
+            _release(child)
         self._children.clear()
 
     def pids(self) -> list[int]:
@@ -123,6 +126,12 @@ class Processes:
 
     def _log(self, name: str) -> Path:
         return self.folder / f"{name}.log"
+
+
+def _release(child: subprocess.Popen) -> None:
+    """Close this process's end of the child's standard input."""
+    if child.stdin is not None:
+        child.stdin.close()
 
 
 @contextmanager
