@@ -13,6 +13,7 @@ from types import FrameType
 
 import psutil
 
+from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR
 from web.errors import WebError
 
 GRACE_S = 5.0  # between SIGTERM and SIGKILL
@@ -119,7 +120,7 @@ class Processes:
 
     def _raise_failed(self, name: str, code: int) -> None:
         lines = self._log(name).read_text(errors="replace").strip().splitlines()
-        if code == 2 and lines and lines[-1].startswith("error: "):
+        if code in (USER_ERROR, TEMPORARY_FAILURE) and lines and lines[-1].startswith("error: "):
             raise WebError(f"{name}: {lines[-1].removeprefix('error: ')}")
         tail = "\n".join(f"  {line}" for line in lines[-TAIL_LINES:])
         raise ProgramFailed(f"{name} stopped with code {code}; its log is {self._log(name)}\n{tail}".rstrip())
