@@ -22,6 +22,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+from camera_node.text import printable
+
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
 
 
@@ -60,7 +62,7 @@ def run(program: Callable[[], int | None]) -> None:
     try:
         code = program()
     except RoundelError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
         code = 130

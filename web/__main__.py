@@ -2,6 +2,7 @@
 """`python -m web`: shows an arena or a recording in the browser or in one line per second, or runs the demo."""
 
 import contextlib
+import logging
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from camera_node.errors import run
+from camera_node.logs import set_up_logging
 from camera_node.protocol.session import open_client
 from camera_node.service import stopped_by_signals
 from web.feed import Feed
@@ -137,6 +139,7 @@ def program() -> int | None:
 
 
 def main() -> None:
+    set_up_logging(logging.WARNING)
     run(program)
 
 
