@@ -19,7 +19,7 @@ PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
-RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+RETRY = {"period_init_ms": 200, "period_max_ms": 400, "period_increase_factor": 1.5}
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
