@@ -18,9 +18,12 @@ from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
 from camera_node.protocol.session import listening_endpoints
+from camera_node.service import ServiceManager
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.protocol.health import describe_status
 from fusion.protocol.messages import (
+    FusionStatus,
     Robots,
     RobotsRequest,
     ShardPoses,
@@ -99,15 +102,18 @@ class Server:
 
     def run(self) -> None:
         """Serve: receive, synchronize, track and publish, report the status."""
-        with collecting_between_frame_sets() as collect_garbage:
+        with ServiceManager() as service, collecting_between_frame_sets() as collect_garbage:
+            service.ready()
             while not self._stopped.is_set():
                 is_backlogged = self.transport.receive(TICK_S, self._max_lag_ns)
                 now_ns = self.clock.now_ns()
                 with self._guarded("tracking"):
                     self._fuse(now_ns, is_backlogged)
                 with self._guarded("the status"):
-                    if self._report_status(now_ns):
+                    if status := self._report_status(now_ns):
+                        service.report(describe_status(status))
                         collect_garbage()
+                service.progress()
 
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
@@ -194,18 +200,19 @@ class Server:
             "camera %s is recalibrated and used again; a query on %s undoes that", correction.name, undo
         )
 
-    def _report_status(self, now_ns: int) -> bool:
-        """Publish the status once a second; return whether it was due."""
+    def _report_status(self, now_ns: int) -> FusionStatus | None:
+        """Publish the status once a second; return it if it was due."""
         if not self.statistics.is_due(now_ns):
-            return False
+            return None
         pipeline = PipelineStatus(
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
-        self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
+        status = self.statistics.report(now_ns, pipeline)
+        self._publisher.publish_status(status)
         self._update_quotas()
-        return True
+        return status
 
     def _update_quotas(self) -> None:
         keys = [self.keys.detections(name) for name in self.pipeline.cameras]
