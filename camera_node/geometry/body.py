@@ -29,7 +29,9 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not 0.001 <= self.diameter_m <= MAX_EXTENT_M:
             raise ValueError(f"diameter_m is {self.diameter_m}; give the black disc's diameter d_o in metres")
         if not self.markers or not all(abs(x) <= MAX_EXTENT_M for marker in self.markers for x in marker):
-            raise ValueError(f"markers must be one or more [x, y, z] in metres, each within {MAX_EXTENT_M:g} m")
+            raise ValueError(
+                f"markers must be one or more [x, y, z] in metres, each within {MAX_EXTENT_M:g} m"
+            )
         if not (0.1 <= self.inner_ratio <= 0.95 and 1.0 <= self.surround_ratio <= 10):
             raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
 
