@@ -185,6 +185,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     calibrated: bool
     excluded: bool = False  # the camera was moved: its detections are excluded until it is recalibrated
     duplicate_publisher: bool = False  # two nodes publish under its name
+    faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
