@@ -108,13 +108,14 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     guess.print_ratios = context.limits.inner_ratios;
     auto fit = fit_photometric(image, guess);
     if (!fit) return std::nullopt;
+    const double at_edges = std::max(context.noise, context.edge_noise);
     std::optional<EdgeMisfit> misfit;
     if (!is_explained_by_noise(*fit, context.noise)) misfit.emplace(image, fit->p);
     const bool elliptic = !misfit || has_elliptic_edges(*misfit, *fit, context.noise);
     const bool accepted = elliptic && passes(image, *fit, context, {kMisfit, kMaxGrowth});
-    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, context.noise));
+    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, at_edges));
     if (fit->unoccluded || guess.model) return fit->unoccluded ? fit : std::nullopt;
-    const auto rest = fit_occluded(image, {guess, *fit, misfit, context.noise, known || accepted});
+    const auto rest = fit_occluded(image, {guess, *fit, misfit, at_edges, known || accepted});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(*fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
