@@ -174,9 +174,9 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
 
 /// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
 void Detector::learn_response(const FrameState& frame) {
-    std::vector<RoundelFit> fits;
+    std::vector<const RoundelFit*> fits;
     for (const TrackedFit& roundel : frame.found)
-        if (roundel.fit.unoccluded) fits.push_back(roundel.fit);
+        if (roundel.fit.unoccluded) fits.push_back(&roundel.fit);
     if (response_.learn(fits, limits_)) change_mask_.invalidate(), tracks_.forget_models();
 }
 

@@ -127,7 +127,7 @@ def tone_curve(tone: Tone) -> Grey:
 
 
 def _through_mosaic(image: Array) -> Array:
-    """A neutral picture through a Bayer mosaic with its white balance, bilinear interpolation and conversion to grey."""
+    """A neutral picture through a Bayer mosaic, its white balance, interpolation and the conversion to grey."""
     h, w = image.shape
     red, green, blue = DAYLIGHT
     transmitted = np.tile(np.float32([[red, green], [green, blue]]), (h // 2 + 1, w // 2 + 1))[:h, :w]

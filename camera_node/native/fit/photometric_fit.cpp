@@ -38,6 +38,7 @@ constexpr double kSlack = 1.3;     // upper bound: tolerance of a median of few 
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kPrintSigma = 0.002;                // of the ratios of prints of one kind
+constexpr double kShadingSigma = 0.002;              // of the relative change of the light, per pixel
 constexpr double kMaxPrintError = 3;                 // standard deviations
 constexpr SanityLimits kLimits{.shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .overflow = 64};
 
@@ -74,6 +75,7 @@ class PhotometricFitter : GaussNewton<kCount> {
 
     double ratio() const { return p_[kRatio]; }
     void use_print(double print_ratio);
+    void allow_shading();
     RoundelFit fit() const;
 
   private:
@@ -105,7 +107,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     bool iterate(const EdgePixels& pixels, int steps_to_go) {
         const bool coarse = steps_to_go > 1;
         for (int k = 0; k < kMaxSteps; ++k) {
-            equations_.linearize(pixels, p_);
+            equations_.linearize(pixels, p_), linearized_at_ = p_;
             const double seen = edge_scale();
             if (resumed_ && coarse && seen < kSlack * scale_) return true;
             if (resumed_ && (k == kMaxResumedSteps || seen > kMaxResumedMisfit * contrast())) return false;
@@ -178,6 +180,8 @@ class PhotometricFitter : GaussNewton<kCount> {
     NormalEquations equations_;
     GaussNewtonSystem<kCount> system_;
     ResidualSums sums_;
+    Parameters linearized_at_{};
+    PoseCovariance shading_effect_{};  // on the covariance, in units of the noise
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
     double print_ratio_ = 0;             // that the estimate is conditioned on; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
@@ -212,16 +216,43 @@ void PhotometricFitter::use_print(double print_ratio) {
     const double off = print_ratio - p_[kRatio];
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kLimits)) {
-        equations_.linearize(pixels_, p_);
+        equations_.linearize(pixels_, p_), linearized_at_ = p_;
         if (solve(scale_) && (advance(scale_), is_sane(kLimits)) && condition_on_print(print_ratio)) return;
     }
     std::tie(p_, factor_, sums_, noise_, scale_) = saved;
 }
 
+/// Includes the two unknowns of a linear shading in the pose, after convergence: with C the products of their
+/// columns with those of the parameters, D their own and e their residuals,
+///   S = D + prior - C^T H^-1 C,  shading = S^-1 (e - C^T step),  pose <- pose - (H^-1 C shading)_pose.
+/// The covariance grows by H^-1 C S^-1 C^T H^-1. The shading is relative to the level at the pixels' origin.
+void PhotometricFitter::allow_shading() {
+    const ShadingProducts products = equations_.shading(pixels_, scale_);
+    const auto& [Cx, Cy] = products.parameters;
+    const Parameters yx = factor_->halfway(Cx), yy = factor_->halfway(Cy);
+    const double prior = square(noise_ / kShadingSigma);
+    Symmetric S{products.own.xx + prior, products.own.xy, products.own.yy + prior};
+    auto [ex, ey] = products.residuals;
+    for (int i = 0; i < kCount; ++i) {
+        const double step = p_[i] - linearized_at_[i];
+        ex -= Cx[i] * step, ey -= Cy[i] * step;
+        S.xx -= yx[i] * yx[i], S.xy -= yx[i] * yy[i], S.yy -= yy[i] * yy[i];
+    }
+    const double det = S.det();
+    if (!(det > 0 && S.xx > 0)) return;
+    const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
+    const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);
+    for (int i = 0; i < kPoseCount; ++i) p_[kX + i] -= Kx[i] * sx + Ky[i] * sy;
+    for (int i = 0; i < kPoseCount; ++i)
+        for (int j = 0; j < kPoseCount; ++j)
+            shading_effect_[i][j] =
+                (S.yy * Kx[i] * Kx[j] - S.xy * (Kx[i] * Ky[j] + Ky[i] * Kx[j]) + S.xx * Ky[i] * Ky[j]) / det;
+}
+
 PoseCovariance PhotometricFitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
-        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= print_effect_[i] * print_effect_[j];
+        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] += shading_effect_[i][j] - print_effect_[i] * print_effect_[j];
     return scaled(inverse, square(noise_));
 }
 
@@ -241,6 +272,7 @@ std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialG
     PhotometricFitter fitter(image, guess);
     if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
     if (!guess.print_ratios.empty()) fitter.use_print(nearest_ratio(guess.print_ratios, fitter.ratio()));
+    fitter.allow_shading();
     return fitter.fit();
 }
 

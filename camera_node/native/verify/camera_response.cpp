@@ -11,10 +11,14 @@ namespace {
 constexpr double kPrintSigma = 0.002;        // of a print's ratio
 constexpr double kMinDiameter = 12;          // pixels: ratio and blur of smaller roundels are correlated
 constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
-constexpr double kMaxCurvature = 0.9;        // of a tone curve between ink and paper
+constexpr double kMaxCurvature = 1.4;        // of a tone curve between ink and paper
 constexpr double kMaxLogExponent = 1.2;      // 3.3
-constexpr double kMinChange = 0.05;          // of the logarithm: smaller ones are within a tenth of the noise
+constexpr int kHalvings = 16;                // of the interval of exponents
+constexpr double kMinTone = 0.1;             // logarithm of an exponent: smaller ones count as linear
+constexpr double kMaxLinear = 0.1;           // logarithm, up to which a measurement is exact to a hundredth
+constexpr double kMinChange = 0.02;          // of the logarithm
 constexpr double kMaxSigma = 0.15;           // of the logarithm, from which it is used
+constexpr size_t kMaxMeasured = 8;           // roundels of a frame
 constexpr double kMemory = 0.2;              // weight of a new frame
 
 /// Edge displacement in blurs for each unit of curvature: with s = Phi(x), the least squares fit of the shift
@@ -27,7 +31,7 @@ double log_exponent_of(double dark, double bright, double middle) {
     const double d = std::log(std::max(dark, kDarkest) / 255), b = std::log(bright / 255),
                  m = std::log((dark + middle * (bright - dark)) / 255);
     double low = -kMaxLogExponent, high = kMaxLogExponent;
-    for (int k = 0; k < 24; ++k) {
+    for (int k = 0; k < kHalvings; ++k) {
         const double log_g = (low + high) / 2, g = std::exp(log_g);
         const bool too_bright = 2 * std::exp(g * m) > std::exp(g * d) + std::exp(g * b);
         (too_bright ? low : high) = log_g;
@@ -59,11 +63,12 @@ ImageView CameraResponse::linearize(const ImageView& image) {
     return {buffer_.data(), image.width, image.height, image.width};
 }
 
-bool CameraResponse::learn(const std::vector<RoundelFit>& fits, const RoundelLimits& limits) {
+bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits) {
     learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
-    for (const RoundelFit& fit : fits)
-        if (const auto estimate = measure(fit, limits)) measured.push_back(*estimate);
+    const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
+    for (size_t k = 0; k < fits.size(); k += step)
+        if (const auto estimate = measure(*fits[k], limits)) measured.push_back(*estimate);
     return !measured.empty() && learn_tone(std::move(measured));
 }
 
@@ -83,10 +88,10 @@ std::optional<CameraResponse::ToneEstimate> CameraResponse::measure(const Rounde
     return ToneEstimate{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)};
 }
 
-void CameraResponse::learn_edge_noise(const std::vector<RoundelFit>& fits) {
+void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     if (fits.empty()) return;
     std::vector<double> residuals;
-    for (const RoundelFit& fit : fits) residuals.push_back(fit.edge_residual);
+    for (const RoundelFit* fit : fits) residuals.push_back(fit->edge_residual);
     const double median = median_by(residuals, [](double residual) { return residual; });
     edge_noise_ = edge_noise_ > 0 ? edge_noise_ + kMemory * (median - edge_noise_) : median;
 }
@@ -103,9 +108,11 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
     const double gain = sigma_ == 0 ? 1 : kMemory;
     mean_ += gain * (middle - mean_), sigma_ += gain * (sigma - sigma_);
     const double change = std::abs(mean_ - log_exponent_);
-    if (sigma_ > kMaxSigma || change < std::max(kMinChange, 2 * sigma_)) return false;
+    const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
+    if (sigma_ > kMaxSigma || change < enough) return false;
     edge_noise_ = 0;
-    set_exponent(std::abs(mean_) < kMinChange ? 0 : std::clamp(mean_, -kMaxLogExponent, kMaxLogExponent));
+    if (change > kMaxLinear) sigma_ = 0;  // the next frame measures the rest: this one was not linear
+    set_exponent(std::abs(mean_) < kMinTone / 2 ? 0 : std::clamp(mean_, -kMaxLogExponent, kMaxLogExponent));
     return true;
 }
 

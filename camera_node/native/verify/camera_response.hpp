@@ -22,7 +22,7 @@ class CameraResponse {
     ImageView linearize(const ImageView& image);
     /// Learns from fits without occlusion to a linearized image. The caller must discard models of earlier
     /// frames if this returns true: the tone curve changed.
-    bool learn(const std::vector<RoundelFit>& fits, const RoundelLimits& limits);
+    bool learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
     /// 1 for a linear camera, 2.2 for a usual tone curve.
     double exponent() const;
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
@@ -34,7 +34,7 @@ class CameraResponse {
         double log_exponent, sigma;
     };
     std::optional<ToneEstimate> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
-    void learn_edge_noise(const std::vector<RoundelFit>& fits);
+    void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     bool learn_tone(std::vector<ToneEstimate> measured);
     void set_exponent(double log_exponent);
 
