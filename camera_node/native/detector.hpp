@@ -73,7 +73,7 @@ class Detector {
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const {
-        return {limits_, frame.noise, response_.edge_noise()};
+        return {limits_, frame.noise, response_.edge_noise(), response_.shading_sigma()};
     }
 
     RoundelLimits limits_;

@@ -38,14 +38,14 @@ constexpr double kSlack = 1.3;     // upper bound: tolerance of a median of few 
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kPrintSigma = 0.002;                // of the ratios of prints of one kind
-constexpr double kShadingSigma = 0.002;              // of the relative change of the light, per pixel
 constexpr double kMaxPrintError = 3;                 // standard deviations
 constexpr SanityLimits kLimits{.shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .overflow = 64};
 
 class PhotometricFitter : GaussNewton<kCount> {
   public:
     PhotometricFitter(const ImageView& image, const InitialGuess& guess)
-        : image_(image), occlusion_(guess.occlusion), resumed_(guess.model.has_value()) {
+        : image_(image), occlusion_(guess.occlusion), resumed_(guess.model.has_value()),
+          shading_sigma_(guess.shading_sigma) {
         pixels_.origin_x = int(std::lround(guess.outer.x));
         pixels_.origin_y = int(std::lround(guess.outer.y));
         p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
@@ -186,6 +186,8 @@ class PhotometricFitter : GaussNewton<kCount> {
     double print_ratio_ = 0;             // that the estimate is conditioned on; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
     bool resumed_;
+    double shading_sigma_;
+    Shading shading_;
 };
 
 Parameters PhotometricFitter::covariance_with_ratio() const {
@@ -230,16 +232,19 @@ void PhotometricFitter::allow_shading() {
     const ShadingProducts products = equations_.shading(pixels_, scale_);
     const auto& [Cx, Cy] = products.parameters;
     const Parameters yx = factor_->halfway(Cx), yy = factor_->halfway(Cy);
-    const double prior = square(noise_ / kShadingSigma);
-    Symmetric S{products.own.xx + prior, products.own.xy, products.own.yy + prior};
+    Symmetric S = products.own;
     auto [ex, ey] = products.residuals;
     for (int i = 0; i < kCount; ++i) {
         const double step = p_[i] - linearized_at_[i];
         ex -= Cx[i] * step, ey -= Cy[i] * step;
         S.xx -= yx[i] * yx[i], S.xy -= yx[i] * yy[i], S.yy -= yy[i] * yy[i];
     }
+    if (!(S.det() > 0 && S.xx > 0)) return;
+    shading_ = {(square(S.yy * ex - S.xy * ey) + square(S.xx * ey - S.xy * ex)) / square(S.det()),
+                square(noise_) * (S.xx + S.yy) / (2 * S.det())};
+    const double prior = square(noise_ / shading_sigma_);
+    S.xx += prior, S.yy += prior;
     const double det = S.det();
-    if (!(det > 0 && S.xx > 0)) return;
     const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
     const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);
     for (int i = 0; i < kPoseCount; ++i) p_[kX + i] -= Kx[i] * sx + Ky[i] * sy;
@@ -261,7 +266,7 @@ RoundelFit PhotometricFitter::fit() const {
     if (print_ratio_ > 0) fit.p[kRatio] = print_ratio_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
-    fit.noise = scale_;
+    fit.noise = scale_, fit.shading = shading_;
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;
 }
@@ -272,7 +277,7 @@ std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialG
     PhotometricFitter fitter(image, guess);
     if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
     if (!guess.print_ratios.empty()) fitter.use_print(nearest_ratio(guess.print_ratios, fitter.ratio()));
-    fitter.allow_shading();
+    if (guess.shading_sigma > 0) fitter.allow_shading();
     return fitter.fit();
 }
 

@@ -105,7 +105,7 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.print_ratios = context.limits.inner_ratios;
+    guess.print_ratios = context.limits.inner_ratios, guess.shading_sigma = context.shading_sigma;
     auto fit = fit_photometric(image, guess);
     if (!fit) return std::nullopt;
     const double at_edges = std::max(context.noise, context.edge_noise);

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numbers>
 
 namespace roundel {
 
@@ -18,12 +19,15 @@ constexpr double kMinTone = 0.1;             // logarithm of an exponent: smalle
 constexpr double kMaxLinear = 0.1;           // logarithm, up to which a measurement is exact to a hundredth
 constexpr double kMinChange = 0.02;          // of the logarithm
 constexpr double kMaxSigma = 0.15;           // of the logarithm, from which it is used
+constexpr double kFirstShading = 2e-4;       // per pixel: a tenth across half of a picture
+constexpr double kLeastShading = 2e-5;
+constexpr double kMaxShadingSigma = 2e-3;    // of one measurement
 constexpr size_t kMaxMeasured = 8;           // roundels of a frame
 constexpr double kMemory = 0.2;              // weight of a new frame
 
 /// Edge displacement in blurs for each unit of curvature: with s = Phi(x), the least squares fit of the shift
 /// of an edge to s (1 - s), which is the integral of s (1 - s) ds over that of phi(x)^2 dx.
-const double kShift = (1 / 6.0) / (0.5 / std::sqrt(3.14159265358979));
+const double kShift = (1 / 6.0) / (0.5 / std::sqrt(std::numbers::pi));
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255.
@@ -49,7 +53,7 @@ T& median_by(std::vector<T>& values, const Key& key) {
 
 }  // namespace
 
-CameraResponse::CameraResponse() { set_exponent(0); }
+CameraResponse::CameraResponse() : shading_(square(kFirstShading)) { set_exponent(0); }
 
 double CameraResponse::exponent() const { return std::exp(log_exponent_); }
 
@@ -64,7 +68,7 @@ ImageView CameraResponse::linearize(const ImageView& image) {
 }
 
 bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits) {
-    learn_edge_noise(fits);
+    learn_edge_noise(fits), learn_shading(fits);
     std::vector<ToneEstimate> measured;
     const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
     for (size_t k = 0; k < fits.size(); k += step)
@@ -94,6 +98,19 @@ void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits
     for (const RoundelFit* fit : fits) residuals.push_back(fit->edge_residual);
     const double median = median_by(residuals, [](double residual) { return residual; });
     edge_noise_ = edge_noise_ > 0 ? edge_noise_ + kMemory * (median - edge_noise_) : median;
+}
+
+/// The measured gradients contain the noise of their measurement. The squared length of a gradient with
+/// independent components has the median 2 ln 2 variances.
+void CameraResponse::learn_shading(const std::vector<const RoundelFit*>& fits) {
+    std::vector<double> excess;
+    for (const RoundelFit* fit : fits)
+        if (fit->shading.variance > 0 && fit->shading.variance < square(kMaxShadingSigma))
+            excess.push_back(fit->shading.squared / (2 * std::numbers::ln2) - fit->shading.variance);
+    if (excess.empty()) return;
+    const double variance = median_by(excess, [](double value) { return value; });
+    const double gain = knows_shading_ ? kMemory : 1;
+    shading_ += gain * (std::max(variance, square(kLeastShading)) - shading_), knows_shading_ = true;
 }
 
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames, are

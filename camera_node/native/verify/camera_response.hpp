@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <array>
+#include <cmath>
 #include <cstdint>
 #include <optional>
 #include <vector>
@@ -27,6 +28,8 @@ class CameraResponse {
     double exponent() const;
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
     double edge_noise() const { return edge_noise_; }
+    /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
+    double shading_sigma() const { return std::sqrt(shading_); }
 
   private:
     /// The logarithm of an exponent and its standard deviation.
@@ -35,6 +38,7 @@ class CameraResponse {
     };
     std::optional<ToneEstimate> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
+    void learn_shading(const std::vector<const RoundelFit*>& fits);
     bool learn_tone(std::vector<ToneEstimate> measured);
     void set_exponent(double log_exponent);
 
@@ -42,6 +46,8 @@ class CameraResponse {
     double mean_ = 0;          // of the measured ones
     double sigma_ = 0;         // of the mean; 0 before the first measurement
     double edge_noise_ = 0;
+    double shading_;  // variance
+    bool knows_shading_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;
 };
