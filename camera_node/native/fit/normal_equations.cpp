@@ -159,8 +159,9 @@ ROUNDEL_CLONES void add_shading(const Gradient* chunks, int lanes, Edge edge, co
             }
             const auto multiply = [&](const Lanes* column, Lanes& sum_x, Lanes& sum_y)
                                       __attribute__((always_inline)) {
-                for (int k = 0; k < count; ++k) sum_x += wx[k] * column[k], sum_y += wy[k] * column[k];
-            };
+                                          for (int k = 0; k < count; ++k)
+                                              sum_x += wx[k] * column[k], sum_y += wy[k] * column[k];
+                                      };
             for (const int i : kBy<e>) multiply(chunks->by[i], sums[0].by[i], sums[1].by[i]);
             multiply(chunks->residual, sums[0].residual, sums[1].residual);
         }

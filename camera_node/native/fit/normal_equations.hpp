@@ -22,8 +22,8 @@ struct ResidualSums {
 /// Tukey's biweight is (1 - (r / c)^2)^2 for |r| < c = 6 scales and 0 beyond.
 constexpr float kTukey = 6;
 
-/// Products of the two columns of linear shading, level x and level y, with those of the parameters, with each
-/// other and with the residuals; x and y in the pixels' frame.
+/// Products of the two columns of linear shading, level x and level y, with those of the parameters, with
+/// each other and with the residuals; x and y in the pixels' frame.
 struct ShadingProducts {
     std::array<Parameters, 2> parameters{};
     Symmetric own{};

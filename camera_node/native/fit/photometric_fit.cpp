@@ -39,12 +39,27 @@ constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kPrintSigma = 0.002;                // of the ratios of prints of one kind
 constexpr double kMaxPrintError = 3;                 // standard deviations
-constexpr SanityLimits kLimits{.shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .overflow = 64};
+constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
+constexpr float kPlateau = 235;        // level that compression leaves of clipped paper
+constexpr SanityLimits kLimits{
+    .shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .underflow = 64, .overflow = 600};
+
+/// Sets bright pixels to the scale's end if many are there, since compression scatters the levels of clipped
+/// paper; returns whether it did.
+bool restore_clipped(EdgePixels& pixels) {
+    float* const end = pixels.level + pixels.count;
+    const auto clipped = std::count_if(pixels.level, end, [](float level) { return level > kSaturated; });
+    if (double(clipped) < kClippedShare * pixels.used) return false;
+    std::replace_if(pixels.level, end, [](float level) { return level > kPlateau; }, 255.0f);
+    return true;
+}
 
 class PhotometricFitter : GaussNewton<kCount> {
   public:
     PhotometricFitter(const ImageView& image, const InitialGuess& guess)
-        : image_(image), occlusion_(guess.occlusion), resumed_(guess.model.has_value()),
+        : image_(image),
+          occlusion_(guess.occlusion),
+          resumed_(guess.model.has_value()),
           shading_sigma_(guess.shading_sigma) {
         pixels_.origin_x = int(std::lround(guess.outer.x));
         pixels_.origin_y = int(std::lround(guess.outer.y));
@@ -87,6 +102,7 @@ class PhotometricFitter : GaussNewton<kCount> {
         if (occlusion_.any()) band.separate = 0;
         select_pixels(image_, p_, band, limit, pixels_);
         if (occlusion_.any()) remove_occluded(occlusion_, start_, pixels_);
+        clipped_ = restore_clipped(pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
@@ -181,11 +197,11 @@ class PhotometricFitter : GaussNewton<kCount> {
     GaussNewtonSystem<kCount> system_;
     ResidualSums sums_;
     Parameters linearized_at_{};
-    PoseCovariance shading_effect_{};  // on the covariance, in units of the noise
+    PoseCovariance shading_effect_{};    // on the covariance, in units of the noise
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
     double print_ratio_ = 0;             // that the estimate is conditioned on; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
-    bool resumed_;
+    bool resumed_, clipped_ = false;
     double shading_sigma_;
     Shading shading_;
 };
@@ -257,7 +273,8 @@ void PhotometricFitter::allow_shading() {
 PoseCovariance PhotometricFitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
-        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] += shading_effect_[i][j] - print_effect_[i] * print_effect_[j];
+        for (int j = 0; j < kPoseCount; ++j)
+            inverse[i][j] += shading_effect_[i][j] - print_effect_[i] * print_effect_[j];
     return scaled(inverse, square(noise_));
 }
 
@@ -266,7 +283,7 @@ RoundelFit PhotometricFitter::fit() const {
     if (print_ratio_ > 0) fit.p[kRatio] = print_ratio_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
-    fit.noise = scale_, fit.shading = shading_;
+    fit.noise = scale_, fit.shading = shading_, fit.clipped = clipped_;
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;
 }

@@ -32,8 +32,8 @@ inline PoseCovariance scaled(PoseCovariance covariance, double factor) {
     return covariance;
 }
 
-/// The linear change of the light across a roundel that the pixels alone show: the squared length of the relative
-/// gradient and the variance of each of its components, per square pixel.
+/// The linear change of the light across a roundel that the pixels alone show: the squared length of the
+/// relative gradient and the variance of each of its components, per square pixel.
 struct Shading {
     double squared = 0, variance = 0;
 };
@@ -54,6 +54,7 @@ struct RoundelFit {
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
     Shading shading{};
+    bool clipped = false;  // the paper is brighter than the camera can show
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {

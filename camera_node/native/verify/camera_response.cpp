@@ -9,21 +9,21 @@ namespace roundel {
 
 namespace {
 
-constexpr double kPrintSigma = 0.002;        // of a print's ratio
-constexpr double kMinDiameter = 12;          // pixels: ratio and blur of smaller roundels are correlated
+constexpr double kPrintSigma = 0.002;             // of a print's ratio
+constexpr double kMinDiameter = 12;               // pixels: ratio and blur of smaller roundels are correlated
 constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
-constexpr double kMaxCurvature = 1.4;        // of a tone curve between ink and paper
-constexpr double kMaxLogExponent = 1.2;      // 3.3
-constexpr int kHalvings = 16;                // of the interval of exponents
-constexpr double kMinTone = 0.1;             // logarithm of an exponent: smaller ones count as linear
-constexpr double kMaxLinear = 0.1;           // logarithm, up to which a measurement is exact to a hundredth
-constexpr double kMinChange = 0.02;          // of the logarithm
-constexpr double kMaxSigma = 0.15;           // of the logarithm, from which it is used
-constexpr double kFirstShading = 2e-4;       // per pixel: a tenth across half of a picture
+constexpr double kMaxCurvature = 1.4;             // of a tone curve between ink and paper
+constexpr double kMaxLogExponent = 1.2;           // 3.3
+constexpr int kHalvings = 16;                     // of the interval of exponents
+constexpr double kMinTone = 0.1;                  // logarithm of an exponent: smaller ones count as linear
+constexpr double kMaxLinear = 0.1;      // logarithm, up to which a measurement is exact to a hundredth
+constexpr double kMinChange = 0.02;     // of the logarithm
+constexpr double kMaxSigma = 0.15;      // of the logarithm, from which it is used
+constexpr double kFirstShading = 2e-4;  // per pixel: a tenth across half of a picture
 constexpr double kLeastShading = 2e-5;
-constexpr double kMaxShadingSigma = 2e-3;    // of one measurement
-constexpr size_t kMaxMeasured = 8;           // roundels of a frame
-constexpr double kMemory = 0.2;              // weight of a new frame
+constexpr double kMaxShadingSigma = 2e-3;  // of one measurement
+constexpr size_t kMaxMeasured = 8;         // roundels of a frame
+constexpr double kMemory = 0.2;            // weight of a new frame
 
 /// Edge displacement in blurs for each unit of curvature: with s = Phi(x), the least squares fit of the shift
 /// of an edge to s (1 - s), which is the integral of s (1 - s) ds over that of phi(x)^2 dx.
@@ -113,15 +113,14 @@ void CameraResponse::learn_shading(const std::vector<const RoundelFit*>& fits) {
     shading_ += gain * (std::max(variance, square(kLeastShading)) - shading_), knows_shading_ = true;
 }
 
-/// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames, are
-/// as certain as the best roundel.
+/// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
+/// are as certain as the best roundel.
 bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
     const double middle =
         median_by(measured, [](const ToneEstimate& e) { return e.log_exponent; }).log_exponent;
-    const double sigma =
-        std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
-            return a.sigma < b.sigma;
-        })->sigma;
+    const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
+                             return a.sigma < b.sigma;
+                         })->sigma;
     const double gain = sigma_ == 0 ? 1 : kMemory;
     mean_ += gain * (middle - mean_), sigma_ += gain * (sigma - sigma_);
     const double change = std::abs(mean_ - log_exponent_);
