@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from camera_node.arrays import Array, Grey
-from camera_node.errors import ConfigError
+from camera_node.simulation.background import Picture
 
 WHITE = 255.0
 GAMMA = 1 / 2.2
@@ -72,8 +72,10 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if self.denoise_px:
             image = self._denoise(image)
         if self.sharpen:
-            image += np.float32(self.sharpen) * (image - cv2.GaussianBlur(image, (0, 0), SHARPEN_PX))
-        return _compress(tone_curve(self.tone)[np.clip(np.rint(image), 0, WHITE).astype(np.uint8)], self.jpeg)
+            blurred = np.asarray(cv2.GaussianBlur(image, (0, 0), SHARPEN_PX), np.float32)
+            image = image + np.float32(self.sharpen) * (image - blurred)
+        linear = np.clip(np.rint(image), 0, WHITE).astype(np.uint8)
+        return _compress(tone_curve(self.tone)[linear], self.jpeg)
 
     def variance(self, level: Array) -> Array:
         """Variance of the noise at grey levels before the tone curve."""
@@ -85,9 +87,9 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         corner = (u**2 + v[:, None] ** 2) / 2
         return (1 - self.vignetting * corner) * (1 + self.shading / 2 * u)
 
-    def _denoise(self, image: Array) -> Array:
+    def _denoise(self, image: Picture) -> Picture:
         edges = DENOISE_LEVELS * float(np.sqrt(self.variance(np.array(WHITE / 2))))
-        return cv2.bilateralFilter(image, -1, edges, self.denoise_px)
+        return np.asarray(cv2.bilateralFilter(image, -1, edges, self.denoise_px), np.float32)
 
 
 CLEAN = Sensor(noise=3.0)
@@ -106,17 +108,6 @@ HARSH = Sensor(
 SENSORS = {"clean": CLEAN, "mild": MILD, "harsh": HARSH}
 
 
-def sensor_named(name: str) -> Sensor:
-    """One of `SENSORS`.
-
-    Raises:
-        ConfigError: there is no such sensor.
-    """
-    if name not in SENSORS:
-        raise ConfigError(f"there is no sensor '{name}'; choose from {', '.join(SENSORS)}")
-    return SENSORS[name]
-
-
 def tone_curve(tone: Tone) -> Grey:
     """(256,) received level of each linear level; 0 stays 0 and 255 stays 255."""
     share = np.arange(256) / WHITE
@@ -126,18 +117,19 @@ def tone_curve(tone: Tone) -> Grey:
     return np.rint(WHITE * encoded).astype(np.uint8)
 
 
-def _through_mosaic(image: Array) -> Array:
+def _through_mosaic(image: Picture) -> Picture:
     """A neutral picture through a Bayer mosaic, its white balance, interpolation and the conversion to grey."""
     h, w = image.shape
     red, green, blue = DAYLIGHT
-    transmitted = np.tile(np.float32([[red, green], [green, blue]]), (h // 2 + 1, w // 2 + 1))[:h, :w]
-    raw = np.clip(np.rint(image * transmitted), 0, WHITE).astype(np.uint8)
-    colours = cv2.cvtColor(raw, cv2.COLOR_BayerBG2BGR).astype(np.float32) / np.float32([blue, green, red])
-    return cv2.cvtColor(np.minimum(colours, np.float32(WHITE)), cv2.COLOR_BGR2GRAY)
+    cell = np.array([[red, green], [green, blue]], np.float32)
+    raw = np.clip(np.rint(image * np.tile(cell, (h // 2 + 1, w // 2 + 1))[:h, :w]), 0, WHITE).astype(np.uint8)
+    colours = cv2.cvtColor(raw, cv2.COLOR_BayerBG2BGR) / np.array([blue, green, red], np.float32)
+    balanced = np.minimum(colours, WHITE).astype(np.float32)
+    return np.asarray(cv2.cvtColor(balanced, cv2.COLOR_BGR2GRAY), np.float32)
 
 
 def _compress(image: Grey, quality: int | None) -> Grey:
     if quality is None:
         return image
     coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)

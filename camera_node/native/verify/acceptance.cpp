@@ -14,8 +14,8 @@ namespace {
 
 constexpr double kTiny = 11;               // pixels: blur and ratio of smaller ones are correlated, so the
 constexpr double kMaxRatioSigma = 0.04;    // tolerance grows by two standard deviations of at most this size
-constexpr double kUnderflow = 30;          // grey levels by which a blurred ring's ink may be below 0,
-constexpr double kOverflow = 500;          // and clipped paper above 255
+constexpr double kUnderflow = 30;          // grey levels that a blurred ring's levels may be out of range,
+constexpr double kOverflow = 500;          // and those of clipped paper
 constexpr double kMisfit = 0.045;          // of the contrast: RMS residual on the ring's edges
 constexpr double kRaggedMisfit = 0.062;    // the same for smoothed edges
 constexpr double kMaxGrowth = 2.5;         // factor of the misfit allowed for the largest roundels, and
@@ -113,7 +113,7 @@ void claim_misfit(RoundelFit& fit, double noise) {
 
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
     return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
-           fit.bright < 255 + kOverflow && fit.outer.major >= limits.min_diameter &&
+           fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) && fit.outer.major >= limits.min_diameter &&
            fit.outer.major <= limits.max_diameter;
 }
 

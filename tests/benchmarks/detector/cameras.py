@@ -149,7 +149,7 @@ def errors(known: Detector, sensor: Sensor, band: tuple[int, int], frames: int) 
         for card in shown:
             off = np.linalg.norm(found.uv - card.uv, axis=1)
             if off.min(initial=np.inf) < 0.2 * card.diameter:
-                rows.append(_errors(found[int(off.argmin())], sight_of(card, SIZE[::-1])))
+                rows.append(_errors(found[int(off.argmin())], sight_of(card, (SIZE[1], SIZE[0]))))
     if len(rows) < 2:
         return Errors(len(rows) / there, *[np.nan] * 4)
     centre, size, bias = np.array(rows).T
