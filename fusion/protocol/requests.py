@@ -9,9 +9,10 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
+from camera_node.protocol.session import reply_of_server
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key, undo_key
+from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key, undo_key
 
 REQUEST_S = 5.0  # the timeout of a request
 RETRY_S = 0.1
@@ -29,7 +30,19 @@ def change_robots(
         FusionError: the server refuses the request; the message is the server's.
         NetworkError: no server answers in time.
     """
-    data = _request(session, arena, robots_key(arena), encode(request), timeout_s)
+    return _robots_of(_request(session, arena, set_robots_key(arena), encode(request), timeout_s))
+
+
+def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> dict[str, Robot]:
+    """All robots that the server tracks.
+
+    Raises:
+        NetworkError: no server answers in time.
+    """
+    return _robots_of(_request(session, arena, robots_key(arena), b"", timeout_s))
+
+
+def _robots_of(data: bytes) -> dict[str, Robot]:
     try:
         return decode(data, Robots).robots
     except MessageError as error:
@@ -56,7 +69,8 @@ def undo_correction(session: zenoh.Session, arena: str, timeout_s: float = REQUE
 def _request(session: zenoh.Session, arena: str, key: str, payload: bytes, timeout_s: float) -> bytes:
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
-        for reply in session.get(key, payload=payload, timeout=left):
+        replies = session.get(key, payload=payload, consolidation=zenoh.ConsolidationMode.NONE, timeout=left)
+        if reply := reply_of_server(session, replies):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             raise FusionError(reply.err.payload.to_string() if reply.err else "the server refused")

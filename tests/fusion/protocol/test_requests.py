@@ -14,7 +14,7 @@ from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
 from fusion.errors import FusionError
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key
+from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.server.active_rig import ActiveRig
 from fusion.server.persistence import PersistedFile
 from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
@@ -42,10 +42,11 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
         until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
         assert set(robots_of(request_reply(client, key)[0]).robots) == {"a"}
         request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
-        assert list(robots_of(request_reply(client, key, encode(request))[0]).robots) == ["rover", "wide"]
+        change = set_robots_key("test")
+        assert list(robots_of(request_reply(client, change, encode(request))[0]).robots) == ["rover", "wide"]
         assert server.pipeline.tracker is not None
         assert server.pipeline.tracker.table.status == ["tracked", None]
-        reply, _ = request_reply(client, key, json.dumps({"remove": ["wide"]}).encode())
+        reply, _ = request_reply(client, change, json.dumps({"remove": ["wide"]}).encode())
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == ["rover"]
 
@@ -61,10 +62,20 @@ def test_an_invalid_change_of_robots_changes_nothing(tmp_path):
     }
     with serving(config(tmp_path)) as (server, client):
         for payload, said in faults.items():
-            reply, error = request_reply(client, robots_key("test"), payload)
+            reply, error = request_reply(client, set_robots_key("test"), payload)
             assert reply is None
             assert said in error
         assert list(server.pipeline.robots) == ["a"]
+
+
+def test_the_key_for_reading_robots_changes_none(tmp_path):
+    """Access rights by key depend on this."""
+    with serving(config(tmp_path)) as (server, client):
+        reply, error = request_reply(client, robots_key("test"), b'{"remove": ["a"]}')
+        assert (reply, error) == (None, "send changes of robots to test/robots/set")
+        reply, _ = request_reply(client, robots_key("test"), b"{}")
+        assert reply is not None
+        assert list(json.loads(reply)["robots"]) == list(server.pipeline.robots) == ["a"]
 
 
 def test_undo_fails_without_a_correction_and_restores_a_corrected_camera(tmp_path):
@@ -118,7 +129,8 @@ def test_changed_robots_are_used_after_a_restart(tmp_path):
         with serving(settings) as (server, client):
             assert set(server.pipeline.robots) == before
             assert (
-                set(robots_of(request_reply(client, robots_key("test"), encode(request))[0]).robots) == after
+                set(robots_of(request_reply(client, set_robots_key("test"), encode(request))[0]).robots)
+                == after
             )
         before = after
     with serving(settings) as (server, _):
