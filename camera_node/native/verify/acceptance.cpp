@@ -113,8 +113,8 @@ void claim_misfit(RoundelFit& fit, double noise) {
 
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
     return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
-           fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) && fit.outer.major >= limits.min_diameter &&
-           fit.outer.major <= limits.max_diameter;
+           fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) &&
+           fit.outer.major >= limits.min_diameter && fit.outer.major <= limits.max_diameter;
 }
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
