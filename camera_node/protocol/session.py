@@ -21,6 +21,12 @@ SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
+ALWAYS = {
+    "mode": "router",
+    "transport/link/tx/lease": LEASE_MS,
+    # It maps 16 MB for each program that sends, bypasses access rights of the network, and a killed program leaves it.
+    "transport/shared_memory/enabled": False,
+}
 SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
 
 
@@ -134,7 +140,7 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
             config.insert_json5(key, "false")
     if config.get_json("scouting/delay") == "null":
         config.insert_json5("scouting/delay", "0")  # otherwise opening waits for scouting
-    for key, value in {"mode": "router", "transport/link/tx/lease": LEASE_MS, **options}.items():
+    for key, value in {**ALWAYS, **options}.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
