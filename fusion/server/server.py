@@ -34,6 +34,7 @@ from fusion.protocol.messages import (
     undo_key,
 )
 from fusion.protocol.shards import Shard
+from fusion.server.audit import AuditLog
 from fusion.server.config import ArenaConfig
 from fusion.server.ingest import MAX_AGE_NS, Ingest
 from fusion.server.pipeline import TrackingPipeline
@@ -116,14 +117,19 @@ class Server:
         transport.subscribe(keys.detections(), self._receive_detections)
         transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
-        transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
+        audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
+        transport.answer_on_server_thread(
+            set_robots_key(keys.arena), audit.audited("change of robots", self._change_robots)
+        )
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
         if isinstance(self.clock, ServerClock):
             transport.answer(keys.clock, partial(self._answer_clock, self.clock))
         if self.shard.leads:
             transport.answer(keys.rig, self._answer_rig)
-            transport.answer_on_server_thread(undo_key(keys.arena), self._undo_correction)
+            transport.answer_on_server_thread(
+                undo_key(keys.arena), audit.audited("undo of the rig", self._undo_correction)
+            )
             transport.declare_alive(keys.fusion_alive)
 
     # The steps of the loop.
