@@ -75,8 +75,7 @@ class Ingest:
             return self._refuse("wrong image size")
         if not self._is_new(message):
             return self._refuse("duplicate frame")
-        frame = CalibratedFrame.of(message, camera, received_ns)
-        return replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+        return sanitized(CalibratedFrame.of(message, camera, received_ns))
 
     def _refuse(self, reason: str) -> None:
         self._statistics.count_fault(reason)
@@ -103,6 +102,11 @@ class Ingest:
         has_two_publishers = sum(history.steps_back) >= MIN_STEPS_BACK
         self._statistics.note_publishers(message.camera, has_two_publishers)
         return True
+
+
+def sanitized(frame: CalibratedFrame) -> CalibratedFrame:
+    """The frame with the parts that are used."""
+    return replace(frame, roundels=_with_plausible_outlines(frame.roundels))
 
 
 def _with_plausible_outlines(roundels: Roundels) -> Roundels:

@@ -164,6 +164,7 @@ class Server:
         published = {pose.robot for pose in update.poses.values()}
         self._publisher.publish_poses([p for p in result.poses if p.robot not in published], latency)
         self._publisher.publish_markers(result.markers)
+        self._publisher.publish_frames(frame_set)
         for correction in tracker.check_extrinsics(frame_set, result):
             self._report_correction(correction)
         states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
@@ -186,6 +187,7 @@ class Server:
         if not self.statistics.is_due(now_ns):
             return None
         pipeline = PipelineStatus(
+            limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
