@@ -133,19 +133,24 @@ class PageAccess:
             tokens = None if is_loopback(host) and not origins else Tokens.random()
         return cls(host, port, tokens, frozenset(origins))
 
-    def url(self, role: Role = "operator") -> str:
-        """An address of the page for a role, with its token."""
+    @property
+    def address(self) -> str:
+        """The page's address, without a token."""
         host = socket.gethostname() if self.host in ("", "0.0.0.0", "::") else self.host
-        base = f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
-        return f"{base}/?token={getattr(self.tokens, role)}" if self.tokens else base
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    def url(self, role: Role) -> str:
+        """An address of the page that gives a role."""
+        return f"{self.address}/?token={getattr(self.tokens, role)}"
 
     def instructions(self, tokens_file: Path | None = None) -> list[str]:
         """Lines that tell a user what to open; they name the file of the tokens instead of its tokens."""
         if self.tokens is None:
-            return [f"open {self.url()} in a browser; Ctrl-C ends"]
+            return [f"open {self.address} in a browser; Ctrl-C ends"]
         if tokens_file is not None:
-            url = self.url().partition("=")[0]
-            return [f"open {url}=TOKEN in a browser, with a token of {tokens_file}; Ctrl-C ends"]
+            return [
+                f"open {self.address}/?token=TOKEN in a browser, with a token of {tokens_file}; Ctrl-C ends"
+            ]
         return [
             f"operator: open {self.url('operator')} in a browser; Ctrl-C ends",
             f"viewer, who can't change anything: open {self.url('viewer')}",

@@ -18,9 +18,12 @@ from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
 from camera_node.protocol.session import listening_endpoints
+from camera_node.service import ServiceManager
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.protocol.health import describe_status
 from fusion.protocol.messages import (
+    FusionStatus,
     Robots,
     RobotsRequest,
     ShardPoses,
@@ -94,7 +97,8 @@ class Server:
 
     def run(self) -> None:
         """Serve: receive, synchronize, track and publish, report the status."""
-        with collecting_between_frame_sets() as collect_garbage:
+        with ServiceManager() as service, collecting_between_frame_sets() as collect_garbage:
+            service.ready()
             while not self._stopped.is_set():
                 is_backlogged = self.transport.receive(TICK_S)
                 now_ns = self.clock.now_ns()
@@ -102,8 +106,10 @@ class Server:
                     self._track(frame_set)
                 if not is_backlogged:
                     self.pipeline.associate_early()
-                if self._report_status(now_ns):
+                if status := self._report_status(now_ns):
+                    service.report(describe_status(status))
                     collect_garbage()
+                service.progress()
 
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
@@ -169,18 +175,19 @@ class Server:
             "camera %s is recalibrated and used again; a query on %s undoes that", correction.name, undo
         )
 
-    def _report_status(self, now_ns: int) -> bool:
-        """Publish the status once a second; return whether it was due."""
+    def _report_status(self, now_ns: int) -> FusionStatus | None:
+        """Publish the status once a second; return it if it was due."""
         if not self.statistics.is_due(now_ns):
-            return False
+            return None
         pipeline = PipelineStatus(
             calibrated=frozenset(self.pipeline.cameras),
             late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
-        self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
-        return True
+        status = self.statistics.report(now_ns, pipeline)
+        self._publisher.publish_status(status)
+        return status
 
     # Received messages.
 

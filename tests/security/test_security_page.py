@@ -87,7 +87,9 @@ def test_the_page_requires_a_token_of_the_file(tmp_path: Path):
     (command,) = commands("The page")
     port = free_port()
     page = subprocess.Popen(
-        [sys.executable, *shlex.split(command)[1:], "--port", str(port)], cwd=tmp_path, stdout=subprocess.DEVNULL
+        [sys.executable, *shlex.split(command)[1:], "--port", str(port)],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
     )
     with contextlib.ExitStack() as closing:
         closing.callback(page.wait, 30)

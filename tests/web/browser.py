@@ -61,7 +61,7 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
         page = browser.new_page(viewport={"width": 1000, "height": 700})
         page.on("console", record)
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(url or view.access.url())
+        page.goto(url or view.access.address)
         yield page
         browser.close()
     assert not errors
