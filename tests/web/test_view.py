@@ -110,8 +110,8 @@ def test_drawing_follows_a_changing_arena(arena: LiveArena, feed: Feed):
     for count in (3, 1, 5):
         send_state(arena)
         arena.markers([(float(k), 0.0, 0.0) for k in range(count)])
-        arena.pose(f"robot {count}", (0.0, 0.0, 0.0), "lost")
-        wait_for(lambda count=count: f"robot {count}" in feed.state().poses)
+        arena.pose(f"robot_{count}", (0.0, 0.0, 0.0), "lost")
+        wait_for(lambda count=count: f"robot_{count}" in feed.state().poses)
         view.update()
     wait_for(lambda: feed.state().rig, arena.status)
     view.update()
