@@ -10,7 +10,15 @@ import tyro
 from camera_node.errors import check_command, run
 from fusion.commands.serve import Serve
 
-COMMANDS = ("run", "replay", "record", "define", "undo", "ros2")  # modules of fusion.commands
+COMMANDS = {  # and their modules in fusion.commands
+    "run": "run",
+    "replay": "replay",
+    "record": "record",
+    "define": "define",
+    "undo": "undo",
+    "redo": "undo",
+    "ros2": "ros2",
+}
 
 
 def main() -> None:
@@ -20,12 +28,12 @@ def main() -> None:
 
 
 def _program() -> int:
-    check_command(sys.argv[1:], COMMANDS)
+    check_command(sys.argv[1:], tuple(COMMANDS))
     name, *arguments = sys.argv[1:] or [""]
     if name not in COMMANDS:
         return tyro.cli(Serve, prog="fusion").run()
     # imported on demand: a robot's computer has neither GTSAM nor SciPy
-    command = getattr(import_module(f"fusion.commands.{name}"), name)
+    command = getattr(import_module(f"fusion.commands.{COMMANDS[name]}"), name)
     return tyro.cli(command, prog=f"fusion {name}", args=arguments)
 
 

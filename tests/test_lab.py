@@ -21,14 +21,15 @@ import zenoh
 import camera_node.__main__ as camera_program
 import fusion.__main__ as fusion_program
 import web.__main__ as web_program
-from calib.live.collect import publish_rig
-from calib.rig.rig import Rig
+from calib.live.rig_requests import set_rig
+from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Detections, Keys, Roundels, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena
 from fusion.protocol.messages import FusionStatus
 from tests.conftest import ROOT
 from tests.waiting import DEADLINE_S, Inbox, wait_for
+from tests.web.arena import four_cameras
 
 KEYS = Keys("arena")
 ROLES = ("camera", "viewer", "operator")
@@ -144,9 +145,12 @@ def test_a_viewer_may_receive_all_and_change_nothing(lab: Lab):
     assert b"robot_b" not in ask(operator, "arena/robots/set", robots)[0]
 
 
-def test_the_operator_may_publish_a_rig(lab: Lab):
-    operator = lab.session("operator")
-    assert publish_rig(operator, "arena", Rig(cameras={}))
+def test_only_the_operator_may_change_the_rig(lab: Lab):
+    """A camera and a viewer find no server that answers."""
+    for role in ("camera", "viewer"):
+        with pytest.raises(NetworkError, match="no server answers"):
+            set_rig(lab.session(role), "arena", four_cameras(), "test", timeout_s=0.5)
+    assert set_rig(lab.session("operator"), "arena", four_cameras(), "test").rig == four_cameras()
 
 
 @pytest.mark.parametrize("stranger", ["without a certificate", "of another authority"])

@@ -16,7 +16,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
-from calib.rig.history import back_up
+from calib.rig.history import History
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
@@ -102,7 +102,7 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
                 writer.put(keys.detections(message.camera), encode(message), message.t_ns)
         with part.open("rb+") as file:
             os.fsync(file.fileno())
-        backup = back_up(path)
+        backup = History(path).back_up()
         os.replace(part, path)
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}") from None

@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from calib.errors import CalibrationError
+from calib.rig.bounds import check_cameras, check_figures
 from calib.rig.camera import Camera
-from calib.rig.history import back_up
+from calib.rig.history import History
 from camera_node.config import dump_yaml, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 
@@ -21,6 +22,14 @@ class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     cameras: dict[str, Camera]
     calibration: dict[str, Any] = {}
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError unless all values are plausible (`calib.rig.bounds`)."""
+        check_cameras(self.cameras)
+        check_figures(self.calibration)
 
     def placed(self) -> dict[str, Camera]:
         """The cameras with a pose."""
@@ -77,15 +86,15 @@ def save_rig(rig: Rig, path: Path) -> Path | None:
         the backup of the previous file at `path`, if there was one (`calib undo` restores it).
 
     Raises:
+        CalibrationError: a value is not plausible, so that the file could not be read.
         ConfigError: the folder can't be written to.
     """
-    backup = back_up(path)
     try:
-        write_atomically(path, dump_rig(rig))
-    except BaseException:
-        if backup:
-            backup.unlink()
-        raise
+        rig.check()  # msgspec.structs.replace does not check in all versions of msgspec
+    except ValueError as error:
+        raise CalibrationError(f"{path} is not written: {error}") from None
+    backup = History(path).back_up()
+    write_atomically(path, dump_rig(rig))
     return backup
 
 

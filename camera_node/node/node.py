@@ -151,7 +151,7 @@ class Node:
         listener = publisher.declare_matching_listener(
             lambda status: matched.set() if status.matching else None
         )
-        if not publisher.matching_status and not matched.wait(LISTENER_S):
+        if not publisher.matching_status.matching and not matched.wait(LISTENER_S):
             log.warning(
                 "no subscriber of %s after %g s; starting the recording anyway", self.name, LISTENER_S
             )

@@ -45,7 +45,7 @@ class ArenaRecording:
             elif key.endswith("/pose"):
                 self.poses.append(decode(data, RobotPose))
             elif key.endswith("/rig") and self.rig is None:
-                self.rig = decode(data, RigMessage).rig()
+                self.rig = decode(data, RigMessage).rig
             elif key.endswith("/robots"):
                 self.robots = decode(data, Robots).robots
         except MessageError:

@@ -14,14 +14,29 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import zenoh
 
-from calib.rig.messages import RigMessage
+from calib.rig.messages import (
+    RigMessage,
+    RigRequest,
+    RigStepRequest,
+    redo_rig_key,
+    set_rig_key,
+    undo_rig_key,
+)
 from camera_node.protocol.host_clock import clock_id
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
-from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
+from camera_node.protocol.requests import (
+    RequestError,
+    RequestSource,
+    encode_reply,
+    parse_request,
+    payload_of,
+)
 from camera_node.protocol.session import listening_endpoints
+from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import (
+    FusionStatus,
     Robots,
     RobotsRequest,
     ShardPoses,
@@ -29,7 +44,6 @@ from fusion.protocol.messages import (
     robots_key,
     set_robots_key,
     shard_key,
-    undo_key,
 )
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
@@ -110,7 +124,6 @@ class Server:
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
         transport.subscribe(keys.detections(), self._receive_detections)
-        transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
         transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
         if self.shard.count > 1:
@@ -118,8 +131,13 @@ class Server:
         if self.shard.leads:
             transport.answer(keys.clock, self._answer_clock)
             transport.answer(keys.rig, self._answer_rig)
-            transport.answer_on_server_thread(undo_key(keys.arena), self._undo_correction)
+            transport.answer_on_server_thread(set_rig_key(keys.arena), self._set_rig)
+            transport.answer_on_server_thread(undo_rig_key(keys.arena), self._undo_rig)
+            transport.answer_on_server_thread(redo_rig_key(keys.arena), self._redo_rig)
             transport.declare_alive(keys.fusion_alive)
+        else:
+            transport.subscribe(keys.rig, self._follow_rig)
+            transport.subscribe(keys.fusion_status, self._request_new_rig)
 
     # The steps of the loop.
 
@@ -173,12 +191,15 @@ class Server:
         if correction.camera is None:
             log.warning("camera %s was moved: excluded until robots show its new pose", correction.name)
             return
-        self.pipeline.correct_rig(correction)
-        self._publisher.publish_rig(self.pipeline.active_rig.message())
-        undo = undo_key(self.keys.arena)
+        self.pipeline.correct_rig(correction, self._now_ns)
+        self._publish_rig()
         log.warning(
-            "camera %s is recalibrated and used again; a query on %s undoes that", correction.name, undo
+            "camera %s is recalibrated and used again; python -m fusion undo reverts that", correction.name
         )
+
+    def _publish_rig(self) -> None:
+        if self.pipeline.active_rig.message is not None:
+            self._publisher.publish_rig(self.pipeline.active_rig.message)
 
     def _report_status(self, now_ns: int) -> bool:
         """Publish the status once a second; return whether it was due."""
@@ -188,6 +209,7 @@ class Server:
             calibrated=frozenset(self.pipeline.cameras),
             late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
         self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
@@ -201,15 +223,20 @@ class Server:
             is_on_time = self.pipeline.synchronizer.add(frame)
             self.statistics.note_lateness(frame.camera, is_on_time, (time.time_ns() - frame.t_ns) * 1e-6)
 
-    def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:
+    def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
+        """Use the rig of the leading shard."""
         try:
-            rig = decode(data, RigMessage).rig()
-        except MessageError as error:
-            self.statistics.count_fault("undecodable rig")
-            log.warning("a published rig is refused, the active one stays: %s", error)
-            return
-        if rig != self.pipeline.active_rig.rig:  # neither our own nor a duplicate
-            self.pipeline.replace_rig(rig)
+            self.pipeline.follow_rig(decode(data, RigMessage))
+        except (MessageError, FusionError) as error:
+            self.statistics.count_fault("unusable rig")
+            log.warning("the rig of the first shard is not used: %s", error)
+
+    def _request_new_rig(self, data: bytes, key: str, received_ns: int) -> None:
+        """Request the rig of the leading shard if its status tells that it is another one."""
+        with contextlib.suppress(MessageError):
+            active, t_ns = self.pipeline.active_rig.message, decode(data, FusionStatus).rig_t_ns
+            if t_ns is not None and (active is None or active.t_ns != t_ns):
+                self.transport.request(self.keys.rig, self._follow_rig)
 
     def _receive_shard(self, data: bytes, key: str, received_ns: int) -> None:
         """Receive the poses of another shard's robots."""
@@ -231,15 +258,31 @@ class Server:
         query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns(), clock=clock_id())))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
-        if self.pipeline.active_rig.rig is not None:
-            query.reply(self.keys.rig, encode(self.pipeline.active_rig.message()))
+        if (message := self.pipeline.active_rig.message) is not None:
+            query.reply(self.keys.rig, encode(message))
 
-    def _undo_correction(self, _: zenoh.Query) -> bytes:
-        name = self.pipeline.undo_correction()
-        log.warning("camera %s has its previous pose again, as requested; it is no longer monitored", name)
-        message = self.pipeline.active_rig.message()
-        self._publisher.publish_rig(message)
-        return encode(message)
+    def _set_rig(self, query: zenoh.Query) -> bytes:
+        request = parse_request(payload_of(query), RigRequest)
+        self.pipeline.replace_rig(request.rig, self._now_ns, request.source)
+        return self._announce_rig(query, "changed", request.source)
+
+    def _undo_rig(self, query: zenoh.Query) -> bytes:
+        request = _parse_step(query)
+        self.pipeline.undo_rig(self._now_ns, request.source)
+        return self._announce_rig(query, "set back to the previous one", request.source)
+
+    def _redo_rig(self, query: zenoh.Query) -> bytes:
+        request = _parse_step(query)
+        self.pipeline.redo_rig(self._now_ns, request.source)
+        return self._announce_rig(query, "set to the one that was undone", request.source)
+
+    def _announce_rig(self, query: zenoh.Query, change: str, source: RequestSource | None) -> bytes:
+        """Publish and log the rig in force; returns the reply to the request that changed it."""
+        message = self.pipeline.active_rig.message
+        assert message is not None
+        log.warning("the rig was %s by %s", change, source or "an unnamed program")
+        self._publish_rig()
+        return encode_reply(payload_of(query), message)
 
     def _answer_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
@@ -252,6 +295,11 @@ class Server:
         request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self.pipeline.change_robots(request))
         return encode_reply(payload, Robots(robots=self.pipeline.robots))
+
+
+def _parse_step(query: zenoh.Query) -> RigStepRequest:
+    payload = payload_of(query)
+    return parse_request(payload, RigStepRequest) if payload else RigStepRequest()
 
 
 @contextlib.contextmanager

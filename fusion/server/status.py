@@ -29,12 +29,14 @@ class PipelineStatus:
         late: frames dropped since the start because they were late, by camera.
         excluded: cameras that were moved, whose detections are excluded.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        rig_t_ns: since when the active rig is in force.
     """
 
     calibrated: frozenset[str] = frozenset()
     late: dict[str, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    rig_t_ns: int | None = None
 
 
 @dataclass
@@ -138,6 +140,7 @@ class ServerStatistics:
             robots=dict(self._robots),
             faults=faults,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            rig_t_ns=pipeline.rig_t_ns,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()

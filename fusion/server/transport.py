@@ -13,7 +13,7 @@ import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
-from camera_node.protocol.requests import respond
+from camera_node.protocol.requests import REQUEST_S, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
@@ -65,6 +65,16 @@ class Transport:
             self.enqueue(lambda: handle(data, key, self.received_ns))
 
         self._closing.callback(self.session.declare_subscriber(key, enqueue).undeclare)
+
+    def request(self, key: str, handle: Callable[[bytes, str, int], None]) -> None:
+        """Query a key; call `handle(data, key, received_ns)` for each reply, on the server's thread."""
+
+        def enqueue(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                data, key = reply.ok.payload.to_bytes(), str(reply.ok.key_expr)
+                self.enqueue(lambda: handle(data, key, self.received_ns))
+
+        self.session.get(key, enqueue, timeout=REQUEST_S)
 
     def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
         """Answer queries at once on Zenoh's thread: `reply` must not modify the server's state."""

@@ -100,7 +100,7 @@ class ArenaMessages:
         self.put(self.keys.fusion_status, encode(message))
 
     def rig(self, rig: Rig) -> None:
-        self.put(self.keys.rig, encode(RigMessage.of(rig)))
+        self.put(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), rig=rig)))
 
 
 class LiveArena(ArenaMessages):
@@ -118,7 +118,7 @@ class LiveArena(ArenaMessages):
         """Answer queries for the rig, as the server does."""
 
         def answer(query: zenoh.Query) -> None:
-            query.reply(self.keys.rig, encode(RigMessage.of(rig)))
+            query.reply(self.keys.rig, encode(RigMessage(t_ns=time.time_ns(), rig=rig)))
 
         return self.session.declare_queryable(self.keys.rig, answer)
 
