@@ -86,6 +86,7 @@ def _drifts(result: WandCalibration) -> list[str]:
 
 def _remarks(report: WandReport) -> list[str]:
     lines = [f"{report.wand_poses} wand poses, residual {report.residual_px:.3f} px"]
+    lines.append(report.timing)
     if report.sigma_inflation > MIN_INFLATION:
         lines.append(
             f"residuals are correlated in time; standard deviations are inflated by {report.sigma_inflation:.1f} "

@@ -7,7 +7,7 @@ from datetime import date
 from typing import Any
 
 from calib.rig.camera import Camera
-from camera_node.config import is_name
+from camera_node.config import NAME_RULE, is_name
 
 MAX_CAMERAS = 256
 MAX_IMAGE_PX = 64e6  # pixels of one image; the server computes a table of the lens in 3 s and 0.7 GB
@@ -28,7 +28,7 @@ def check_cameras(cameras: Mapping[str, Camera]) -> None:
         raise ValueError(f"{len(cameras)} cameras; a rig has at most {MAX_CAMERAS}")
     for name, camera in cameras.items():
         if not is_name(name):
-            raise ValueError(f"{name[:64]!r} can't name a camera; use letters, digits, '_', '.' and '-'")
+            raise ValueError(f"{name[:64]!r} can't name a camera; {NAME_RULE}")
         if fault := _find_fault(camera):
             raise ValueError(f"camera '{name}': {fault}")
     if sum(camera.width * camera.height for camera in cameras.values()) > MAX_RIG_PX:

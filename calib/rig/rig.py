@@ -94,7 +94,12 @@ def save_rig(rig: Rig, path: Path) -> Path | None:
     except ValueError as error:
         raise CalibrationError(f"{path} is not written: {error}") from None
     backup = History(path).back_up()
-    write_atomically(path, dump_rig(rig))
+    try:
+        write_atomically(path, dump_rig(rig))
+    except BaseException:
+        if backup:
+            backup.unlink()  # equal to the file
+        raise
     return backup
 
 

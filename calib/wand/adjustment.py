@@ -15,10 +15,11 @@ from calib.wand.bundle_adjustment.problem import (
     CRYSTAL_DRIFT,
     SLEWED_DRIFT,
     Estimate,
+    Problem,
     WandObservations,
 )
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
-from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
+from calib.wand.quality.checks import check_agreement, check_clocks, check_lenses, check_sizes, check_spacing
 from calib.wand.trajectory import acceleration_density
 from camera_node.arrays import Array
 
@@ -60,9 +61,10 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
         CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
         CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
     """
-    rough = _scale(rough)
-    coarse = _adjust_coarsely(recording, rough)
+    rough = scale_rig(rough)
+    coarse = adjust_coarsely(recording, rough)
     check_lenses(recording.names, coarse)
+    check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
     clocks = _choose_clocks(coarse)
     fine = _prepare_fine(recording, rough, coarse, clocks)
@@ -74,7 +76,7 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
     return replace(solution, adjusted=inflate_covariance(solution.adjusted))
 
 
-def _scale(rough: RoughRig) -> RoughRig:
+def scale_rig(rough: RoughRig) -> RoughRig:
     """The rig scaled to the measured distance, or to 1 m between the farthest cameras if it has no scale."""
     if rough.distance is None and rough.metric:
         return rough
@@ -103,18 +105,24 @@ def _build(recording: LabeledRecording, rough: RoughRig, budget: int) -> Estimat
     return replace(start, problem=replace(start.problem, fixed_distance=distance))
 
 
-def _adjust_coarsely(recording: LabeledRecording, rough: RoughRig) -> Adjusted:
-    """Adjust poses, clocks and lenses on few frame sets, after a robust optimization of poses and clocks."""
-    start = _build(recording, rough, COARSE_SETS)
-    clocks = (OFFSET, DRIFT) if np.ptp(start.problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
-    problem = start.problem.with_free(POSE, *clocks)
+def adjust_coarsely(recording: LabeledRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
+    """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
+    start = _build(recording, rough, budget)
+    problem = start.problem.with_free(POSE, *_clock_candidates(recording, start.problem))
     state = optimize_robustly(problem, start.observations, start.state)
     # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
     # motion absorbs noise and the residuals are too small.
-    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.gap_s)
+    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
     return adjust(problem, observations, state)
+
+
+def _clock_candidates(recording: LabeledRecording, problem: Problem) -> tuple[tuple[int, ...], ...]:
+    """The clock parameters that the recording may show."""
+    if recording.timing.synchronous:
+        return ()
+    return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +162,7 @@ def _prepare_fine(
     better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
     start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
     state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses)
-    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.gap_s)
+    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.timing.gap_s)
     problem = start.problem.with_free(POSE, LENS, *clocks.free)
     problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)

@@ -36,6 +36,7 @@ class Placement:
         metric: whether the wand gives the scale.
         scaled_by: the measured distance that gives the scale.
         compared_with: a measured distance to compare with the wand.
+        timing: whether cameras are taken as synchronous, and why.
     """
 
     names: list[str]
@@ -45,6 +46,7 @@ class Placement:
     metric: bool
     scaled_by: Distance | None
     compared_with: Distance | None
+    timing: str = ""
 
 
 def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibration:
@@ -126,6 +128,7 @@ def _build_report(
         sigma_inflation=adjusted.inflation**0.5,
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
+        timing=placement.timing,
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },

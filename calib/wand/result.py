@@ -82,6 +82,7 @@ class WandReport:
         sigma_inflation: factor of the standard deviations for the correlation of residuals in time.
         scaled_by: the measured distance that gives the scale.
         compared: a measured distance compared with the wand.
+        timing: whether the cameras are taken as synchronous, and why.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
     """
 
@@ -95,6 +96,7 @@ class WandReport:
     sigma_inflation: float
     scaled_by: Distance | None
     compared: DistanceComparison | None
+    timing: str
     adjusted_lenses: dict[str, Any]
 
     @property
@@ -111,6 +113,7 @@ class WandReport:
         """Return the entries for the `calibration` map of `rig.yaml`."""
         return {
             "metric": self.metric,
+            "timing": self.timing,
             "wand_poses": self.wand_poses,
             "residual_px": round(self.residual_px, 4),
             "sigma_inflation": round(self.sigma_inflation, 2),
@@ -175,6 +178,11 @@ class WandCalibration:
     drift_ppm: Array
     drift_sigma_ppm: Array
     jump: ClockJump | None
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether frames with equal stamps were taken as simultaneous."""
+        return self.adjusted.problem.gap_s == 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the `calibration` map of `rig.yaml`: report, clocks if the data need them, and changes of lenses."""

@@ -13,6 +13,7 @@ import zenoh
 from camera_node.node.clock_offset import READING_NS, OffsetEstimator, RoundTrip
 from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode
+from camera_node.protocol.session import is_from_router
 
 log = logging.getLogger("camera_node.clock")
 
@@ -29,6 +30,7 @@ class ClockSync:
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session = session
         self._querier = session.declare_querier(
             keys.clock,
             timeout=TIMEOUT_S,
@@ -37,7 +39,7 @@ class ClockSync:
             express=True,
         )
         self._estimator = OffsetEstimator()
-        self._shared = False  # the server uses this machine's clock
+        self._shared_ahead_ns: int | None = None  # server time minus the monotonic clock that both share
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
@@ -59,15 +61,19 @@ class ClockSync:
         ahead_ns = unix_ahead_ns()
         monotonic_ns = time.monotonic_ns() if t_ns is None else t_ns - ahead_ns
         with self._lock:
-            if self._shared:
-                return 0, 0.0
-            estimate = self._estimator.at(monotonic_ns)
+            shared_ahead_ns, estimate = self._shared_ahead_ns, self._estimator.at(monotonic_ns)
+        if shared_ahead_ns is not None:
+            return shared_ahead_ns - ahead_ns, 0.0
         return estimate and (estimate[0] - ahead_ns, estimate[1])
 
     def to_server(self, t_ns: int) -> int:
         """Convert this machine's Unix time to the server's; unchanged until the server answers."""
         estimate = self.estimate(t_ns)
         return t_ns + estimate[0] if estimate else t_ns
+
+    def now_ns(self) -> int:
+        """The server's present time."""
+        return self.to_server(time.time_ns())
 
     def _run(self) -> None:
         pause_s = FIRST_PERIOD_S
@@ -77,33 +83,51 @@ class ClockSync:
 
     def _refresh(self) -> bool:
         """Ask the server `BURST` times, or once where it uses this machine's clock; return whether it answered."""
-        trips, shared = [], False
-        while len(trips) < BURST and not shared and not self._closed.is_set() and (reply := self._ask()):
+        trips, ahead_ns = [], None
+        while (
+            len(trips) < BURST and ahead_ns is None and not self._closed.is_set() and (reply := self._ask())
+        ):
             trips.append(reply[0])
-            shared = reply[1]
+            ahead_ns = reply[1]
         if trips:
             with self._lock:
-                self._shared = shared
+                self._shared_ahead_ns = ahead_ns
                 self._estimator.add(*trips)
         return bool(trips)
 
-    def _ask(self) -> tuple[RoundTrip, bool] | None:
-        """Make a round trip; return it and whether the server uses this machine's clock, or None without a reply."""
+    def _ask(self) -> tuple[RoundTrip, int | None] | None:
+        """A round trip, and the server's time minus the monotonic clock if both share that; None without a reply.
+
+        Other clients may answer too, unless access control forbids it: the router's reply is used, if there is one.
+        """
+        answer = None
         sent_ns = time.monotonic_ns()
         try:
             for reply in self._querier.get():
                 received_ns = time.monotonic_ns()
-                if reply.ok:
-                    message = decode(reply.ok.payload.to_bytes(), ClockReply)
-                    trip = RoundTrip(sent_ns, message.t_ns, received_ns)
-                    return trip, _is_shared(message.clock, trip)
-        except (zenoh.ZError, MessageError) as error:
+                answer = _parse(reply, sent_ns, received_ns) or answer
+                if is_from_router(self._session, reply):
+                    break
+        except zenoh.ZError as error:
             log.debug("no server time: %s", error)
+        return answer
+
+
+def _parse(reply: zenoh.Reply, sent_ns: int, received_ns: int) -> tuple[RoundTrip, int | None] | None:
+    """As `ClockSync._ask`, of one reply; None of an invalid one."""
+    if reply.ok is None:
         return None
+    try:
+        message = decode(reply.ok.payload.to_bytes(), ClockReply)
+    except MessageError as error:
+        log.debug("no server time: %s", error)
+        return None
+    trip = RoundTrip(sent_ns, message.t_ns, received_ns)
+    return trip, message.monotonic_ahead_ns if _is_shared(message, trip) else None
 
 
-def _is_shared(clock: str, trip: RoundTrip) -> bool:
-    """Whether the server's clock has this machine's clock id and its time; copies of a virtual machine share ids."""
-    if not clock or clock != clock_id():
+def _is_shared(reply: ClockReply, trip: RoundTrip) -> bool:
+    """Whether the server reads the monotonic clock of this machine; copies of a virtual machine share ids."""
+    if not reply.clock or reply.clock != clock_id() or reply.monotonic_ahead_ns is None:
         return False
-    return trip.sent_ns - READING_NS <= trip.server_ns - unix_ahead_ns() <= trip.received_ns + READING_NS
+    return trip.sent_ns - READING_NS <= reply.t_ns - reply.monotonic_ahead_ns <= trip.received_ns + READING_NS

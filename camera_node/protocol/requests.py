@@ -16,6 +16,7 @@ import zenoh
 from camera_node.arrays import Grey
 from camera_node.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.session import reply_of_server
 
 log = logging.getLogger("camera_node.requests")
 
@@ -64,7 +65,9 @@ def send_request(
     """
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
-        for reply in session.get(key, payload=payload, timeout=max(left, ANSWER_S)):
+        every = zenoh.ConsolidationMode.NONE
+        replies = session.get(key, payload=payload, consolidation=every, timeout=max(left, ANSWER_S))
+        if reply := reply_of_server(session, replies):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")

@@ -5,7 +5,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import zenoh
@@ -120,6 +120,27 @@ def open_requester(
             f"no server answers at {' '.join(connect)} within {timeout_s:g} s; check that python -m fusion runs there, "
             f"and check --connect ({_brief(error)})"
         ) from None
+
+
+def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:
+    """Whether a router that this session is connected to sent the reply: the server, unless routers are between them.
+
+    Without access control any client may answer a query. Zenoh names the sender in each reply.
+    """
+    return reply.replier_id is not None and reply.replier_id.zid in session.info.routers_zid()
+
+
+def reply_of_server(session: zenoh.Session, replies: Iterable[zenoh.Reply]) -> zenoh.Reply | None:
+    """The first reply of a router that this session is connected to; if there is none, the first reply.
+
+    The query needs `consolidation=zenoh.ConsolidationMode.NONE`: otherwise Zenoh drops all replies but one.
+    """
+    first = None
+    for reply in replies:
+        if is_from_router(session, reply):
+            return reply
+        first = first or reply
+    return first
 
 
 def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:

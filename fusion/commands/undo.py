@@ -12,7 +12,7 @@ from calib.live.rig_requests import redo_rig, request_rig, undo_rig
 from calib.rig.messages import RigMessage
 from camera_node.protocol.session import open_requester
 from camera_node.terminal import say
-from fusion.server.active_rig import corrected_camera
+from fusion.model.corrections import corrected_camera
 
 
 def undo(

@@ -5,11 +5,9 @@ import atexit
 import logging
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from calib.rig.camera import Camera
 from calib.rig.history import History
@@ -17,10 +15,10 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
+from fusion.model.corrections import correct
 from fusion.server.persistence import is_newer
 
 log = logging.getLogger("fusion")
-CORRECTED = "corrected"  # entry of `Rig.calibration`: the camera that the server recalibrated last
 
 
 class ActiveRig:
@@ -45,7 +43,7 @@ class ActiveRig:
         """The rig in use."""
         return self.message.rig if self.message else None
 
-    def load(self, apply: Callable[[Rig], object], now_ns: int) -> None:
+    def load(self, apply: Callable[[Rig], object]) -> None:
         """Use the newer of the saved and the given rig.
 
         A saved rig that is broken, or to which `apply` raises, is logged, and the one before it is used.
@@ -61,12 +59,12 @@ class ActiveRig:
                 log.warning("the saved rig %s is not used, but the one before it: %s", path, error)
                 continue
             log.info("using the rig that was last changed over the network: %s", path)
-            self.message = RigMessage(t_ns=now_ns, rig=rig, saved=True)
+            self.message = RigMessage(t_ns=time.time_ns(), rig=rig, saved=True)
             return
         if self._given is not None:
             rig = load_rig(self._given)
             apply(rig)
-            self.message = RigMessage(t_ns=now_ns, rig=rig, saved=True)
+            self.message = RigMessage(t_ns=time.time_ns(), rig=rig, saved=True)
 
     def use(
         self, rig: Rig, now_ns: int, source: RequestSource | None = None, saved: bool | None = None
@@ -87,9 +85,7 @@ class ActiveRig:
     def correct(self, name: str, camera: Camera, now_ns: int) -> None:
         """Use a new pose of a camera that was moved. A fault of the disk is only logged."""
         assert self.rig is not None
-        calibration = self.rig.calibration | {CORRECTED: {"camera": name, "t_ns": now_ns}}
-        cameras = {**self.rig.cameras, name: camera}
-        rig = msgspec.structs.replace(self.rig, cameras=cameras, calibration=calibration)
+        rig = correct(self.rig, name, camera, now_ns)
         saved = None
         try:
             self.save(rig)
@@ -141,17 +137,6 @@ class ActiveRig:
             return
         yield self._saved
         yield from reversed(self._history.older())
-
-
-def corrected_camera(undone: Rig, restored: Rig) -> str | None:
-    """The camera whose recalibration by the server an undo reverts; None if a user made the change."""
-    was, now = _correction(undone), _correction(restored)
-    return was.get("camera") if was != now and was.get("camera") in restored.cameras else None
-
-
-def _correction(rig: Rig) -> dict[str, Any]:
-    entry = rig.calibration.get(CORRECTED)
-    return entry if isinstance(entry, dict) and isinstance(entry.get("camera"), str) else {}
 
 
 def _holds(path: Path, rig: Rig) -> bool:

@@ -2,7 +2,6 @@
 """The active rig and robots, and the synchronizer and tracker that use them; no network."""
 
 import logging
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,11 +11,12 @@ from calib.rig.rig import Rig
 from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
+from fusion.model.corrections import corrected_camera
 from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
-from fusion.server.active_rig import ActiveRig, corrected_camera
+from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.persistence import PersistedFile
@@ -50,7 +50,7 @@ class TrackingPipeline:
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
         self._start(self.cameras)
-        self.active_rig.load(lambda rig: self._start(rig.placed()), time.time_ns())
+        self.active_rig.load(lambda rig: self._start(rig.placed()))
 
     @property
     def cameras(self) -> dict[str, Camera]:

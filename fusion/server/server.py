@@ -8,8 +8,8 @@ import contextlib
 import gc
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -22,8 +22,7 @@ from calib.rig.messages import (
     set_rig_key,
     undo_rig_key,
 )
-from camera_node.protocol.host_clock import clock_id
-from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import (
     RequestError,
     RequestSource,
@@ -50,6 +49,7 @@ from fusion.server.config import ArenaConfig
 from fusion.server.ingest import MAX_AGE_NS, Ingest
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
+from fusion.server.server_clock import ServerClock, clock_of
 from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.server.transport import Transport, open_session
 from fusion.tracking.result import latency_of
@@ -58,9 +58,6 @@ from fusion.tracking.tracker import Tracker
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # resolution at which a wait for frames ends
 MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
-MAX_CLOCK_STEP_NS = (
-    1_000_000_000  # by which this machine's clock may be set back without a restart of tracking
-)
 
 
 class Server:
@@ -82,7 +79,6 @@ class Server:
         self.statistics = ServerStatistics(config.limits.lateness_ms)
         self.pipeline = TrackingPipeline(config, self.shard)
         self._ingest = Ingest(self.keys, self.statistics)
-        self._now_ns = 0
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
@@ -91,7 +87,9 @@ class Server:
             self.session = stack.enter_context(open_session(self.config, self.shard))
             if self.shard.leads:
                 self.endpoints = listening_endpoints(self.session, self.config.listen)
-            self.transport = Transport(self.session, self.statistics.count_fault, stack)
+            self.clock = clock_of(self.shard, self.session, self.keys)
+            stack.callback(self.clock.close)
+            self.transport = Transport(self.session, self.clock, self.statistics.count_fault, stack)
             self._publisher = ArenaPublisher(self.transport, self.keys, self.shard)
             self._declare()
             self._closing = stack.pop_all()
@@ -113,7 +111,7 @@ class Server:
         with collecting_between_frame_sets() as collect_garbage:
             while not self._stopped.is_set():
                 is_backlogged = self.transport.receive(TICK_S)
-                now_ns = self._read_clock()
+                now_ns = self.clock.now_ns()
                 for frame_set in self._synchronize(now_ns, is_backlogged):
                     self._track(frame_set)
                 if not is_backlogged:
@@ -128,8 +126,9 @@ class Server:
         transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
+        if isinstance(self.clock, ServerClock):
+            transport.answer(keys.clock, partial(self._answer_clock, self.clock))
         if self.shard.leads:
-            transport.answer(keys.clock, self._answer_clock)
             transport.answer(keys.rig, self._answer_rig)
             transport.answer_on_server_thread(set_rig_key(keys.arena), self._set_rig)
             transport.answer_on_server_thread(undo_rig_key(keys.arena), self._undo_rig)
@@ -140,16 +139,6 @@ class Server:
             transport.subscribe(keys.fusion_status, self._request_new_rig)
 
     # The steps of the loop.
-
-    def _read_clock(self) -> int:
-        """The present time. Tracking restarts if the clock was set back, since all tracks are in its future then."""
-        now_ns = time.time_ns()
-        if now_ns < self._now_ns - MAX_CLOCK_STEP_NS:
-            step_s = (self._now_ns - now_ns) * 1e-9
-            log.warning("this machine's clock was set back by %.0f s; all robots are acquired again", step_s)
-            self.pipeline.restart()
-        self._now_ns = now_ns
-        return now_ns
 
     def _synchronize(self, now_ns: int, is_backlogged: bool) -> list[FrameSet]:
         """The frame sets that are due. Queued frames count as on time unless the server lags by more than 0.5 s."""
@@ -170,10 +159,10 @@ class Server:
 
     def _track_and_publish(self, tracker: Tracker, frame_set: FrameSet) -> None:
         """Publish the poses that acquisition can't change first, then everything else."""
-        start_ns = time.time_ns()
+        start_ns = self.clock.now_ns()
         predicted = tracker.predict(frame_set.t_ns, self.pipeline.early)
         update = tracker.update(tracker.associate(predicted, frame_set), frame_set)
-        latency = latency_of(frame_set, start_ns, time.time_ns())
+        latency = latency_of(frame_set, start_ns, self.clock.now_ns())
         self._publisher.publish_poses(update.poses.values(), latency)
         if self.shard.count > 1:
             self._publisher.publish_shard(tracker.table.shard_poses())
@@ -191,7 +180,7 @@ class Server:
         if correction.camera is None:
             log.warning("camera %s was moved: excluded until robots show its new pose", correction.name)
             return
-        self.pipeline.correct_rig(correction, self._now_ns)
+        self.pipeline.correct_rig(correction, self.clock.now_ns())
         self._publish_rig()
         log.warning(
             "camera %s is recalibrated and used again; python -m fusion undo reverts that", correction.name
@@ -221,7 +210,7 @@ class Server:
         frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
         if frame is not None:
             is_on_time = self.pipeline.synchronizer.add(frame)
-            self.statistics.note_lateness(frame.camera, is_on_time, (time.time_ns() - frame.t_ns) * 1e-6)
+            self.statistics.note_lateness(frame.camera, is_on_time, (self.clock.now_ns() - frame.t_ns) * 1e-6)
 
     def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
         """Use the rig of the leading shard."""
@@ -254,8 +243,8 @@ class Server:
 
     # Answered queries.
 
-    def _answer_clock(self, query: zenoh.Query) -> None:
-        query.reply(self.keys.clock, encode(ClockReply(t_ns=time.time_ns(), clock=clock_id())))
+    def _answer_clock(self, clock: ServerClock, query: zenoh.Query) -> None:
+        query.reply(self.keys.clock, encode(clock.reply()))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
         if (message := self.pipeline.active_rig.message) is not None:
@@ -263,17 +252,17 @@ class Server:
 
     def _set_rig(self, query: zenoh.Query) -> bytes:
         request = parse_request(payload_of(query), RigRequest)
-        self.pipeline.replace_rig(request.rig, self._now_ns, request.source)
+        self.pipeline.replace_rig(request.rig, self.clock.now_ns(), request.source)
         return self._announce_rig(query, "changed", request.source)
 
     def _undo_rig(self, query: zenoh.Query) -> bytes:
         request = _parse_step(query)
-        self.pipeline.undo_rig(self._now_ns, request.source)
+        self.pipeline.undo_rig(self.clock.now_ns(), request.source)
         return self._announce_rig(query, "set back to the previous one", request.source)
 
     def _redo_rig(self, query: zenoh.Query) -> bytes:
         request = _parse_step(query)
-        self.pipeline.redo_rig(self._now_ns, request.source)
+        self.pipeline.redo_rig(self.clock.now_ns(), request.source)
         return self._announce_rig(query, "set to the one that was undone", request.source)
 
     def _announce_rig(self, query: zenoh.Query, change: str, source: RequestSource | None) -> bytes:

@@ -3,7 +3,6 @@
 
 import contextlib
 import queue
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,11 +11,13 @@ import msgspec
 import zenoh
 
 from camera_node.errors import ConfigError
+from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import encode
 from camera_node.protocol.requests import REQUEST_S, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
+from fusion.server.server_clock import ServerClock
 
 QUEUE_SIZE = 2000  # messages: seconds of a large arena
 Task = Callable[[], object]
@@ -44,15 +45,20 @@ class Transport:
 
     Args:
         session: an open Zenoh session.
+        clock: the server's time, of arrivals.
         count_fault: called with the name of a fault, from any thread.
         closing: undeclares everything that this object declares.
     """
 
     def __init__(
-        self, session: zenoh.Session, count_fault: Callable[[str], None], closing: contextlib.ExitStack
+        self,
+        session: zenoh.Session,
+        clock: ServerClock | ClockSync,
+        count_fault: Callable[[str], None],
+        closing: contextlib.ExitStack,
     ) -> None:
         self.session = session
-        self._count_fault, self._closing = count_fault, closing
+        self._clock, self._count_fault, self._closing = clock, count_fault, closing
         self._tasks: queue.Queue[tuple[int, Task]] = queue.Queue(QUEUE_SIZE)
         self.received_ns = 0  # arrival time of the last task that was executed
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -91,7 +97,7 @@ class Transport:
     def enqueue(self, task: Task) -> None:
         """Execute a task on the server's thread; callable from any thread."""
         try:
-            self._tasks.put_nowait((time.time_ns(), task))
+            self._tasks.put_nowait((self._clock.now_ns(), task))
         except queue.Full:
             self._count_fault("queue full")
 

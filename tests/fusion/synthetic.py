@@ -48,6 +48,17 @@ def line(
     return at
 
 
+def circle(turn_s: float, radius_m: float, height_m: float = 0.2) -> Motion:
+    """A drive around the origin in so many seconds a turn, the robot's x axis along the motion."""
+
+    def at(t: float) -> tuple[np.ndarray, np.ndarray]:
+        c, s = np.cos(2 * np.pi * t / turn_s), np.sin(2 * np.pi * t / turn_s)
+        R = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 1.0]])
+        return R, np.array([radius_m * c, radius_m * s, height_m])
+
+    return at
+
+
 @dataclass
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
@@ -74,7 +85,7 @@ class Arena:
         )
         return [
             CalibratedFrame.measure(
-                name, t_ns, self._detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name]
+                name, t_ns, self.detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name]
             )
             for t_ns, name in times
         ]
@@ -95,7 +106,8 @@ class Arena:
         """R and p."""
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
 
-    def _detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
+    def detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
+        """What a camera detects at t seconds."""
         cameras = CameraArray({name: self.cameras[name]})
         marker_table = MarkerTable.of(list(self.robots.values()))
         seen = [

@@ -145,7 +145,7 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
 
 def loaded(given: Path, saved: Path) -> Rig | None:
     active = ActiveRig(given, saved)
-    active.load(lambda rig: None, 0)
+    active.load(lambda rig: None)
     return active.rig
 
 

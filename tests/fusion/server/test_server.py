@@ -92,14 +92,6 @@ def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_
         until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
 
 
-def test_tracking_restarts_when_the_clock_is_set_back(tmp_path, caplog):
-    with serving(config(tmp_path)) as (server, _):
-        before = server.pipeline.tracker
-        server.transport.enqueue(lambda: setattr(server, "_now_ns", time.time_ns() + 3600 * 10**9))
-        until(lambda: server.pipeline.tracker is not before)
-    assert "clock was set back by 3600 s" in caplog.text
-
-
 def send_in_real_time(server: Server, n_frames: int) -> None:
     """Publish frames of all cameras thirty times a second, each with the present time."""
     pause = threading.Event()
