@@ -31,9 +31,11 @@ from camera_node.protocol.requests import (
     payload_of,
 )
 from camera_node.protocol.session import listening_endpoints
+from camera_node.service import ServiceManager
 from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.protocol.health import describe_status
 from fusion.protocol.messages import (
     FusionStatus,
     Robots,
@@ -108,7 +110,8 @@ class Server:
 
     def run(self) -> None:
         """Serve: receive, synchronize, track and publish, report the status."""
-        with collecting_between_frame_sets() as collect_garbage:
+        with ServiceManager() as service, collecting_between_frame_sets() as collect_garbage:
+            service.ready()
             while not self._stopped.is_set():
                 is_backlogged = self.transport.receive(TICK_S)
                 now_ns = self.clock.now_ns()
@@ -116,8 +119,10 @@ class Server:
                     self._track(frame_set)
                 if not is_backlogged:
                     self.pipeline.associate_early()
-                if self._report_status(now_ns):
+                if status := self._report_status(now_ns):
+                    service.report(describe_status(status))
                     collect_garbage()
+                service.progress()
 
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
@@ -190,10 +195,10 @@ class Server:
         if self.pipeline.active_rig.message is not None:
             self._publisher.publish_rig(self.pipeline.active_rig.message)
 
-    def _report_status(self, now_ns: int) -> bool:
-        """Publish the status once a second; return whether it was due."""
+    def _report_status(self, now_ns: int) -> FusionStatus | None:
+        """Publish the status once a second; return it if it was due."""
         if not self.statistics.is_due(now_ns):
-            return False
+            return None
         pipeline = PipelineStatus(
             calibrated=frozenset(self.pipeline.cameras),
             late=self.pipeline.synchronizer.late,
@@ -201,8 +206,9 @@ class Server:
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
-        self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
-        return True
+        status = self.statistics.report(now_ns, pipeline)
+        self._publisher.publish_status(status)
+        return status
 
     # Received messages.
 

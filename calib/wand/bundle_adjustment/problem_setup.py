@@ -10,13 +10,13 @@ from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_fra
 from calib.wand.bundle_adjustment.initial_motion import initial_positions
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
-from calib.wand.detections import WandDetections
+from calib.wand.detections import WandDetections, normalise
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import WandRecording
 from calib.wand.timing import Timing
-from calib.wand.tracks import MarkerTrack
+from calib.wand.tracks import MarkerTrack, build_tracks
 from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
@@ -63,6 +63,21 @@ class LabeledRecording:
             recording.timing,
             float(t_s.min() + t_s.max()) / 2,
         )
+
+    def with_centres(self, rows: Index, uv: Array) -> "LabeledRecording":
+        """The recording with other centres (n, 2), raw pixels, of the detections `rows` (n,)."""
+        changed = self.detections.uv.copy()
+        changed[rows] = uv
+        xy = normalise(self.lenses, self.detections.camera, changed)
+        return self._with(replace(self.detections, uv=changed, xy=xy))
+
+    def select(self, rows: Mask) -> "LabeledRecording":
+        """The recording with some of its detections (n,) only."""
+        return self._with(self.detections.select(rows))
+
+    def _with(self, detections: WandDetections) -> "LabeledRecording":
+        tracks = build_tracks(detections, len(self.lenses), len(self.wand.markers))
+        return replace(self, detections=detections, tracks=tracks)
 
     def undistort_tracks(self, lenses: Sequence[Lens]) -> "LabeledRecording":
         """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
@@ -148,6 +163,7 @@ def _middle_times(t_s: Array, knot: Index) -> Array:
 def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> WandObservations:
     detections = recording.detections.select(rows)
     return WandObservations(
+        row=rows,
         camera=detections.camera,
         knot=knot,
         label=detections.label,

@@ -107,6 +107,30 @@ def test_declared_cameras_without_equal_stamps_are_refused():
         calibrate(arena.intrinsics, STICK, apart, synchronous=True)
 
 
+def test_residuals_are_stated_for_all_detections_and_gross_errors_by_their_size():
+    """Every tenth detection is 30 px off: the share and the list say so, to the noise of the triangulated point. Three
+    cameras have 6 equations for 3 unknowns: residuals are 0.5 px (2 / 2)^1/2 RMS without gross errors."""
+    arena, messages, gross = ring(3, wand=STICK), [], []
+    for message in random_rows(arena, 500_000_000):
+        seen = message.unpack()
+        if message.camera == "cam1" and message.seq % 5 == 0 and len(seen):
+            seen.uv[0] += [0.0, 30.0]
+            gross.append(message.t_ns * 1e-9)
+        header = {n: getattr(message, n) for n in ("camera", "seq", "t_ns", "width", "height")}
+        messages.append(Detections.pack(seen, **header))
+    report = calibrate(arena.intrinsics, STICK, messages).report
+    given, held_out = report.given, report.held_out
+    assert given is not None
+    assert held_out is not None
+    assert given.count == sum(len(m.unpack()) for m in messages)
+    assert given.gross == pytest.approx(len(gross) / given.count, abs=0.01)
+    assert given.all_px == pytest.approx(30 * np.sqrt(len(gross) / given.count), rel=0.1)
+    assert given.residual_px == pytest.approx(SIGMA_PX, rel=0.15)
+    assert held_out.residual_px == pytest.approx(SIGMA_PX, rel=0.3)
+    assert sorted(o.t_s for o in report.outliers) == pytest.approx(gross)
+    assert [o.off_px for o in report.outliers] == pytest.approx([30.0] * len(gross), abs=5.0)
+
+
 def test_ends_without_numbers_are_distinguished_by_simultaneous_frames_alone():
     arena = ring(4, wand=STICK)
     result = calibrate(
