@@ -15,6 +15,8 @@ COMMANDS = {  # and their modules in fusion.commands
     "replay": "replay",
     "record": "record",
     "repair": "repair",
+    "health": "health",
+    "doctor": "doctor",
     "define": "define",
     "undo": "undo",
     "redo": "undo",

@@ -4,6 +4,7 @@ line."""
 
 import getpass
 import logging
+import re
 import socket
 import time
 from collections.abc import Callable
@@ -32,6 +33,17 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 class RequestError(RoundelError):
     """An invalid request; the message goes to its sender."""
+
+
+def sender(session: zenoh.Session) -> bytes:
+    """The attachment of a request: the id of the session that sends it, for the receiver's audit."""
+    return str(session.info.zid()).encode()
+
+
+def sender_of(query: zenoh.Query) -> str:
+    """The id of the session that a request claims to come from; empty where it claims none."""
+    attachment = query.attachment.to_bytes() if query.attachment else b""
+    return attachment.decode() if re.fullmatch(rb"[0-9a-f]{1,32}", attachment) else ""
 
 
 class RequestSource(msgspec.Struct, frozen=True):
@@ -66,7 +78,9 @@ def send_request(
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
         every = zenoh.ConsolidationMode.NONE
-        replies = session.get(key, payload=payload, consolidation=every, timeout=max(left, ANSWER_S))
+        replies = session.get(
+            key, payload=payload, attachment=sender(session), consolidation=every, timeout=max(left, ANSWER_S)
+        )
         if reply := reply_of_server(session, replies):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()

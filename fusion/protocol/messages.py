@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index
 from camera_node.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
+from fusion.model.frames import FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 
 Vector = tuple[float, float, float]
@@ -173,6 +175,45 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         return np.frombuffer(self.cameras, "<u8")
 
 
+class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
+    """The frames of a frame set, so that a replay fuses the same frames as the server did.
+
+    Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
+    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds.
+    """
+
+    version: int = VERSION
+    t_ns: int
+    cameras: tuple[str, ...]
+    stamps: bytes
+    times: bytes
+    clock_sigmas: bytes
+
+    @classmethod
+    def of(cls, frame_set: FrameSet) -> "FusedFrames":
+        """The message of a frame set."""
+        frames = frame_set.frames
+        return cls(
+            t_ns=frame_set.t_ns,
+            cameras=tuple(frame.camera for frame in frames),
+            stamps=np.array([frame.stamp_ns for frame in frames], "<i8").tobytes(),
+            times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
+            clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
+        )
+
+    def check(self) -> None:
+        """Raise MessageError unless the columns' sizes agree."""
+        n = 8 * len(self.cameras)
+        if not len(self.stamps) == len(self.times) == len(self.clock_sigmas) == n:
+            raise MessageError(f"the columns have other sizes than those of {len(self.cameras)} frames")
+
+    def rows(self) -> list[tuple[str, int, int, float]]:
+        """Camera, stamp, capture time (ns) and standard deviation of the clock (s) of each frame."""
+        columns = np.frombuffer(self.stamps, "<i8"), np.frombuffer(self.times, "<i8")
+        sigmas = np.frombuffer(self.clock_sigmas, "<f8").tolist()
+        return list(zip(self.cameras, *(column.tolist() for column in columns), sigmas, strict=True))
+
+
 class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     """The server's figures of one camera over the last second."""
 
@@ -200,6 +241,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, TrackingState]
     faults: dict[str, int]
+    limits: Limits | None = None  # with which the server tracks, for a replay
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
     rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one
 
@@ -215,6 +257,11 @@ def set_robots_key(arena: str) -> str:
     A key of its own, because access rights cannot tell a query with a payload from one without.
     """
     return f"{arena}/robots/set"
+
+
+def frames_key(arena: str) -> str:
+    """The key on which the server publishes `FusedFrames` for every frame set."""
+    return f"{arena}/fusion/frames"
 
 
 def shard_key(arena: str, index: int | str) -> str:
