@@ -140,7 +140,13 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
         const OcclusionMask mask = misfit->occlusion(input.noise, slack * fit.contrast());
         if (masks_too_much(mask)) return std::nullopt;
         if (mask == guess.occlusion) continue;
-        guess = {fit.outer, fit.ratio, fit.dark, fit.bright, guess.print_ratios, mask};
+        guess = {.outer = fit.outer,
+                 .ratio = fit.ratio,
+                 .dark = fit.dark,
+                 .bright = fit.bright,
+                 .print_ratios = guess.print_ratios,
+                 .occlusion = mask,
+                 .shading_sigma = guess.shading_sigma};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;
         fit = *rest, misfit.reset();
