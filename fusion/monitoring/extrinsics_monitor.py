@@ -9,6 +9,7 @@ Each camera is compared in turn, just often enough to find a move within a secon
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,7 +97,11 @@ class ExtrinsicsMonitor:
         self._turns: dict[str, int] = {}  # of each camera at its last comparison
 
     def check(
-        self, frame_set: FrameSet, scene: TrackedScene, recalibrates: bool
+        self,
+        frame_set: FrameSet,
+        scene: TrackedScene,
+        recalibrates: bool,
+        is_clock: Callable[[str], bool] = lambda name: False,
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Compare the frames that are due; returns the cameras to exclude, and those to recalibrate.
 
@@ -104,13 +109,16 @@ class ExtrinsicsMonitor:
             frame_set: including the frames of excluded cameras.
             scene: after the update with this frame set.
             recalibrates: False for a shard that waits for the poses from another.
+            is_clock: whether a wrong clock explains the disagreement of a camera.
         """
         n_markers = int(scene.tracked[scene.marker_table.robot].sum())
         for frame in frame_set.frames:
             if self._is_due(frame, scene.cameras, n_markers):
                 self._compare(frame, frame_set.t_ns, scene)
         corrections = []
-        if (name := self._find_moved()) is not None:
+        if (name := self._find_moved()) is not None and is_clock(name):
+            self.readmit(name)
+        elif name is not None:
             self.excluded.add(name)
             corrections.append(ExtrinsicsCorrection(name, None))
         for name in sorted(self.excluded) if recalibrates else ():

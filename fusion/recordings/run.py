@@ -13,6 +13,7 @@ from camera_node.sources.observations import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.recordings.report import Summary
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import TrackingResult
@@ -59,7 +60,7 @@ def fuse_recording(
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
     smoother = Smoother(tracker.table.names) if arena.smooth else None
-    for frame_set in _synchronize(messages, arena, summary.faults):
+    for frame_set in _synchronize(messages, tracker.clocks, arena, summary.faults):
         fused = tracker.track(frame_set)
         summary.add(fused)
         if smoother is None:
@@ -92,7 +93,10 @@ def read_detections(
 
 
 def _synchronize(
-    messages: Iterable[tuple[int, Detections]], arena: OfflineArena, faults: Counter[str]
+    messages: Iterable[tuple[int, Detections]],
+    clocks: CameraClocks,
+    arena: OfflineArena,
+    faults: Counter[str],
 ) -> Iterator[FrameSet]:
     synchronizer = FrameSynchronizer.at_rate(arena.rate_hz, arena.limits.lateness_ms)
     for received_ns, message in messages:
@@ -102,7 +106,9 @@ def _synchronize(
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            synchronizer.add(CalibratedFrame.of(message, camera))
+            frame = clocks.admit(CalibratedFrame.of(message, camera, received_ns))
+            if frame is not None:
+                synchronizer.add(frame)
             yield from synchronizer.take(received_ns)
     for name, late in synchronizer.late.items():
         if late:
