@@ -12,7 +12,6 @@ See docs/time_offsets.md.
 import logging
 import time
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -24,7 +23,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.states import States
 from fusion.monitoring.stamp_check import StampCheck
-from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, disagreement, offset_information
+from fusion.monitoring.time_offsets import OffsetInformation, disagreement, offset_information
 from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_time_shift
 
 log = logging.getLogger("fusion")
@@ -33,7 +32,8 @@ ClockState = Literal["correct", "excluded", "corrected", "undecided"]
 FAST_NS = 120_000_000  # of frame sets that show a jump
 SLOW_S = 6.0  # time constant of the information that shows a drift
 JUMP_PX, DRIFT_PX = 1.5, 0.6  # RMS image motion that an offset must explain
-MIN_DRIFT_S = 0.0007  # smallest correction of a drift
+MIN_DRIFT_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest correction of a drift
+MIN_SLOW_NS = 1_500_000_000  # of frame sets, for a correction of a drift
 KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
 MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
@@ -43,6 +43,7 @@ STATIC_NS = 1_000_000_000  # without any moving robot, after which the arrival d
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 SMALL_S = 0.002  # an offset below this is none
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
+MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
 MAX_MARKERS = 160  # observations of a frame set that are compared
 MIN_SPEED_M_S = 0.03  # of a robot that is compared
 UNDECIDED_NS = 10_000_000_000  # between reports without a majority
@@ -96,7 +97,7 @@ class CameraClocks:
         self._clocks = {name: _Clock() for name in cameras.names}
         self._history: deque[Snapshot] = deque()
         self._fast: deque[tuple[int, OffsetInformation]] = deque()
-        self._slow = OffsetInformation.none(len(cameras.names))
+        self._slow, self._slow_since_ns = OffsetInformation.none(len(cameras.names)), 0
         self._now_ns = self._undecided_ns = 0
 
     @property
@@ -116,7 +117,7 @@ class CameraClocks:
         self._clocks = old._clocks
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
-        """The frame in corrected time; None while its camera is excluded."""
+        """The frame in corrected time; None while its camera is excluded, or if that time is in the future."""
         clock = self._clocks[frame.camera]
         jump_ns = clock.check.jump_ns(frame.t_ns, frame.received_ns)
         frame = replace(
@@ -126,9 +127,9 @@ class CameraClocks:
         )
         if jump_ns is not None and clock.state != "excluded" and frame.received_ns > clock.trusted_ns:
             self._exclude(clock, frame.received_ns, 0)
-            clock.arrival_jump_ns = jump_ns
+            clock.arrival_jump_ns = jump_ns or None
         clock.frames.append(frame)
-        if clock.state == "excluded":
+        if clock.state == "excluded" or frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
             return None
         while clock.frames[0].t_ns < frame.t_ns - KEPT_NS:
             clock.frames.popleft()
@@ -203,11 +204,11 @@ class CameraClocks:
         found = disagreement(total, JUMP_PX)
         if found is None:
             return
-        if not found.has_majority:
-            self._report_undecided(found)
+        if not found.cameras:
+            self._report_undecided()
             return
-        for name in self._names(found):
-            clock = self._clocks[name]
+        for k in found.cameras:
+            clock = self._clocks[self._cameras.names[k]]
             if clock.state != "excluded" and self._now_ns > clock.trusted_ns:
                 self._exclude(clock, self._now_ns, FAST_NS)
         self._forget()
@@ -220,16 +221,13 @@ class CameraClocks:
         n = len(self._cameras.names)
         kept = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
         self._slow = kept.plus(info.relative_to(-self._offsets_s()))
-        found = disagreement(self._slow.relative_to(self._offsets_s()), DRIFT_PX, has_shifts=True)
-        if found is None or not found.has_majority:
+        self._slow_since_ns = self._slow_since_ns or self._now_ns
+        if self._now_ns < self._slow_since_ns + MIN_SLOW_NS:
             return
-        for name in self._names(found):
-            k = self._cameras.index[name]
-            if abs(found.offsets_s[k]) > MIN_DRIFT_S:
-                self._correct_drift(name, float(found.offsets_s[k]), float(found.sigma_s[k]))
-
-    def _names(self, found: Disagreement) -> list[str]:
-        return [name for name, out in zip(self._cameras.names, found.outliers, strict=True) if out]
+        found = disagreement(self._slow.relative_to(self._offsets_s()), DRIFT_PX, has_shifts=True)
+        for k, offset_s, sigma_s in zip(*found.columns, strict=True) if found else ():
+            if MIN_DRIFT_S < abs(offset_s) < MAX_DRIFT_S:
+                self._correct_drift(self._cameras.names[k], offset_s, sigma_s)
 
     # Changes.
 
@@ -292,23 +290,13 @@ class CameraClocks:
     def _forget(self) -> None:
         """Drop the information of frames with earlier corrections or of excluded cameras."""
         self._fast.clear()
-        self._slow = OffsetInformation.none(len(self._cameras.names))
+        self._slow, self._slow_since_ns = OffsetInformation.none(len(self._cameras.names)), 0
 
-    def _report_undecided(self, found: Disagreement) -> None:
-        if self._now_ns < self._undecided_ns + UNDECIDED_NS:
-            return
-        self._undecided_ns = self._now_ns
-        offsets = [
-            f"{name} {1e3 * s:.0f} ms"
-            for name, s, out in zip(self._cameras.names, found.offsets_s, found.outliers, strict=True)
-            if out
-        ]
-        log.warning(
-            "the stamps of the cameras contradict each other and no majority agrees (%s); check their clocks",
-            ", ".join(offsets),
-        )
-
-
-def corrected(frames: Iterable[CalibratedFrame], clocks: CameraClocks) -> list[CalibratedFrame]:
-    """The frames that are admitted, in corrected time."""
-    return [admitted for frame in frames if (admitted := clocks.admit(frame)) is not None]
+    def _report_undecided(self) -> None:
+        if self._now_ns > self._undecided_ns + UNDECIDED_NS:
+            self._undecided_ns = self._now_ns
+            log.warning(
+                "the stamps of the cameras contradict each other, and it is not clear which of them are wrong; "
+                "check the clocks of %s",
+                ", ".join(self._cameras.names),
+            )

@@ -2,11 +2,12 @@
 """Estimates the time offsets of all cameras together from moving robots; docs/time_offsets.md derives it.
 
 A stamp that is off by d moves a detection by d times the image velocity of its marker; a camera that was moved
-slightly shifts all detections alike. The poses of the robots are free in each frame set, so the estimate depends on no
-history: it compares the cameras of the set with each other.
+slightly shifts all detections alike. Poses and velocities of the robots are free in each frame set, so the estimate
+depends on no history: it compares the cameras of the set with each other.
 """
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from fusion.model.observations import MatchedObservations
 from fusion.model.states import POSITION, THETA, States
 
 SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detection
-WEAK = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # prior information of a pose, 1 / rad^2 and 1 / m^2
+FREE = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # pose and velocity of a state, which a wrong clock displaces too
+WEAK = np.repeat([1.0, 1.0, 4.0], 3)  # their prior information: 1 / rad^2, 1 / m^2, s^2 / m^2
 CAUCHY = 4.0  # standard deviations, as in docs/fusion_filter.md section 4
 SHIFT_PX = 2.0  # prior standard deviation of the shift of an image by calibration errors or a touch
 SIGMAS = 5.0  # by which an offset must differ from those of the majority
-SAME_S = 0.0015  # offsets within this and 3 sigma of each other are equal
+EXPLAINED = 0.85  # of the contradiction, by the cameras at fault
+MAX_GROUP = 3  # cameras at fault at the same time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,21 +72,28 @@ class OffsetInformation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Disagreement:
-    """Offsets (C,) and their standard deviations relative to the majority, and the cameras that differ from it.
+    """Cameras whose clocks contradict the others.
 
-    `has_majority` is False if no largest group of cameras agrees: `outliers` are then all cameras with information.
+    Attributes:
+        cameras: indices of the smallest group whose offsets explain the contradiction; empty if several groups of less
+            than half of the cameras do, or none.
+        offsets_s, sigma_s: of these, by which the clocks differ from those of the others.
     """
 
-    offsets_s: Array
-    sigma_s: Array
-    outliers: Mask
-    has_majority: bool
+    cameras: tuple[int, ...] = ()
+    offsets_s: tuple[float, ...] = ()
+    sigma_s: tuple[float, ...] = ()
+
+    @property
+    def columns(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+        """Cameras, offsets and standard deviations."""
+        return self.cameras, self.offsets_s, self.sigma_s
 
 
 def offset_information(
     cameras: CameraArray, states: States, observations: MatchedObservations, single: Mask
 ) -> OffsetInformation:
-    """The information of one frame set about the time offsets of the cameras; poses of robots are eliminated.
+    """The information of one frame set about the time offsets of the cameras; the states of robots are eliminated.
 
     Args:
         cameras: C cameras.
@@ -101,7 +111,7 @@ def offset_information(
     k, weights = J.shape[2] - 3 * n, np.ones(len(e))
     for _ in range(2):  # reweighted once, by the residuals without the offsets
         H, right = _normal_equations(J, e, weights)
-        H[np.arange(k), np.arange(k)] += np.tile(WEAK, k // 6)
+        H[np.arange(k), np.arange(k)] += np.tile(WEAK, k // len(WEAK))
         prior = np.concatenate([np.zeros(k), np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
         solution = np.linalg.solve(H + np.diag(prior), right)
         weights = 1 / (1 + np.sum((e - J @ solution) ** 2, 1) / CAUCHY**2)
@@ -118,66 +128,52 @@ def offset_information(
 def disagreement(
     info: OffsetInformation, min_shift_px: float, has_shifts: bool = False
 ) -> Disagreement | None:
-    """The cameras whose offsets differ from those of the largest group; None if none differs.
+    """The cameras whose offsets differ from those of the others; None if none differs.
 
-    A common offset of all cameras is unobservable, so offsets are relative to the group that most cameras share.
+    A common offset of all cameras is unobservable. So the smallest group of cameras is searched whose offsets, with
+    those of the others zero, explain as much as all offsets do.
 
     Args:
         info: of some frame sets.
         min_shift_px: RMS image motion that an offset must explain: calibration errors explain less.
         has_shifts: whether images may be shifted too; then offsets are known only where motions differ.
     """
-    n = len(info.count)
     M, y = info.with_unknown_shifts() if has_shifts else info.without_shifts()
     known = np.flatnonzero((info.count > 0) & (np.diag(M) > 1.0))
-    if len(known) < 2:
-        return None
     M, y = M[np.ix_(known, known)], y[known]
-    offsets = np.linalg.pinv(M, rcond=1e-6) @ y
     speed_px = np.sqrt(info.motion_px2[known] / info.count[known])
-    sigma = np.sqrt(1 / np.diag(M))
-    same = 3 * np.hypot(sigma[:, None], sigma) + SAME_S
-    agree = np.abs(offsets[:, None] - offsets) < same
-    size = agree.sum(1)
-    first = int(np.argmax(size))
-    group = agree[first]
-    offsets, sigma_group = _relative_to(group, M, y)
-    significant = (np.abs(offsets) > SIGMAS * np.hypot(sigma, sigma_group)) & (
-        np.abs(offsets) * speed_px > min_shift_px
-    )
-    outliers = significant & ~group
-    if not outliers.any():
+    offsets = np.linalg.pinv(M, rcond=1e-6, hermitian=True) @ y
+    total = float(y @ offsets)
+    if len(known) < 2 or total < SIGMAS**2 or float(np.max(np.abs(y) / np.diag(M) * speed_px)) < min_shift_px:
         return None
-    rivals = size[outliers] >= size[first]
-    return Disagreement(
-        _spread(offsets, known, n),
-        _spread(np.hypot(sigma, sigma_group), known, n),
-        _spread(outliers | rivals.any(), known, n).astype(bool),
-        not rivals.any(),
-    )
+    group = _smallest_group(M, y, EXPLAINED * total)
+    if not group:
+        return Disagreement()
+    inverse = np.linalg.inv(M[np.ix_(group, group)])
+    found, sigma = inverse @ y[list(group)], np.sqrt(np.diag(inverse))
+    shift_px = np.abs(found) * speed_px[list(group)]
+    if (np.abs(found) < SIGMAS * sigma).any() or (shift_px < min_shift_px).any():
+        return None
+    return Disagreement(tuple(known[list(group)].tolist()), tuple(found.tolist()), tuple(sigma.tolist()))
 
 
-def _relative_to(group: Mask, M: Array, y: Array) -> tuple[Array, Array]:
-    """Offsets (K,) if those of the group are zero, and their standard deviations."""
-    out, fixed = np.flatnonzero(~group), np.zeros(len(group))
-    if not len(out):
-        return np.zeros(len(group)), fixed
-    inverse = np.linalg.pinv(M[np.ix_(out, out)], rcond=1e-9)
-    solved, sigma = np.zeros(len(group)), np.zeros(len(group))
-    solved[out], sigma[out] = inverse @ y[out], np.sqrt(np.maximum(np.diag(inverse), 0))
-    return solved, sigma
-
-
-def _spread(values: Array | Mask, rows: Index, n: int) -> Array:
-    spread = np.zeros(n)
-    spread[rows] = values
-    return spread
+def _smallest_group(M: Array, y: Array, explained: float) -> tuple[int, ...]:
+    """The only smallest group of less than half of the cameras that explains so much; empty if there is none."""
+    n = len(y)
+    for size in range(1, min((n - 1) // 2, MAX_GROUP) + 1):
+        groups = np.array(list(combinations(range(n), size)))
+        right = y[groups]
+        solved = np.linalg.solve(M[groups[:, :, None], groups[:, None]], right[..., None])[..., 0]
+        good = np.flatnonzero(np.sum(right * solved, 1) >= explained)
+        if len(good):
+            return tuple(groups[good[0]].tolist()) if len(good) == 1 else ()
+    return ()
 
 
 def _equations(
     cameras: CameraArray, states: States, observations: MatchedObservations, single: Mask
 ) -> tuple[Array, Array, Array]:
-    """Whitened derivatives by the pose (N, 2, 6) and by the time (N, 2), and residuals (N, 2); zero if not visible."""
+    """Whitened derivatives by `FREE` (N, 2, 9) and by the time (N, 2), and residuals (N, 2); zero if not visible."""
     discs, seen = observations.discs, observations.detections
     cov = seen.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
     whiten = MatchedObservations.of_discs(replace(seen, cov=cov), discs).whiten
@@ -186,21 +182,22 @@ def _equations(
     spin = np.einsum("nji,nj->ni", states.R, states.omega)[discs.body]  # body frame
     g = np.einsum("nai,ni->na", rows[:, :, THETA], spin)
     g += np.einsum("nai,ni->na", rows[:, :, POSITION], states.v[discs.body])
-    return rows[:, :, :6], g, rows[:, :, 12]
+    return rows[:, :, FREE], g, rows[:, :, 12]
 
 
 def _jacobian(A: Array, by_camera: Array, body: Index, camera: Index, n_cameras: int) -> Array:
-    """(N, 2, 6 B + 3 C): poses of B bodies, then the time offsets of C cameras, then their image shifts.
+    """(N, 2, 9 B + 3 C): the free states of B bodies, then the time offsets of C cameras, then their image shifts.
 
     Args:
-        A: (N, 2, 6) by the pose.
+        A: (N, 2, 9) by the free states.
         by_camera: (N, 2, 3) by the time offset and the image shift.
         body, camera: (N,).
         n_cameras: C.
     """
-    k = 6 * (int(body.max()) + 1)
+    size = A.shape[2]
+    k = size * (int(body.max()) + 1)
     J, rows = np.zeros((len(A), 2, k + 3 * n_cameras)), np.arange(len(A))[:, None]
-    J[rows, :, 6 * body[:, None] + np.arange(6)] = A.transpose(0, 2, 1)
+    J[rows, :, size * body[:, None] + np.arange(size)] = A.transpose(0, 2, 1)
     shift = k + n_cameras + 2 * camera
     columns = np.stack([k + camera, shift, shift + 1], 1)
     J[rows, :, columns] = by_camera.transpose(0, 2, 1)

@@ -30,13 +30,18 @@ def drift(at_s: float, ppm: float) -> StampError:
     return lambda t_s: max(t_s - at_s, 0.0) * ppm * 1e-6
 
 
-def arrivals(load: Load, seconds: float, faults: Mapping[str, StampError]) -> list[tuple[int, Detections]]:
-    """The messages of a load in order of arrival, with the stamps of faulty cameras."""
+def arrivals(
+    load: Load, seconds: float, faults: Mapping[str, StampError], jitter_s: float | None = JITTER_S
+) -> list[tuple[int, Detections]]:
+    """The messages of a load in order of arrival, with the stamps of faulty cameras.
+
+    Without `jitter_s` each frame arrives at its stamp: a recording that has no arrival times.
+    """
     rng, messages = np.random.default_rng(load.seed + 9), []
     for message in load.messages(seconds):
-        lag_ns = round((LAG_S + rng.exponential(JITTER_S)) * 1e9)
         fault = faults.get(message.camera)
         error_ns = round(fault((message.t_ns - START_NS) * 1e-9) * 1e9) if fault else 0
+        lag_ns = error_ns if jitter_s is None else round((LAG_S + rng.exponential(jitter_s)) * 1e9)
         stamped = msgspec.structs.replace(
             message, t_ns=message.t_ns + error_ns, sent_ns=message.sent_ns + error_ns
         )
@@ -99,14 +104,16 @@ def seconds(t_ns: int) -> float:
     return (t_ns - START_NS) * 1e-9
 
 
-def fuse(load: Load, duration_s: float, faults: Mapping[str, StampError]) -> Outcome:
+def fuse(
+    load: Load, duration_s: float, faults: Mapping[str, StampError], jitter_s: float | None = JITTER_S
+) -> Outcome:
     """Track a recording of faulty cameras, in order of arrival, by the code of `fusion run` and the server."""
     outcome, summary, log = Outcome(), Summary(), _Log()
     logger = logging.getLogger("fusion")
     logger.addHandler(log)
     try:
         arena = OfflineArena(load.rig, load.bodies)
-        for result in fuse_recording(arrivals(load, duration_s, faults), arena, summary):
+        for result in fuse_recording(arrivals(load, duration_s, faults, jitter_s), arena, summary):
             _add(outcome, load, result.poses)
             for name, use in result.cameras.items():
                 if use.used:
