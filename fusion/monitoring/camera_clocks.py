@@ -27,11 +27,11 @@ from fusion.monitoring.time_offsets import OffsetInformation, disagreement, offs
 from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_time_shift
 
 log = logging.getLogger("fusion")
-ClockState = Literal["correct", "excluded", "corrected", "undecided"]
+ClockState = Literal["correct", "excluded", "corrected"]
 
 FAST_NS = 120_000_000  # of frame sets that show a jump
-SLOW_S = 6.0  # time constant of the information that shows a drift
-JUMP_PX, DRIFT_PX = 1.5, 0.6  # RMS image motion that an offset must explain
+SLOW_S = 8.0  # time constant of the information that shows a drift
+JUMP_PX, DRIFT_PX = 1.5, 0.4  # RMS image motion that an offset must explain
 MIN_DRIFT_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest correction of a drift
 MIN_SLOW_NS = 1_500_000_000  # of frame sets, for a correction of a drift
 KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
@@ -39,14 +39,15 @@ MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
 MIN_EXPECTED = 16  # moving markers, for a decision
 GIVE_UP_NS = 1_500_000_000  # without an explanation by time: above `RANGE_S`, so that the history covers it
-STATIC_NS = 1_000_000_000  # without any moving robot, after which the arrival decides
+STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the arrival decides
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
-SMALL_S = 0.002  # an offset below this is none
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
 MAX_MARKERS = 160  # observations of a frame set that are compared
 MIN_SPEED_M_S = 0.03  # of a robot that is compared
-UNDECIDED_NS = 10_000_000_000  # between reports without a majority
+UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
+MAX_SPREAD_S = 0.1  # standard deviation of all stamps meanwhile
+HELD_NS = 3_000_000_000  # after such a contradiction no camera counts as moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ class _Clock:
         correction_ns, sigma_s: added to its stamps, and the standard deviation.
         frames: the last frames, with the present correction.
         since_ns: server time of the exclusion; 0 while the camera is in use.
-        arrival_jump_ns: the jump according to the arrival, None if this shows none.
+        has_jumped: whether the arrival of its frames shows a jump.
         searched_ns, trusted_ns: times of the last search, and until which no evidence of the same kind counts.
     """
 
@@ -76,7 +77,7 @@ class _Clock:
     check: StampCheck = field(default_factory=StampCheck)
     frames: deque[CalibratedFrame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     since_ns: int = 0
-    arrival_jump_ns: int | None = None
+    has_jumped: bool = False
     searched_ns: int = 0
     trusted_ns: int = 0
 
@@ -98,7 +99,8 @@ class CameraClocks:
         self._history: deque[Snapshot] = deque()
         self._fast: deque[tuple[int, OffsetInformation]] = deque()
         self._slow, self._slow_since_ns = OffsetInformation.none(len(cameras.names)), 0
-        self._now_ns = self._undecided_ns = 0
+        self._now_ns = self._undecided_ns = self._reported_ns = 0
+        self._undecided_s = 0.0
 
     @property
     def excluded(self) -> set[str]:
@@ -119,15 +121,12 @@ class CameraClocks:
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """The frame in corrected time; None while its camera is excluded, or if that time is in the future."""
         clock = self._clocks[frame.camera]
-        jump_ns = clock.check.jump_ns(frame.t_ns, frame.received_ns)
-        frame = replace(
-            frame,
-            t_ns=frame.t_ns + clock.correction_ns,
-            clock_sigma_s=float(np.hypot(frame.clock_sigma_s, clock.sigma_s)),
-        )
-        if jump_ns is not None and clock.state != "excluded" and frame.received_ns > clock.trusted_ns:
+        has_jumped = clock.check.has_jumped(frame.t_ns, frame.received_ns)
+        sigma_s = np.sqrt(frame.clock_sigma_s**2 + clock.sigma_s**2 + self._common_sigma_s() ** 2)
+        frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=float(sigma_s))
+        if has_jumped and clock.state != "excluded" and frame.received_ns > clock.trusted_ns:
             self._exclude(clock, frame.received_ns, 0)
-            clock.arrival_jump_ns = jump_ns or None
+            clock.has_jumped = True
         clock.frames.append(frame)
         if clock.state == "excluded" or frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
             return None
@@ -162,11 +161,13 @@ class CameraClocks:
             self._search(name)
 
     def suspects(self, name: str) -> bool:
-        """Whether time explains the last detections of a camera; it is then excluded here, or corrected."""
+        """Whether time explains the last detections of a camera, which is then excluded here, or may explain them."""
         clock = self._clocks[name]
         if clock.state != "excluded":
             shift = self._shift(name, clock)
-            if shift is None or not shift.is_clear or abs(shift.offset_s) < max(SMALL_S, 3 * shift.sigma_s):
+            if self._is_undecided():
+                return True
+            if shift is None or not shift.explains(MIN_EXPECTED) or shift.is_zero:
                 return False
             self._exclude(clock, self._now_ns, KEPT_NS)
             self._search(name)
@@ -176,6 +177,14 @@ class CameraClocks:
         """Forget the clock of a camera that has another calibration."""
         self._clocks[name] = _Clock()
         self._forget()
+
+    def _is_undecided(self) -> bool:
+        """Whether cameras contradicted each other lately and no majority decided."""
+        return bool(self._undecided_ns) and self._now_ns < self._undecided_ns + HELD_NS
+
+    def _common_sigma_s(self) -> float:
+        """The standard deviation of all stamps, as long as it is not known which of them are wrong."""
+        return self._undecided_s if self._is_undecided() else 0.0
 
     # Evidence.
 
@@ -205,7 +214,7 @@ class CameraClocks:
         if found is None:
             return
         if not found.cameras:
-            self._report_undecided()
+            self._report_undecided(found.spread_s)
             return
         for k in found.cameras:
             clock = self._clocks[self._cameras.names[k]]
@@ -233,7 +242,7 @@ class CameraClocks:
 
     def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
         """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
-        clock.state, clock.since_ns, clock.arrival_jump_ns = "excluded", now_ns, None
+        clock.state, clock.since_ns, clock.has_jumped = "excluded", now_ns, False
         while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
             clock.frames.popleft()
         if not back_ns:
@@ -250,13 +259,18 @@ class CameraClocks:
             return
         clock.searched_ns = self._now_ns
         shift, waited_ns = self._shift(name, clock), self._now_ns - clock.since_ns
-        if shift is not None and shift.is_clear and shift.n_expected >= MIN_EXPECTED:
-            if abs(shift.offset_s) < max(SMALL_S, 3 * shift.sigma_s):
+        jump_ns = clock.check.jump_ns() if clock.has_jumped else None
+        if (
+            shift is not None
+            and shift.explains(MIN_EXPECTED)
+            and (jump_ns is None or shift.resolves(jump_ns * 1e-9))
+        ):
+            if shift.is_zero:
                 self._readmit(clock)
             elif shift.is_told_apart:
                 self._correct_jump(name, shift.offset_s, shift.sigma_s)
-        elif shift is None and waited_ns > STATIC_NS and clock.arrival_jump_ns is not None:
-            self._correct_jump(name, -clock.arrival_jump_ns * 1e-9, ARRIVAL_SIGMA_S)
+        elif jump_ns is not None and waited_ns > STATIC_NS:
+            self._correct_jump(name, -jump_ns * 1e-9, ARRIVAL_SIGMA_S)
         elif waited_ns > GIVE_UP_NS:
             self._readmit(clock)
 
@@ -292,9 +306,10 @@ class CameraClocks:
         self._fast.clear()
         self._slow, self._slow_since_ns = OffsetInformation.none(len(self._cameras.names)), 0
 
-    def _report_undecided(self) -> None:
-        if self._now_ns > self._undecided_ns + UNDECIDED_NS:
-            self._undecided_ns = self._now_ns
+    def _report_undecided(self, spread_s: float) -> None:
+        self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)
+        if self._now_ns > self._reported_ns + UNDECIDED_NS:
+            self._reported_ns = self._now_ns
             log.warning(
                 "the stamps of the cameras contradict each other, and it is not clear which of them are wrong; "
                 "check the clocks of %s",

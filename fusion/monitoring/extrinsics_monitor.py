@@ -202,7 +202,7 @@ class ExtrinsicsMonitor:
 def _expected_points(scene: TrackedScene, name: str, tau: float, markers: Index) -> Array:
     """(3, N) points, world frame, that project to the outlines' centres of markers that the camera should see."""
     camera, lens = scene.cameras.index[name], scene.cameras[name]
-    exposures = Exposures(np.array([camera]), np.array([tau]))
+    exposures = Exposures.exact(np.array([camera]), np.array([tau]))
     discs = scene.marker_table.discs(markers, np.zeros(len(markers), np.intp))
     views = scene.cameras.views(scene.states, exposures, discs)
     points = scene.cameras.R_cam_world[camera].T @ views.q + scene.cameras.centres[camera][:, None]

@@ -20,30 +20,30 @@ class StampCheck:
     """
 
     def __init__(self) -> None:
+        self._usual_ns: float | None = None  # lag before the last jump
         self._lags: deque[int] = deque(maxlen=HISTORY)
         self._stamps: deque[int] = deque(maxlen=LEARNED)
 
-    def jump_ns(self, t_ns: int, received_ns: int) -> int | None:
-        """By how much the stamp `t_ns` jumped, 0 if this is unknown; None if nothing shows that it did."""
-        lag, jump = received_ns - t_ns, None
+    def has_jumped(self, t_ns: int, received_ns: int) -> bool:
+        """Whether the stamp `t_ns` of the next frame jumped; the frames before it are forgotten then."""
+        lag, jumped = received_ns - t_ns, False
         if len(self._lags) >= LEARNED:
             first, usual, late, last = np.percentile(self._lags, [0, 50, 95, 100])
+            is_known = not first == last == lag
             is_early = lag < first - MIN_JUMP_NS
-            is_late = lag > late + MIN_JUMP_NS and self._is_irregular(t_ns)
-            if is_early or is_late:
-                jump = round(usual) - lag
-            elif first == last == lag and (self._is_irregular(t_ns) or self._is_after_gap(t_ns)):
-                jump = 0
-        if jump is not None:
-            self.reset()
+            is_late = (lag > late + MIN_JUMP_NS or not is_known) and self._is_irregular(t_ns)
+            jumped = is_early or is_late or (not is_known and self._is_after_gap(t_ns))
+            if jumped:
+                self._usual_ns = float(usual) if is_known else None
+                self._lags.clear()
+                self._stamps.clear()
         self._lags.append(lag)
         self._stamps.append(t_ns)
-        return jump
+        return jumped
 
-    def reset(self) -> None:
-        """Forget all frames."""
-        self._lags.clear()
-        self._stamps.clear()
+    def jump_ns(self) -> float | None:
+        """By how much the stamps jumped, from the lags before and since; None if arrivals do not show it."""
+        return None if self._usual_ns is None else self._usual_ns - float(np.median(self._lags))
 
     def _interval_ns(self) -> float:
         return max(1.0, float(np.median(np.diff(self._stamps))))

@@ -19,6 +19,7 @@ from fusion.model.states import POSITION, THETA, States
 SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detection
 FREE = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # pose and velocity of a state, which a wrong clock displaces too
 WEAK = np.repeat([1.0, 1.0, 4.0], 3)  # their prior information: 1 / rad^2, 1 / m^2, s^2 / m^2
+REWEIGHTED = 1  # times: by the residuals that offsets do not explain
 CAUCHY = 4.0  # standard deviations, as in docs/fusion_filter.md section 4
 SHIFT_PX = 2.0  # prior standard deviation of the shift of an image by calibration errors or a touch
 SIGMAS = 5.0  # by which an offset must differ from those of the majority
@@ -78,11 +79,13 @@ class Disagreement:
         cameras: indices of the smallest group whose offsets explain the contradiction; empty if several groups of less
             than half of the cameras do, or none.
         offsets_s, sigma_s: of these, by which the clocks differ from those of the others.
+        spread_s: RMS of the offsets of all cameras.
     """
 
     cameras: tuple[int, ...] = ()
     offsets_s: tuple[float, ...] = ()
     sigma_s: tuple[float, ...] = ()
+    spread_s: float = 0.0
 
     @property
     def columns(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
@@ -109,18 +112,20 @@ def offset_information(
     camera = observations.detections.camera
     J = _jacobian(A, np.concatenate([g[:, :, None], _whitened_shifts(observations)], 2), body, camera, n)
     k, weights = J.shape[2] - 3 * n, np.ones(len(e))
-    for _ in range(2):  # reweighted once, by the residuals without the offsets
-        H, right = _normal_equations(J, e, weights)
-        H[np.arange(k), np.arange(k)] += np.tile(WEAK, k // len(WEAK))
-        prior = np.concatenate([np.zeros(k), np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
+    states_prior = np.tile(WEAK, k // len(WEAK))
+    prior = np.concatenate([states_prior, np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
+    H, right = _normal_equations(J, e, weights)
+    for _ in range(REWEIGHTED):
         solution = np.linalg.solve(H + np.diag(prior), right)
         weights = 1 / (1 + np.sum((e - J @ solution) ** 2, 1) / CAUCHY**2)
+        H, right = _normal_equations(J, e, weights)
+    H[np.arange(k), np.arange(k)] += states_prior
     by_pose = np.linalg.solve(H[:k, :k], np.column_stack([H[:k, k:], right[:k]]))
-    motion = np.sum(g**2, 1) * _variance_px2(observations)
+    motion = np.sum(g**2, axis=1) * _variance_px2(observations)
     return OffsetInformation(
         H[k:, k:] - H[k:, :k] @ by_pose[:, :-1],
         right[k:] - H[k:, :k] @ by_pose[:, -1],
-        np.bincount(camera, motion, n),
+        np.bincount(camera, motion, n).astype(float),
         np.bincount(camera, minlength=n).astype(float),
     )
 
@@ -148,13 +153,14 @@ def disagreement(
         return None
     group = _smallest_group(M, y, EXPLAINED * total)
     if not group:
-        return Disagreement()
+        return Disagreement(spread_s=float(np.std(offsets)))
     inverse = np.linalg.inv(M[np.ix_(group, group)])
     found, sigma = inverse @ y[list(group)], np.sqrt(np.diag(inverse))
     shift_px = np.abs(found) * speed_px[list(group)]
     if (np.abs(found) < SIGMAS * sigma).any() or (shift_px < min_shift_px).any():
         return None
-    return Disagreement(tuple(known[list(group)].tolist()), tuple(found.tolist()), tuple(sigma.tolist()))
+    cameras = tuple(known[list(group)].tolist())
+    return Disagreement(cameras, tuple(found.tolist()), tuple(sigma.tolist()), float(np.std(offsets)))
 
 
 def _smallest_group(M: Array, y: Array, explained: float) -> tuple[int, ...]:
@@ -207,7 +213,7 @@ def _jacobian(A: Array, by_camera: Array, body: Index, camera: Index, n_cameras:
 def _whitened_shifts(observations: MatchedObservations) -> Array:
     """(N, 2, 2) whitened derivatives by a shift of the image: L^-1, where L L^T is the covariance."""
     cov = observations.detections.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
-    return np.linalg.inv(np.linalg.cholesky(cov.transpose(2, 0, 1)))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov.transpose(2, 0, 1))), float)
 
 
 def _normal_equations(J: Array, e: Array, weights: Array) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ APART_PX2 = (
     25.0  # squared deviations of the shifts from their mean, above which no moved camera explains them
 )
 NOISE_PX = 0.5  # of one vote
+SMALL_S = 0.002  # an offset below this is none
 MAX_ROBOTS = 6
 
 
@@ -62,9 +63,17 @@ class TimeShift:
     is_told_apart: bool
 
     @property
-    def is_clear(self) -> bool:
-        """Whether the frames were taken at this offset."""
-        return self.share >= MIN_SHARE and self.is_unique
+    def is_zero(self) -> bool:
+        """Whether the clock is right, as far as the motion shows."""
+        return abs(self.offset_s) < max(SMALL_S, 3 * self.sigma_s)
+
+    def explains(self, n_markers: int) -> bool:
+        """Whether the frames were taken at this offset, according to so many markers at least."""
+        return self.share >= MIN_SHARE and self.is_unique and self.n_expected >= n_markers
+
+    def resolves(self, offset_s: float) -> bool:
+        """Whether the motion is fast enough to show such an offset."""
+        return 6 * self.sigma_s < max(abs(offset_s), SMALL_S)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +131,7 @@ def _trajectories(
     discs = markers.discs(np.tile(rows, len(history)), np.zeros(len(rows) * len(history), np.intp))
     body = np.repeat(np.arange(len(history)) * n_robots, len(rows)) + discs.body
     camera = cameras.index[name]
-    exposures = Exposures(np.array([camera]), np.zeros(1))
+    exposures = Exposures.exact(np.array([camera]), np.zeros(1))
     views = cameras.views(
         joined, exposures, type(discs)(discs.frame, body, discs.marker, discs.position, discs.radius)
     )
@@ -144,7 +153,7 @@ def _votes(frames: Sequence[CalibratedFrame], trajectories: _Trajectories) -> _V
     begin, along, length2, dt = begin[s, m], along[s, m], length2[s, m], dt[s, 0]
     offsets, velocities, expected = [], [], np.zeros(_n_bins())
     for frame in frames:
-        start_s = (t_ns[s] - frame.t_ns) * 1e-9
+        start_s = np.asarray((t_ns[s] - frame.t_ns) * 1e-9, float)
         off = frame.roundels.uv[None] - begin[:, None]
         share = np.einsum("kdi,ki->kd", off, along) / length2[:, None]
         cross = (

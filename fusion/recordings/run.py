@@ -109,6 +109,8 @@ def _synchronize(
             frame = clocks.admit(CalibratedFrame.of(message, camera, received_ns))
             if frame is not None:
                 synchronizer.add(frame)
+            else:
+                faults[f"frames of camera '{message.camera}', whose clock was wrong"] += 1
             yield from synchronizer.take(received_ns)
     for name, late in synchronizer.late.items():
         if late:

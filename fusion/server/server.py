@@ -177,6 +177,7 @@ class Server:
             calibrated=frozenset(self.pipeline.cameras),
             late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            clocks=self.pipeline.clocks(),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
         self._publisher.publish_status(self.statistics.report(now_ns, pipeline))
@@ -186,9 +187,14 @@ class Server:
 
     def _receive_detections(self, data: bytes, key: str, received_ns: int) -> None:
         frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
+        if frame is None:
+            return
+        frame, name = self.pipeline.admit(frame), frame.camera
         if frame is not None:
             is_on_time = self.pipeline.synchronizer.add(frame)
-            self.statistics.note_lateness(frame.camera, is_on_time, (self.clock.now_ns() - frame.t_ns) * 1e-6)
+            self.statistics.note_lateness(name, is_on_time, (self.clock.now_ns() - frame.t_ns) * 1e-6)
+        elif name not in self.pipeline.excluded_clocks():
+            self.statistics.count_fault("implausible time")
 
     def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:

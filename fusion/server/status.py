@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
@@ -28,12 +29,14 @@ class PipelineStatus:
         calibrated: cameras with a pose in the active rig.
         late: frames dropped since the start because they were late, by camera.
         excluded: cameras that were moved, whose detections are excluded.
+        clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
     """
 
     calibrated: frozenset[str] = frozenset()
     late: dict[str, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
+    clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
 
 
@@ -169,6 +172,7 @@ def memory_mb() -> float:
 def _camera_health(
     name: str, camera: _CameraCounts, seconds: float, pipeline: PipelineStatus
 ) -> CameraHealth:
+    clock = pipeline.clocks.get(name, ClockHealth())
     return CameraHealth(
         fps=len(camera.lateness_ms) / seconds,
         lateness_ms=float(np.mean(camera.lateness_ms)) if camera.lateness_ms else 0.0,
@@ -179,4 +183,7 @@ def _camera_health(
         calibrated=name in pipeline.calibrated,
         excluded=name in pipeline.excluded,
         duplicate_publisher=camera.has_two_publishers,
+        clock=clock.state,
+        clock_correction_ms=clock.offset_ms,
+        clock_sigma_ms=clock.sigma_ms,
     )

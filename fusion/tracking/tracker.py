@@ -189,6 +189,8 @@ class Tracker:
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
+        if camera.time_offset_ms != self.cameras[name].time_offset_ms:
+            self.clocks.reset(name)
         self.cameras.place(name, camera)
         (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)
 

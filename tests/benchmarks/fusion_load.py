@@ -151,7 +151,7 @@ class _Scene:
         """One frame's message."""
         name, t_ns = self.cameras.names[camera], START_NS + round(t_s * 1e9)
         states = self.load.paths.at((t_ns - START_NS) * 1e-9)
-        exposures = Exposures(np.array([camera]), np.zeros(1))
+        exposures = Exposures.exact(np.array([camera]), np.zeros(1))
         n = len(self.marker_table)
         views = self.cameras.views(
             states, exposures, self.marker_table.discs(np.arange(n), np.zeros(n, np.intp))
