@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`python -m calib`: calibrates lenses, camera poses and the world frame."""
 
+import logging
 import sys
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from calib.commands.undo import Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
 from camera_node.errors import run
+from camera_node.logs import set_up_logging
 
 Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]
@@ -26,6 +28,7 @@ Command = (
 
 def main() -> None:
     """The program `roundel-calib`."""
+    set_up_logging(logging.WARNING)
     run(lambda: execute(sys.argv[1:]))
 
 

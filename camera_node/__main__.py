@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels."""
 
-import logging
 import sys
 
 import tyro
 
 from camera_node.commands.publish import Publish
 from camera_node.errors import check_command, run
+from camera_node.logs import set_up_logging
 
 
 def main() -> None:
     """The entry point of `roundel-camera`."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
+    set_up_logging()
     run(_program)
 
 

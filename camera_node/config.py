@@ -13,58 +13,43 @@ import numpy as np
 import yaml
 
 from camera_node.errors import ConfigError
+from camera_node.text import printable
+from camera_node.yaml_file import read_yaml
 
 T = TypeVar("T")
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-NAME = re.compile(r"[^/*$#?\s]+")  # without the special characters of Zenoh keys
+NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
+NAME_RULE = "use letters, digits, _, . and -, at most 64 characters"
 
 
 def is_name(text: str) -> bool:
-    """Whether a text is a valid name of an arena, a camera or a robot, which are parts of Zenoh keys."""
+    """Whether a text can name an arena, a camera or a robot: names are parts of Zenoh keys and of file names."""
     return NAME.fullmatch(text) is not None
+
+
+def require_name(text: str, what: str) -> str:
+    """The text, if it can name `what`, such as "an arena".
+
+    Raises:
+        ConfigError: it can't.
+    """
+    if not is_name(text):
+        raise ConfigError(f"'{printable(text, 80)}' can't name {what}; {NAME_RULE}")
+    return text
 
 
 def load_yaml(path: Path, kind: type[T]) -> T:
     """Read a YAML file as `kind`.
 
     Raises:
-        ConfigError: the file is missing or unreadable, is not YAML, or does not match `kind`; the message names
-            the file and the place in it, such as `$.cameras.cam0.fx`.
+        ConfigError: as in `read_yaml`, or the content does not match `kind`; the message names the file and the place
+            in it, such as `$.cameras.cam0.fx`.
     """
-    try:
-        text = path.read_bytes()
-        _require_single(yaml.compose(text, _LOADER))
-        data = msgspec.yaml.decode(text)
-    except FileNotFoundError:
-        raise ConfigError(f"{path} does not exist; check the path") from None
-    except OSError as error:
-        raise ConfigError(f"{path} can't be read: {error.strerror}; give a readable file") from None
-    except (msgspec.DecodeError, yaml.YAMLError, UnicodeDecodeError) as error:
-        where = " ".join(str(error).replace('in "<byte string>", ', "at ").split())
-        raise ConfigError(f"{path} is not valid YAML: {where}") from None
+    data = read_yaml(path)
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         fault = _name_entry(data, kind, str(error))
         raise ConfigError(f"{path}: {fault}{_suggest(kind, fault)}") from None
-
-
-def _require_single(node: yaml.Node | None) -> None:
-    """Raise YAMLError where a mapping has a key twice; PyYAML would silently use the last one."""
-    if isinstance(node, yaml.MappingNode):
-        lines: dict[str, int] = {}
-        for key, value in node.value:
-            name, line = str(key.value), key.start_mark.line + 1
-            if name in lines:
-                raise yaml.YAMLError(
-                    f"'{name}' is defined twice, in lines {lines[name]} and {line}; remove one"
-                )
-            lines[name] = line
-            _require_single(value)
-    elif isinstance(node, yaml.SequenceNode):
-        for value in node.value:
-            _require_single(value)
 
 
 def _name_entry(data: Any, kind: type, fault: str) -> str:

@@ -17,6 +17,8 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from camera_node.text import printable
+
 
 class RoundelError(Exception):
     """Base class of all errors that a user can fix."""
@@ -39,7 +41,7 @@ def run(program: Callable[[], int | None]) -> None:
     try:
         code = program()
     except RoundelError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         code = 130

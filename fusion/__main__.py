@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m fusion` is the live server, `python -m fusion NAME` one of the commands."""
 
-import logging
 import sys
 from importlib import import_module
 
 import tyro
 
 from camera_node.errors import check_command, run
+from camera_node.logs import set_up_logging
 from fusion.commands.serve import Serve
 
-COMMANDS = ("run", "replay", "record", "define", "undo", "ros2")  # modules of fusion.commands
+COMMANDS = ("run", "replay", "record", "repair", "define", "undo", "ros2")  # modules of fusion.commands
 
 
 def main() -> None:
     """The entry point of `roundel-fusion`."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
+    set_up_logging()
     run(_program)
 
 

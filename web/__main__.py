@@ -2,6 +2,7 @@
 """`python -m web`: shows an arena or a recording in the browser or in one line per second, or runs the demo."""
 
 import contextlib
+import logging
 import signal
 import threading
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 import tyro
 
 from camera_node.errors import run
+from camera_node.logs import set_up_logging
 from camera_node.protocol.session import open_client
 from web.feed import Feed
 from web.replay import RecordingPlayer
@@ -138,6 +140,7 @@ def program() -> int | None:
 
 
 def main() -> None:
+    set_up_logging(logging.WARNING)
     run(program)
 
 

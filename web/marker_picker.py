@@ -6,7 +6,7 @@ import viser
 from numpy.typing import ArrayLike
 
 from camera_node.arrays import Array
-from camera_node.config import is_name
+from camera_node.config import require_name
 from camera_node.errors import RoundelError
 from fusion.client.define import describe
 from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
@@ -77,8 +77,7 @@ class MarkerPicker:
         """Measure the selected markers and have the server track the robot; return the outcome as text."""
         name = self._name.value
         try:
-            if not is_name(name):
-                raise FusionError(f"'{name}' is not a valid robot name; use letters, digits, - and _")
+            require_name(name, "a robot")
             if not self.selected:
                 raise FusionError("no marker is selected")
             measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))

@@ -50,10 +50,10 @@ class Check(WandOptions):
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> dict[str, Any]:
         with progress_console().status("calibrating camera poses"):
-            result = calibrate(rig, wand, messages, distance)
+            result = calibrate(rig, wand, messages, distance, self.synchronised)
         quality = assess(result, wand, self.height)
         print_report(result, quality)
-        halves = _compare_halves(result.rig, wand, messages, distance)
+        halves = _compare_halves(result, wand, messages, distance)
         with_rig = _compare_with_rig(rig, result)
         if self.maps is not None:
             save_maps(self.maps, result, quality)
@@ -61,7 +61,7 @@ class Check(WandOptions):
 
 
 def _compare_halves(
-    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
+    whole: WandCalibration, wand: Body, messages: Sequence[Detections], distance: Distance | None
 ) -> Agreement | None:
     """Compare calibrations from both halves of a recording.
 
@@ -71,7 +71,9 @@ def _compare_halves(
     exact = distance and replace(distance, sigma_m=0.0)
     try:
         with progress_console().status("calibrating camera poses from each half"):
-            first, second = (calibrate(rig, wand, half, exact) for half in split_halves(messages))
+            first, second = (
+                calibrate(whole.rig, wand, half, exact, whole.synchronous) for half in split_halves(messages)
+            )
             agreement = compare_calibrations(*(CameraPoses.of_calibration(half) for half in (first, second)))
     except CalibrationError as error:
         say(f"warning: the halves of the recording can't be compared: {error}")

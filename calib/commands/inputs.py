@@ -4,6 +4,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from calib.errors import CalibrationError
 from calib.rig.recording import read_detections
@@ -13,6 +16,8 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations
+
+Synchronised = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(aliases=["--synchronized"])]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +36,9 @@ class WandOptions:
     """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
     distance_sigma: float = SIGMA_M
     """Standard deviation of that distance, metres."""
+    synchronised: Synchronised = False
+    """The cameras are triggered together: frames with equal stamps are simultaneous. Without this option, cameras whose
+    stamps are equal count as synchronous unless clock offsets fit the recording better."""
     height: float = 0.1
     """Height of the robots' roundels above the floor, metres, for which errors are predicted."""
     maps: Path | None = None

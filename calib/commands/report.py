@@ -86,6 +86,7 @@ def _drifts(result: WandCalibration) -> list[str]:
 
 def _remarks(report: WandReport) -> list[str]:
     lines = [f"{report.wand_poses} wand poses, residual {report.residual_px:.3f} px"]
+    lines += [*_validation_remarks(report), report.timing]
     if report.sigma_inflation > MIN_INFLATION:
         lines.append(
             f"residuals are correlated in time; standard deviations are inflated by {report.sigma_inflation:.1f} "
@@ -110,6 +111,27 @@ def _remarks(report: WandReport) -> list[str]:
         "world: z up for cameras that are mounted upright, origin below the median of the wand's positions, z = 0 at "
         "the lowest of them"
     )
+    return lines
+
+
+def _validation_remarks(report: WandReport) -> list[str]:
+    lines = []
+    if (given := report.given) is not None:
+        lines.append(
+            f"all {given.count} detections that two cameras or more saw: residual {given.all_px:.2f} px; without the "
+            f"{given.gross:.1%} that are gross errors {given.residual_px:.2f} px"
+        )
+    if (held_out := report.held_out) is not None:
+        unit = (
+            f"{1e3 * held_out.error_m:.2f} mm"
+            if report.metric
+            else f"{1e3 * held_out.relative:.2f} per mille"
+        )
+        at = f"at a distance of {held_out.range_m:.1f} m" if report.metric else "of the distance"
+        lines.append(
+            f"held-out detections ({held_out.count}): viewing rays pass the markers by {unit} {at}, "
+            f"{held_out.residual_px:.2f} px"
+        )
     return lines
 
 

@@ -77,7 +77,7 @@ class Wand(WandOptions):
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> Rig:
         with progress_console().status("calibrating camera poses"):
-            result = calibrate(rig, wand, messages, distance)
+            result = calibrate(rig, wand, messages, distance, self.synchronised)
         quality = assess(result, wand, self.height)
         print_report(result, quality)
         if self.maps is not None:
@@ -89,7 +89,7 @@ class Wand(WandOptions):
 
     def _calibrate_one(self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Rig:
         with progress_console().status(f"calibrating the pose of {name}"):
-            result = recalibrate_camera(rig, wand, messages, name)
+            result = recalibrate_camera(rig, wand, messages, name, self.synchronised)
         print_recalibration(result)
         figures = result.rig.calibration | {"only": {"camera": name, **provenance()}}
         return msgspec.structs.replace(result.rig, calibration=figures)
@@ -146,9 +146,10 @@ class Wand(WandOptions):
         """The command that calibrates from a saved recording with the options of this one."""
         options = {"recording": recording, "wand": self.wand, "rig": self.rig, "out": self.out}
         options |= {"only": self.only, "height": self.height, "maps": self.maps}
+        flags = ["--synchronised"] * self.synchronised
         words = [
             word for name, value in options.items() if value is not None for word in (f"--{name}", value)
         ]
         if self.distance is not None:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
-        return shlex.join(["python", "-m", "calib", "wand", *map(str, words)])
+        return shlex.join(["python", "-m", "calib", "wand", *map(str, words), *flags])

@@ -5,18 +5,20 @@ Messages are in MessagePack as on the wire. `log_time` is the time of arrival, i
 messages of an arena's recording are defined by fusion (`fusion.recordings.record`).
 """
 
+import io
 import os
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import cast
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
 from calib.rig.history import back_up
+from calib.rig.recording_repair import repair_recording
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
@@ -27,18 +29,29 @@ CHUNK = 1 << 16  # bytes compressed together: the most that is lost when a recor
 class RecordingWriter:
     """Writes the messages of an arena; a context manager. A recording that is cut off is readable up to its end.
 
+    Where the disk is full, the file is completed within the space that it has, so that all readers can read it.
+
+    Args:
+        path: the MCAP file.
+        overwrite: replace an existing file.
+
     Raises, at entry:
-        ConfigError: the file can't be written.
+        ConfigError: the file exists or can't be written.
+    Raises, in `put` and at exit:
+        ConfigError: the disk is full.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, overwrite: bool = True) -> None:
         self.path = path
         self.counts: Counter[str] = Counter()
+        self._mode = "wb" if overwrite else "xb"
         self._channels: dict[str, int] = {}
 
     def __enter__(self) -> "RecordingWriter":
         try:
-            self._file: IO[bytes] = self.path.open("wb")
+            self._file = cast(io.BufferedWriter, self.path.open(self._mode))
+        except FileExistsError:
+            raise ConfigError(f"{self.path} exists; give another name, or --force to replace it") from None
         except OSError as error:
             raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
         self._writer = Writer(self._file, chunk_size=CHUNK)
@@ -46,15 +59,41 @@ class RecordingWriter:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        with self._file:
+        if self._file.closed:
+            return
+        try:
             self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+        except OSError as error:
+            raise self._close_full(error) from None
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far."""
+        return self._file.tell()
 
     def put(self, key: str, data: bytes, received_ns: int) -> None:
         """Append a message that arrived on a key."""
-        if key not in self._channels:
-            self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
-        self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
+        try:
+            if key not in self._channels:
+                self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
+            self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
+        except OSError as error:
+            raise self._close_full(error) from None
         self.counts[key] += 1
+
+    def _close_full(self, error: OSError) -> ConfigError:
+        """Close a file that can't grow, with an index in place of its last chunks; the error to raise."""
+        size = os.fstat(self._file.fileno()).st_size
+        self._file.raw.close()  # without the buffered bytes, for which there is no space
+        try:
+            n = repair_recording(self.path, size).n_messages
+            state = f"the recording is closed with {n} messages; free space on the disk"
+        except ConfigError as fault:
+            state = str(fault)
+        return ConfigError(f"{self.path}: {error.strerror}: {state}")
 
 
 def read_messages(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[str, bytes, int]]:
@@ -100,8 +139,6 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
         with RecordingWriter(part) as writer:
             for message in messages:
                 writer.put(keys.detections(message.camera), encode(message), message.t_ns)
-        with part.open("rb+") as file:
-            os.fsync(file.fileno())
         backup = back_up(path)
         os.replace(part, path)
     except OSError as error:

@@ -9,7 +9,7 @@ import msgspec
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.rig.history import back_up
-from camera_node.config import dump_yaml, load_yaml, write_atomically
+from camera_node.config import dump_yaml, load_yaml, require_name, write_atomically
 from camera_node.errors import ConfigError
 
 T = TypeVar("T")
@@ -59,6 +59,8 @@ def load_rig(path: Path) -> Rig:
     rig = _read(path, Rig)
     if not rig.cameras:
         raise ConfigError(f"{path} names no camera; run python -m calib intrinsics")
+    for name in rig.cameras:
+        require_name(name, f"a camera in {path}")
     return rig
 
 

@@ -15,14 +15,20 @@ from calib.wand.bundle_adjustment.problem import (
     CRYSTAL_DRIFT,
     SLEWED_DRIFT,
     Estimate,
+    Problem,
+    State,
     WandObservations,
 )
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
-from calib.wand.quality.checks import check_agreement, check_lenses, check_sizes, check_spacing
+from calib.wand.quality.checks import check_agreement, check_clocks, check_lenses, check_sizes, check_spacing
+from calib.wand.quality.held_out import triangulated_residuals, validate
+from calib.wand.result import Validation
 from calib.wand.trajectory import acceleration_density
 from camera_node.arrays import Array
 
 COARSE_SETS, FINE_SETS = 250, 800  # frame sets of either stage
+MAX_MEASURED = 20_000  # detections whose residuals are stated
+RUN, PARTS = 8, 5  # of this many parts of a recording, runs of consecutive instants, one is held out
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 
 
@@ -45,10 +51,20 @@ class RoughRig:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The adjusted rig, and its observations of the discs' own centres."""
+    """The adjusted rig, and its observations of the discs' own centres.
+
+    Attributes:
+        given: residuals of all detections of the recording, whether the adjustment used them or not.
+        held_out: residuals of a fifth of the instants, at the rig adjusted without these.
+        rejected_px: (r,) distances of the rejected observations from where the other cameras see the marker, pixels;
+            NaN where none does.
+    """
 
     adjusted: Adjusted
     observations: WandObservations
+    given: Validation | None = None
+    held_out: Validation | None = None
+    rejected_px: Array | None = None
 
 
 def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
@@ -60,9 +76,10 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
         CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
         CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
     """
-    rough = _scale(rough)
-    coarse = _adjust_coarsely(recording, rough)
+    rough = scale_rig(rough)
+    coarse = adjust_coarsely(recording, rough)
     check_lenses(recording.names, coarse)
+    check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
     clocks = _choose_clocks(coarse)
     fine = _prepare_fine(recording, rough, coarse, clocks)
@@ -71,10 +88,49 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
     if rough.metric:
         check_sizes(recording.wand, solution.adjusted, solution.observations)
         check_spacing(recording.wand, solution.adjusted, solution.observations)
-    return replace(solution, adjusted=inflate_covariance(solution.adjusted))
+    solution = replace(solution, adjusted=inflate_covariance(solution.adjusted))
+    return _validate(recording, rough, solution)
 
 
-def _scale(rough: RoughRig) -> RoughRig:
+def _validate(recording: LabeledRecording, rough: RoughRig, solution: Solution) -> Solution:
+    """Measure the residuals of all detections, and of detections that are held out.
+
+    Of recordings with very many detections, those in the frame sets of the adjustment are measured.
+    """
+    adjusted, observations = solution.adjusted, solution.observations
+    measured = np.ones(len(recording.detections), bool)
+    if len(measured) > MAX_MEASURED:
+        measured = np.isin(np.arange(len(measured)), observations.row)
+    corrected = recording.with_centres(observations.row, observations.uv).select(measured)
+    residuals = np.full(len(measured), np.nan)
+    residuals[measured] = np.linalg.norm(triangulated_residuals(corrected, adjusted.state)[0], axis=1)
+    run = np.unique(corrected.detections.t_s, return_inverse=True)[1] // RUN
+    last = run % PARTS == PARTS - 1
+    without = _adjust_part(corrected.select(~last), rough, adjusted) if last.any() else None
+    return replace(
+        solution,
+        given=validate(corrected, adjusted.state),
+        held_out=validate(corrected.select(last), without) if without is not None else None,
+        rejected_px=residuals[observations.row[~adjusted.used]],
+    )
+
+
+def _adjust_part(part: LabeledRecording, rough: RoughRig, whole: Adjusted) -> State | None:
+    """The state adjusted to a part of the recording, with the priors of the whole; None where it gives too few frame
+    sets."""
+    state = whole.state
+    lenses = [state.lens(k, lens) for k, lens in enumerate(part.lenses)]
+    near = replace(rough, cameras=state.cameras, offset_s=state.clocks[:, 0])
+    try:
+        start = _build(part.undistort_tracks(lenses), near, FINE_SETS)
+    except CalibrationError:
+        return None
+    problem = replace(whole.problem, knot_s=start.problem.knot_s, fixed_distance=start.problem.fixed_distance)
+    start_state = replace(state, motion=start.state.motion)
+    return adjust(problem, start.observations, start_state, rounds=1).state
+
+
+def scale_rig(rough: RoughRig) -> RoughRig:
     """The rig scaled to the measured distance, or to 1 m between the farthest cameras if it has no scale."""
     if rough.distance is None and rough.metric:
         return rough
@@ -103,18 +159,24 @@ def _build(recording: LabeledRecording, rough: RoughRig, budget: int) -> Estimat
     return replace(start, problem=replace(start.problem, fixed_distance=distance))
 
 
-def _adjust_coarsely(recording: LabeledRecording, rough: RoughRig) -> Adjusted:
-    """Adjust poses, clocks and lenses on few frame sets, after a robust optimization of poses and clocks."""
-    start = _build(recording, rough, COARSE_SETS)
-    clocks = (OFFSET, DRIFT) if np.ptp(start.problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
-    problem = start.problem.with_free(POSE, *clocks)
+def adjust_coarsely(recording: LabeledRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
+    """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
+    start = _build(recording, rough, budget)
+    problem = start.problem.with_free(POSE, *_clock_candidates(recording, start.problem))
     state = optimize_robustly(problem, start.observations, start.state)
     # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
     # motion absorbs noise and the residuals are too small.
-    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.gap_s)
+    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
     return adjust(problem, observations, state)
+
+
+def _clock_candidates(recording: LabeledRecording, problem: Problem) -> tuple[tuple[int, ...], ...]:
+    """The clock parameters that the recording may show."""
+    if recording.timing.synchronous:
+        return ()
+    return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +216,7 @@ def _prepare_fine(
     better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
     start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
     state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses)
-    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.gap_s)
+    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.timing.gap_s)
     problem = start.problem.with_free(POSE, LENS, *clocks.free)
     problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)

@@ -19,17 +19,22 @@ from calib.wand.detections import count_frames
 from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
 from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
 from calib.wand.initialization.two_view import MIN_FRAME_SETS, TwoViewGeometry
-from calib.wand.labeling import WandRecording, label_recording
+from calib.wand.labeling import WandRecording
 from calib.wand.quality.checks import check_motion
 from calib.wand.result import NOT_RECORDED, WandCalibration
 from calib.wand.scale import Distance
+from calib.wand.synchrony import label_by_timing
 from camera_node.arrays import Index
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
 
 def calibrate(
-    rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None = None
+    rig: Rig,
+    wand: Body,
+    messages: Sequence[Detections],
+    distance: Distance | None = None,
+    synchronous: bool = False,
 ) -> WandCalibration:
     """Estimate the poses and clocks of a rig's cameras from a wand recording.
 
@@ -38,6 +43,7 @@ def calibrate(
         wand: its markers; two or more give the scale, one gives it only by the size of the roundel.
         messages: detections of all cameras, in any order; the `id` of a roundel, if given, is its marker number.
         distance: measured between two cameras: the scale for a wand of one marker, else compared with the wand.
+        synchronous: frames with equal stamps are simultaneous; without this, the recording decides.
 
     Returns:
         the rig with poses and time offsets of all cameras that could be placed, and the report.
@@ -48,14 +54,14 @@ def calibrate(
     check_recording(rig, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
-    recording = label_recording(rig, wand, messages)
+    recording, timing = label_by_timing(rig, wand, messages, synchronous)
     if not len(recording.detections):
         raise CalibrationError(_explain_no_wand(recording))
     check_motion(recording.detections, recording.names, recording.lenses)
-    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.frames.period_s())
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
     placement, solution = _solve_majority(recording, pairs, distance)
     absent = {name: NOT_RECORDED for name in rig.cameras if name not in recording.names}
-    return conclude(rig, solution, replace(placement, unplaced=placement.unplaced | absent))
+    return conclude(rig, solution, replace(placement, unplaced=placement.unplaced | absent, timing=timing))
 
 
 def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
@@ -107,7 +113,7 @@ def _solve_majority(
         poses, offset_s = (
             np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
         )
-        labeled = select_cameras(recording, pairs, start.placed)
+        labeled = LabeledRecording.of(recording, pairs, start.placed)
         try:
             return placement, adjust_rig(labeled, RoughRig(poses, offset_s, start.metric, known))
         except CameraFault as fault:
@@ -147,26 +153,6 @@ def _place(
         metric=start.metric,
         scaled_by=distance if by_distance else None,
         compared_with=None if by_distance else distance,
-    )
-
-
-def select_cameras(
-    recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]
-) -> LabeledRecording:
-    """Return the input of the adjustment for the cameras `placed`, renumbered in this order."""
-    number = np.full(len(recording.names), -1)
-    number[placed] = np.arange(len(placed))
-    detections = recording.detections.select(number[recording.detections.camera] >= 0)
-    t_s = recording.frames.t_s
-    return LabeledRecording(
-        replace(detections, camera=number[detections.camera]),
-        [recording.names[k] for k in placed],
-        [recording.lenses[k] for k in placed],
-        [pairs.tracks[k] for k in placed],
-        pairs.wand,
-        pairs.period_s,
-        pairs.gap_s,
-        float(t_s.min() + t_s.max()) / 2,
     )
 
 

@@ -2,7 +2,7 @@
 """Turns the solution of a wand recording into the calibrated rig and its report."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ class Placement:
         metric: whether the wand gives the scale.
         scaled_by: the measured distance that gives the scale.
         compared_with: a measured distance to compare with the wand.
+        timing: whether cameras are taken as synchronous, and why.
     """
 
     names: list[str]
@@ -45,6 +46,7 @@ class Placement:
     metric: bool
     scaled_by: Distance | None
     compared_with: Distance | None
+    timing: str = ""
 
 
 def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibration:
@@ -59,7 +61,7 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
     size = 6 * len(placement.names)
     return WandCalibration(
         rig=_place(rig, adjusted.state, covariance, placement, offsets),
-        report=_build_report(adjusted, covariance, observations, placement),
+        report=_build_report(replace(solution, adjusted=adjusted), covariance, placement),
         names=placement.names,
         adjusted=adjusted,
         observations=observations,
@@ -108,9 +110,8 @@ def _place(
     return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 
 
-def _build_report(
-    adjusted: Adjusted, covariance: CameraCovariance, observations: WandObservations, placement: Placement
-) -> WandReport:
+def _build_report(solution: Solution, covariance: CameraCovariance, placement: Placement) -> WandReport:
+    adjusted, observations = solution.adjusted, solution.observations
     names, distance = placement.names, placement.compared_with
     lengths, cov = measure_lengths(adjusted, observations), covariance.of(POSE)
     return WandReport(
@@ -121,11 +122,14 @@ def _build_report(
         wand_poses=len(adjusted.problem.knot_s),
         length_mean_mm=float(np.mean(lengths)) * 1e3 if len(lengths) else None,
         length_std_mm=float(np.std(lengths)) * 1e3 if len(lengths) else None,
-        outliers=_list_outliers(names, observations, adjusted),
+        outliers=_list_outliers(names, solution),
+        given=solution.given,
+        held_out=solution.held_out,
         metric=placement.metric or placement.scaled_by is not None,
         sigma_inflation=adjusted.inflation**0.5,
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
+        timing=placement.timing,
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },
@@ -150,9 +154,13 @@ def _report_camera(
     )
 
 
-def _list_outliers(names: list[str], observations: WandObservations, adjusted: Adjusted) -> list[Outlier]:
+def _list_outliers(names: list[str], solution: Solution) -> list[Outlier]:
+    """The rejected observations, farthest first, with their distance from where the other cameras see the marker."""
+    observations, adjusted = solution.observations, solution.adjusted
     rows = np.flatnonzero(~adjusted.used)
     distance = np.linalg.norm(adjusted.residuals, axis=1)
+    if solution.rejected_px is not None:
+        distance[rows] = np.where(np.isfinite(solution.rejected_px), solution.rejected_px, distance[rows])
     return [
         Outlier(
             names[observations.camera[row]],

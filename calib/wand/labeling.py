@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calib.rig.rig import Rig
 from calib.wand.detections import FrameTable, WandDetections, gather
 from calib.wand.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
+from calib.wand.timing import Timing
 from calib.wand.two_markers import label_ends
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
@@ -34,6 +35,7 @@ class WandRecording:
     Attributes:
         names, lenses: of its cameras, sorted by name.
         frames: all frames.
+        timing: how the cameras' frames are related in time.
         detections: the markers of the wand, at most one row per frame and marker.
         left_out: by camera, the number of frames without a marker by reason.
     """
@@ -41,12 +43,15 @@ class WandRecording:
     names: list[str]
     lenses: list[Lens]
     frames: FrameTable
+    timing: Timing
     detections: WandDetections
     left_out: list[Counter[str]]
 
 
-def label_recording(rig: Rig, wand: Body, messages: Sequence[Detections]) -> WandRecording:
-    """Collect the detections of a recording and label them.
+def label_recording(
+    rig: Rig, wand: Body, messages: Sequence[Detections], synchronous: bool = False
+) -> WandRecording:
+    """Collect the detections of a recording, of `synchronous` cameras or of others, and label them.
 
     Raises:
         CalibrationError: see `label`.
@@ -54,11 +59,12 @@ def label_recording(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Wan
     names = sorted({message.camera for message in messages})
     lenses: list[Lens] = [rig.cameras[name] for name in names]
     frames, detections = gather(messages, names, lenses)
-    return WandRecording(names, lenses, frames, *label(frames, detections, wand, lenses))
+    timing = Timing(frames.period_s(), synchronous)
+    return WandRecording(names, lenses, frames, timing, *label(frames, timing, detections, wand, lenses))
 
 
 def label(
-    frames: FrameTable, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
+    frames: FrameTable, timing: Timing, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
 ) -> tuple[WandDetections, list[Counter[str]]]:
     """Label the detections that are markers of the wand.
 
@@ -69,7 +75,7 @@ def label(
     Raises:
         CalibrationError: the wand is symmetric and the detections carry no numbers.
     """
-    labels, reason = _assign_labels(frames, detections, wand, lenses)
+    labels, reason = _assign_labels(frames, timing, detections, wand, lenses)
     left_out = [Counter() for _ in lenses]
     without = np.setdiff1d(np.arange(len(frames.t_s)), detections.frame[labels >= 0])
     for camera, why in zip(frames.camera[without].tolist(), reason[without].tolist(), strict=True):
@@ -78,7 +84,7 @@ def label(
 
 
 def _assign_labels(
-    frames: FrameTable, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
+    frames: FrameTable, timing: Timing, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
 ) -> tuple[Index, NDArray[np.object_]]:
     """Return the label (n,) of each detection, -1 for none, and the reason (F,) that applies to frames without one."""
     markers = len(wand.markers)
@@ -94,13 +100,15 @@ def _assign_labels(
     if markers == 2:
         reason[counts == 2] = "the ends of the wand cannot be distinguished"
         reason[counts > 2] = "ambiguous"
-        labels = label_ends(frames, detections, wand, lenses)
+        labels = label_ends(timing, detections, wand, lenses)
     else:
         require_distinct(wand)
         reason[counts > MAX_ROUNDELS] = f"more than {MAX_ROUNDELS} roundels in the frame"
         labels, ambiguous = label_by_spacing(detections, wand, lenses)
         reason[ambiguous] = "ambiguous"
-    return propagate_labels(frames, detections, labels, markers), reason
+    if not timing.synchronous:
+        labels = propagate_labels(frames, detections, labels, markers)
+    return labels, reason
 
 
 def _label_by_number(detections: WandDetections, markers: int) -> Index:

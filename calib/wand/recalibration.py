@@ -17,7 +17,7 @@ from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
 from calib.wand.bundle_adjustment.problem import Estimate, WandObservations
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
-from calib.wand.calibrate import check_recording, select_cameras
+from calib.wand.calibrate import check_recording
 from calib.wand.conclusion import adjusted_camera, clock_values
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import WandRecording, label_recording
@@ -55,7 +55,9 @@ class Recalibration:
     observations: WandObservations
 
 
-def recalibrate_camera(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Recalibration:
+def recalibrate_camera(
+    rig: Rig, wand: Body, messages: Sequence[Detections], name: str, synchronous: bool = False
+) -> Recalibration:
     """Estimate the pose, time offset and lens correction of one camera; all other cameras are fixed.
 
     Args:
@@ -63,17 +65,18 @@ def recalibrate_camera(rig: Rig, wand: Body, messages: Sequence[Detections], nam
         wand: its markers.
         messages: detections of the camera and of others, in any order.
         name: of the camera.
+        synchronous: frames with equal stamps are simultaneous, and the camera has no time offset.
 
     Raises:
         CalibrationError: the camera is not in the rig or the recording, its intrinsics are those of another camera, or
             no placed camera shares enough frame sets with it.
         CameraFault: its lens differs from its file, or its observations contradict those of the others.
     """
-    recording = _label(rig, wand, messages, name)
+    recording = _label(rig, wand, messages, name, synchronous)
     this = recording.names.index(name)
-    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.frames.period_s())
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
     cameras, offset_s = _initial_rig(rig, recording.names, pairs, this)
-    labeled = select_cameras(recording, pairs, list(range(len(recording.names))))
+    labeled = LabeledRecording.of(recording, pairs, list(range(len(recording.names))))
     start = build_problem(labeled, cameras, offset_s, MAX_FRAME_SETS)
     if start is None:
         raise CalibrationError("the wand's lengths do not fit the detections; check the wand file")
@@ -81,7 +84,9 @@ def recalibrate_camera(rig: Rig, wand: Body, messages: Sequence[Detections], nam
     return _conclude(rig, name, this, solution)
 
 
-def _label(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> WandRecording:
+def _label(
+    rig: Rig, wand: Body, messages: Sequence[Detections], name: str, synchronous: bool
+) -> WandRecording:
     """Label the detections of the camera and of all placed cameras."""
     if name not in rig.cameras:
         raise CalibrationError(
@@ -90,7 +95,7 @@ def _label(rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> W
     used = set(rig.placed()) | {name}
     messages = [message for message in messages if message.camera in used]
     check_recording(rig, messages)
-    recording = label_recording(rig, wand, messages)
+    recording = label_recording(rig, wand, messages, synchronous)
     if name not in recording.names:
         raise CalibrationError(f"camera '{name}' is not in the recording, or never saw the wand")
     return recording
@@ -121,10 +126,11 @@ def _initial_rig(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) 
 
 def _adjust(recording: LabeledRecording, start: Estimate, this: int) -> Solution:
     """Adjust the camera: robustly, with usual lens priors, and with estimated lens priors."""
-    problem = replace(start.problem.with_free(POSE, OFFSET), estimated=(this,))
+    clock = () if recording.timing.synchronous else OFFSET
+    problem = replace(start.problem.with_free(POSE, clock), estimated=(this,))
     state = optimize_robustly(problem, start.observations, start.state)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
-    first = inflate_covariance(adjust(problem.with_free(POSE, OFFSET, LENS), observations, state))
+    first = inflate_covariance(adjust(problem.with_free(POSE, clock, LENS), observations, state))
     check_lenses(recording.names, first)
     problem = estimate_lens_priors(first.problem, first)
     adjusted = inflate_covariance(adjust(problem, observations, first.state))

@@ -69,6 +69,32 @@ class ClockJump:
 
 
 @dataclass(frozen=True, slots=True)
+class Validation:
+    """Residuals of n detections at a rig.
+
+    Attributes:
+        count: n; detections that no other camera saw at once have no residual and do not count.
+        all_px: RMS distance of detected from expected centres, over all n.
+        gross: share of gross errors.
+        residual_px: RMS distance without these.
+        error_m: RMS distance of the markers from the viewing rays without these, in the unit of the rig.
+        range_m: median distance of the markers from the cameras.
+    """
+
+    count: int
+    all_px: float
+    gross: float
+    residual_px: float
+    error_m: float
+    range_m: float
+
+    @property
+    def relative(self) -> float:
+        """The error as a part of the distance."""
+        return self.error_m / self.range_m
+
+
+@dataclass(frozen=True, slots=True)
 class WandReport:
     """Figures of a wand calibration.
 
@@ -78,10 +104,12 @@ class WandReport:
         wand_poses: number of estimated poses of the wand.
         length_mean_mm, length_std_mm: measured less nominal lengths of the wand; None with one marker.
         outliers: the rejected marker centres, worst first.
+        given, held_out: residuals of all detections, and of held-out ones (`Validation`).
         metric: whether the scale is known.
         sigma_inflation: factor of the standard deviations for the correlation of residuals in time.
         scaled_by: the measured distance that gives the scale.
         compared: a measured distance compared with the wand.
+        timing: whether the cameras are taken as synchronous, and why.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
     """
 
@@ -91,10 +119,13 @@ class WandReport:
     length_mean_mm: float | None
     length_std_mm: float | None
     outliers: list[Outlier]
+    given: Validation | None
+    held_out: Validation | None
     metric: bool
     sigma_inflation: float
     scaled_by: Distance | None
     compared: DistanceComparison | None
+    timing: str
     adjusted_lenses: dict[str, Any]
 
     @property
@@ -111,8 +142,10 @@ class WandReport:
         """Return the entries for the `calibration` map of `rig.yaml`."""
         return {
             "metric": self.metric,
+            "timing": self.timing,
             "wand_poses": self.wand_poses,
             "residual_px": round(self.residual_px, 4),
+            **self._validation(),
             "sigma_inflation": round(self.sigma_inflation, 2),
             "wand_length_error_mm": self._length_error(),
             **self._distance(),
@@ -129,6 +162,17 @@ class WandReport:
             "left_out": dict(self.left_out()),
             "unplaced": dict(self.unplaced),
         }
+
+    def _validation(self) -> dict[str, Any]:
+        entries = {}
+        if (given := self.given) is not None:
+            entries["all_residual_px"] = round(given.all_px, 4)
+            entries["gross_errors"] = round(given.gross, 4)
+        if (held_out := self.held_out) is not None:
+            unit = {"mm": round(1e3 * held_out.error_m, 3)} if self.metric else {}
+            relative = {"per_mille_of_distance": round(1e3 * held_out.relative, 3)}
+            entries["held_out"] = {"residual_px": round(held_out.residual_px, 4), **unit, **relative}
+        return entries
 
     def _length_error(self) -> dict[str, float] | None:
         if self.length_mean_mm is None or self.length_std_mm is None:
@@ -175,6 +219,11 @@ class WandCalibration:
     drift_ppm: Array
     drift_sigma_ppm: Array
     jump: ClockJump | None
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether frames with equal stamps were taken as simultaneous."""
+        return self.adjusted.problem.gap_s == 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the `calibration` map of `rig.yaml`: report, clocks if the data need them, and changes of lenses."""

@@ -13,6 +13,7 @@ from camera_node.arrays import Array, Index, Mask
 ROUNDS = 8  # of reweighting in a triangulation
 CAUCHY = 0.003  # scale of the weights: angle between a ray and the point, radians
 AGREE = 4.0  # times the median of these angles: a ray within agrees with the point
+SAME_S = 1e-6  # stamps closer than this are equal: they are whole nanoseconds, here as seconds
 MIN_ANGLE = 1e-4  # ratio of the information along the worst and the best axis, below which rays are parallel
 
 
@@ -34,12 +35,16 @@ class MarkerTrack:
         return cls(t_s, xy, velocity)
 
     def interpolate(self, t_s: Array, gap_s: float) -> Array:
-        """Return positions (..., 2) at timestamps (...), by cubic Hermite polynomials; NaN in gaps above `gap_s`."""
-        if len(self.t_s) < 2:
+        """Return positions (..., 2) at timestamps (...), by cubic Hermite polynomials; NaN in gaps above `gap_s`,
+        except at the track's own timestamps."""
+        if not len(self.t_s):
             return np.full((*t_s.shape, 2), np.nan)
+        if len(self.t_s) == 1:
+            return np.where(np.abs(t_s - self.t_s[0])[..., None] < SAME_S, self.xy[0], np.nan)
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         tau, dt = t_s - self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
-        inside = (tau >= -1e-6) & (tau <= dt + 1e-6) & (dt <= gap_s)
+        inside = (tau >= -SAME_S) & (tau <= dt + SAME_S) & (dt <= gap_s)
+        inside |= np.minimum(np.abs(tau), np.abs(dt - tau)) < SAME_S
         h = hermite(tau.ravel(), dt.ravel()).reshape(*t_s.shape, 4)
         p, v = self.xy, self.velocity
         found = h[..., :1] * p[after - 1] + h[..., 1:2] * v[after - 1]
@@ -94,14 +99,15 @@ def triangulate(
     known = np.isfinite(xy[..., 0])
     ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:3], 1))], axis=3)
     ray = np.einsum("cij,cmkj->cmki", poses[:, :3, :3], ray / np.linalg.norm(ray, axis=3, keepdims=True))
-    points, angle = _intersect(ray, poses[:, :3, 3], known)
+    points, angle = intersect(ray, poses[:, :3, 3], known)
     usual = float(np.median(angle[known])) if known.any() else 0.0
     agreeing = (known & (angle <= AGREE * usual)).sum(axis=0)
     return np.swapaxes(points, 0, 1), agreeing.T
 
 
-def _intersect(ray: Array, centre: Array, known: Mask) -> tuple[Array, Array]:
-    """Return points (M, K, 3) nearest to rays (C, M, K, 3) through centres (C, 3), and the rays' angles to them."""
+def intersect(ray: Array, centre: Array, known: Mask) -> tuple[Array, Array]:
+    """Return points (M, K, 3) nearest to `known` (C, M, K) rays (C, M, K, 3) through centres (C, 3), and the rays'
+    angles (C, M, K) to them; points are NaN where fewer than two rays are known, or they are nearly parallel."""
     across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
     toward = np.einsum("cmkij,cj->cmki", across, centre)
     weight = known.astype(float)

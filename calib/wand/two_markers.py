@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.wand.detections import FrameTable, WandDetections
+from calib.wand.detections import WandDetections
 from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
-from calib.wand.initialization.two_view import TwoViewGeometry, longest_gap_s, sampson
+from calib.wand.initialization.two_view import TwoViewGeometry, sampson
+from calib.wand.timing import Timing
 from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
@@ -125,34 +126,34 @@ class _Evidence:
     gain: Array
 
 
-def label_ends(frames: FrameTable, detections: WandDetections, wand: Body, lenses: Sequence[Lens]) -> Index:
+def label_ends(timing: Timing, detections: WandDetections, wand: Body, lenses: Sequence[Lens]) -> Index:
     """Return the end (n,), 0 or 1, of each detection in a frame of two; -1 where the data do not determine it."""
-    period_s, cameras = frames.period_s(), range(len(lenses))
-    sticks = _chain(detections, period_s)
+    cameras = range(len(lenses))
+    sticks = _chain(detections, timing)
     if not len(sticks.rows):
         return np.full(len(detections), -1, np.intp)
-    tracks, light = _StickTracks.of(sticks, longest_gap_s(period_s)), Body(diameter_m=wand.diameter_m)
-    middles = TwoViewGeometry(_middles(detections, sticks), lenses, light, period_s)
+    tracks, light = _StickTracks.of(sticks, timing.gap_s), Body(diameter_m=wand.diameter_m)
+    middles = TwoViewGeometry(_middles(detections, sticks), lenses, light, timing)
     start = build_initial_rig(middles, cameras)
     labels = _label(sticks, _estimate_signs(tracks, start, lenses, COARSE_PX), len(detections))
     if not (labels >= 0).any():
         return labels
     labeled = replace(detections, label=labels).select(labels >= 0)
-    refined = build_initial_rig(TwoViewGeometry(labeled, lenses, wand, period_s), cameras)
+    refined = build_initial_rig(TwoViewGeometry(labeled, lenses, wand, timing), cameras)
     if len(refined.poses) < len(start.poses):
         return labels
     return _label(sticks, _estimate_signs(tracks, refined, lenses, FINE_PX), len(detections))
 
 
-def _chain(detections: WandDetections, period_s: float) -> _Sticks:
-    """Chain the frames of two detections into runs, and split these into segments."""
+def _chain(detections: WandDetections, timing: Timing) -> _Sticks:
+    """Chain the frames of two detections into runs, and split these into segments; each frame of synchronous cameras is
+    a segment, because their frames may be any time apart."""
+    limit_s = 0.0 if timing.synchronous else max(CHAIN_S, CHAIN_PERIODS * timing.period_s)
     rows = np.flatnonzero((np.bincount(detections.frame) == 2)[detections.frame]).reshape(-1, 2)
     camera, t_s = detections.camera[rows[:, 0]], detections.t_s[rows[:, 0]]
     duplicate = (np.diff(camera, prepend=-1) == 0) & (np.diff(t_s, prepend=0) <= 0)
     rows = rows[~duplicate]
-    sign, run = _follow(
-        _Sticks.of(detections, rows, np.arange(len(rows))), max(CHAIN_S, CHAIN_PERIODS * period_s)
-    )
+    sign, run = _follow(_Sticks.of(detections, rows, np.arange(len(rows))), limit_s)
     rows = np.where(sign[:, None] > 0, rows, rows[:, ::-1])
     whole = run == np.minimum.accumulate(run[::-1])[::-1]  # without runs inside of another run
     return _split(_Sticks.of(detections, rows[whole], run[whole]))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from camera_node.config import is_name
+from camera_node.config import require_name
 from camera_node.errors import ConfigError
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.frame import Source, SourceSettings
@@ -50,8 +50,8 @@ class Publish:
         from camera_node.node.node import Node
         from camera_node.protocol.session import open_client
 
-        _check_name("name", self.name)
-        _check_name("arena", self.arena)
+        require_name(self.name, "a camera")
+        require_name(self.arena, "an arena")
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         cv2.setNumThreads(1)  # a machine runs one process for each of its cameras
         with contextlib.ExitStack() as stack:
@@ -92,8 +92,3 @@ def _open_simulation(settings: SourceSettings, name: str) -> Source:
         raise ConfigError("--source sim needs an arena: add --scene FILE, such as configs/demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
     return SimulatedCamera(settings.scene, name, epoch_ns)
-
-
-def _check_name(option: str, name: str) -> None:
-    if not is_name(name):
-        raise ConfigError(f"--{option} '{name}' is not valid in a Zenoh key; remove / * $ # ? and spaces")

@@ -13,6 +13,7 @@ import zenoh
 from camera_node.node.clock_offset import READING_NS, OffsetEstimator, RoundTrip
 from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode
+from camera_node.protocol.session import is_from_router
 
 log = logging.getLogger("camera_node.clock")
 
@@ -29,6 +30,7 @@ class ClockSync:
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session = session
         self._querier = session.declare_querier(
             keys.clock,
             timeout=TIMEOUT_S,
@@ -94,18 +96,34 @@ class ClockSync:
         return bool(trips)
 
     def _ask(self) -> tuple[RoundTrip, int | None] | None:
-        """A round trip, and the server's time minus the monotonic clock if both share that; None without a reply."""
+        """A round trip, and the server's time minus the monotonic clock if both share that; None without a reply.
+
+        Other clients may answer too, unless access control forbids it: the router's reply is used, if there is one.
+        """
+        answer = None
         sent_ns = time.monotonic_ns()
         try:
             for reply in self._querier.get():
                 received_ns = time.monotonic_ns()
-                if reply.ok:
-                    message = decode(reply.ok.payload.to_bytes(), ClockReply)
-                    trip = RoundTrip(sent_ns, message.t_ns, received_ns)
-                    return trip, message.monotonic_ahead_ns if _is_shared(message, trip) else None
-        except (zenoh.ZError, MessageError) as error:
+                answer = _parse(reply, sent_ns, received_ns) or answer
+                if is_from_router(self._session, reply):
+                    break
+        except zenoh.ZError as error:
             log.debug("no server time: %s", error)
+        return answer
+
+
+def _parse(reply: zenoh.Reply, sent_ns: int, received_ns: int) -> tuple[RoundTrip, int | None] | None:
+    """As `ClockSync._ask`, of one reply; None of an invalid one."""
+    if reply.ok is None:
         return None
+    try:
+        message = decode(reply.ok.payload.to_bytes(), ClockReply)
+    except MessageError as error:
+        log.debug("no server time: %s", error)
+        return None
+    trip = RoundTrip(sent_ns, message.t_ns, received_ns)
+    return trip, message.monotonic_ahead_ns if _is_shared(message, trip) else None
 
 
 def _is_shared(reply: ClockReply, trip: RoundTrip) -> bool:

@@ -7,6 +7,7 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
+from camera_node.config import is_name, require_name
 from camera_node.detection.roundels import Roundels
 
 VERSION = 1
@@ -27,10 +28,10 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Keys:
-    """Zenoh keys of one arena; `docs/messages.md` lists their publishers and messages."""
+    """Zenoh keys of one arena; `docs/messages.md` lists them. Raises ConfigError if its name is invalid."""
 
     def __init__(self, arena: str) -> None:
-        self.arena = arena
+        self.arena = arena = require_name(arena, "an arena")
         self.clock = f"{arena}/clock"  # queryable of the server: the server's time
         self.rig = f"{arena}/rig"
         self.markers = f"{arena}/markers"
@@ -119,8 +120,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             size = len(getattr(self, name))
             if size != n * width * dtype.itemsize:
                 raise MessageError(f"column {name} of {size} bytes for {n} roundels")
-        if not (self.camera and 0 < self.width <= 32768 and 0 < self.height <= 32768):
-            raise MessageError("no camera name, or an impossible image size")
+        if not (is_name(self.camera) and 0 < self.width <= 32768 and 0 < self.height <= 32768):
+            raise MessageError("an invalid camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
@@ -154,6 +155,11 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     temperature_c: float | None = None
     advice: str = ""  # "saturated" or "too dark" with the change to make, or empty
     refused: int = 0  # refused requests for a snapshot or settings since the node started
+
+    def check(self) -> None:
+        """Raise MessageError for a name that no camera can have."""
+        if not is_name(self.camera):
+            raise MessageError("an invalid camera name")
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -5,7 +5,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import zenoh
@@ -17,7 +17,9 @@ log = logging.getLogger("camera_node.network")
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
-RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
+LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
+SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
@@ -84,6 +86,9 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
         "transport/unicast/open_timeout": 2000,  # `close` waits this long for a listener that is not Zenoh
+        "transport/link/tcp/so_sndbuf": SEND_BUFFER,
+        "transport/link/tls/so_sndbuf": SEND_BUFFER,
+        "transport/link/tx/queue/size/real_time": 1,  # batches
     }
     try:
         return zenoh.open(_config(zenoh_config, options))
@@ -91,6 +96,27 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
         raise NetworkError(
             f"can't connect to {' '.join(connect)}: give an endpoint such as tcp/host:7447 ({_brief(error)})"
         ) from None
+
+
+def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:
+    """Whether a router that this session is connected to sent the reply: the server, unless routers are between them.
+
+    Without access control any client may answer a query. Zenoh names the sender in each reply.
+    """
+    return reply.replier_id is not None and reply.replier_id.zid in session.info.routers_zid()
+
+
+def reply_of_server(session: zenoh.Session, replies: Iterable[zenoh.Reply]) -> zenoh.Reply | None:
+    """The first reply of a router that this session is connected to; if there is none, the first reply.
+
+    The query needs `consolidation=zenoh.ConsolidationMode.NONE`: otherwise Zenoh drops all replies but one.
+    """
+    first = None
+    for reply in replies:
+        if is_from_router(session, reply):
+            return reply
+        first = first or reply
+    return first
 
 
 def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
@@ -104,7 +130,7 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
             config.insert_json5(key, "false")
     if config.get_json("scouting/delay") == "null":
         config.insert_json5("scouting/delay", "0")  # otherwise opening waits for scouting
-    for key, value in {"mode": "router", **options}.items():
+    for key, value in {"mode": "router", "transport/link/tx/lease": LEASE_MS, **options}.items():
         config.insert_json5(key, json.dumps(value))
     return config
 

@@ -8,8 +8,7 @@ from typing import Literal
 import msgspec
 import zenoh
 
-from camera_node.config import is_name
-from camera_node.errors import ConfigError
+from camera_node.config import require_name
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
 from fusion.model.robots import Robot, distances
 from fusion.protocol.messages import RobotsRequest
@@ -38,8 +37,7 @@ class RobotDefinition:
     radius_m: float = 0.3
 
     def __post_init__(self) -> None:
-        if not is_name(self.name):
-            raise ConfigError(f"'{self.name}' can't name a robot; use letters, digits, - and _")
+        require_name(self.name, "a robot")
 
 
 def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robot:

@@ -8,8 +8,10 @@ import tyro
 
 from calib.rig.recording import RecordingWriter
 from camera_node.protocol.session import open_client
+from camera_node.service import stopped_by_signals
 from camera_node.terminal import say
-from fusion.recordings.record import record_arena
+from fusion.recordings.record import ArenaRecorder
+from fusion.recordings.rotation import RotatingWriter, Rotation
 
 
 def record(
@@ -20,6 +22,9 @@ def record(
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
     seconds: float | None = None,
+    rotate_mb: float | None = None,
+    rotate_minutes: float | None = None,
+    force: bool = False,
 ) -> int:
     """Record an arena's detections, poses, markers, rig and robots, until stopped.
 
@@ -28,11 +33,19 @@ def record(
         connect: the server's Zenoh endpoints.
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
-        seconds: the duration; until Ctrl-C unless given.
+        seconds: the duration; until Ctrl-C or SIGTERM unless given.
+        rotate_mb: begin the next file, OUT-001.mcap, OUT-002.mcap and so on, at this size, megabytes.
+        rotate_minutes: begin the next file after this time, minutes.
+        force: replace an existing file.
     """
-    with RecordingWriter(out) as writer, open_client(connect, zenoh_config) as session:
-        record_arena(session, arena, writer, seconds)
+    rotation = Rotation(rotate_mb, rotate_minutes)
+    opened = RotatingWriter(out, rotation) if rotation else RecordingWriter(out, overwrite=force)
+    with stopped_by_signals() as stop, opened as writer, open_client(connect, zenoh_config) as session:
+        recorder = ArenaRecorder(session, arena, writer)
+        recorder.run(stop, seconds)
     for key, count in sorted(writer.counts.items()):
         say(f"{count:7} on {key}")
-    say(f"wrote {out}")
+    for reason, count in recorder.lost.items():
+        say(f"not written: {count} {reason}")
+    say(f"wrote {writer.path}")
     return 0

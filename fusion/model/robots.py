@@ -14,10 +14,11 @@ import msgspec
 import numpy as np
 
 from camera_node.arrays import Array, Index
-from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
+from camera_node.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions
+from camera_node.text import printable
 from fusion.errors import FusionError
 
 DISTINCT_M = (
@@ -120,7 +121,7 @@ def save_robots(robots: dict[str, Robot], path: Path) -> None:
 def require_trackable(robots: dict[str, Robot], where: str) -> None:
     """Raise ConfigError for an invalid name; raise FusionError like `require_distinct`."""
     if bad := [name for name in robots if not is_name(name)]:
-        raise ConfigError(f"{where}: '{bad[0]}' can't name a robot; use letters, digits, - and _")
+        raise ConfigError(f"{where}: '{printable(bad[0], 80)}' can't name a robot; {NAME_RULE}")
     require_distinct(robots, where)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Index
+from camera_node.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.robots import Robot
 
@@ -53,6 +54,8 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise MessageError unless numbers are finite, the quaternion is not zero and the covariance is 12 x 12."""
+        if not is_name(self.robot):
+            raise MessageError("an invalid robot name")
         numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
         if not any(self.quaternion_wxyz):
             raise MessageError("the pose has a zero quaternion")

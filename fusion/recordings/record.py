@@ -6,8 +6,9 @@ clock. At the start the recorder requests the active rig and the robots from the
 everything that a replay needs.
 """
 
-import contextlib
+import math
 import queue
+import threading
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -22,9 +23,18 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, Robots, robots_key
+from fusion.recordings.rotation import RotatingWriter
 
+Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
-REQUEST_S = 1.0  # the timeout of a request for the rig or the robots, and the interval until the next one
+MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
+MAX_QUEUED_BYTES = 1 << 28
+MAX_KEYS = 4096
+WAIT_S = 0.1
+REQUEST_S = (
+    1.0  # the timeout of a request for the rig or the robots, and the longest pause until the next one
+)
+FIRST_PAUSE_S = 0.1  # the first request may precede the route to the server
 
 
 @dataclass
@@ -66,36 +76,82 @@ def read_recording(path: Path) -> ArenaRecording:
     return recording
 
 
-def record_arena(
-    session: zenoh.Session, arena: str, writer: RecordingWriter, seconds: float | None = None
-) -> None:
-    """Write all messages of an arena for `seconds`, or until Ctrl-C."""
-    received: queue.Queue[tuple[str, bytes, int]] = queue.Queue(QUEUE_SIZE)
-    subscriber = session.declare_subscriber(f"{arena}/**", lambda sample: _enqueue(received, sample))
-    end = time.monotonic() + (seconds if seconds is not None else float("inf"))
-    missing, requested = {Keys(arena).rig, robots_key(arena)}, 0.0
-    with contextlib.suppress(KeyboardInterrupt):
-        while time.monotonic() < end:
-            if missing and time.monotonic() - requested > REQUEST_S:
-                requested = time.monotonic()
-                missing -= writer.counts.keys()
-                for key in missing:
-                    _request(session, key, received)
-            with contextlib.suppress(queue.Empty):
-                writer.put(*received.get(timeout=0.1))
-    subscriber.undeclare()
+class ArenaRecorder:
+    """Receives all messages of an arena and writes them. Time and memory stay bounded for any input.
 
+    Args:
+        session: an open session, which stays open.
+        arena: its name.
+        writer: of the files.
 
-def _enqueue(received: queue.Queue[tuple[str, bytes, int]], sample: zenoh.Sample) -> None:
-    with contextlib.suppress(queue.Full):
-        received.put_nowait((str(sample.key_expr), sample.payload.to_bytes(), time.time_ns()))
+    Attributes:
+        lost: messages that were not written, by reason.
+    """
 
+    def __init__(self, session: zenoh.Session, arena: str, writer: RecordingWriter | RotatingWriter) -> None:
+        self.lost: Counter[str] = Counter()
+        self._session, self._arena, self._writer = session, arena, writer
+        self._missing = {Keys(arena).rig, robots_key(arena)}
+        self._request_at_s, self._pause_s = 0.0, FIRST_PAUSE_S
+        self._received: queue.Queue[Entry] = queue.Queue(QUEUE_SIZE)
+        self._lock = threading.Lock()
+        self._queued_bytes = 0
 
-def _request(session: zenoh.Session, key: str, received: queue.Queue[tuple[str, bytes, int]]) -> None:
-    """Query the server; record the reply as if it were published."""
+    def run(self, stop: threading.Event, seconds: float | None = None) -> None:
+        """Write until `stop` is set, or for `seconds`; then write what was received before.
 
-    def take(reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            _enqueue(received, reply.ok)
+        Raises:
+            ConfigError: the disk is full; the file is closed.
+        """
+        end_s = time.monotonic() + (math.inf if seconds is None else seconds)
+        subscriber = self._session.declare_subscriber(f"{self._arena}/**", self._enqueue)
+        try:
+            while not stop.is_set() and time.monotonic() < end_s:
+                self._request_missing()
+                self._write_next(WAIT_S)
+        finally:
+            subscriber.undeclare()
+        for _ in range(self._received.qsize()):
+            self._write_next(0.0)
 
-    session.get(key, take, timeout=REQUEST_S)
+    def _enqueue(self, sample: zenoh.Sample) -> None:
+        """Queue a message; called from Zenoh's threads."""
+        size = len(sample.payload)
+        with self._lock:
+            if size > MAX_MESSAGE_BYTES:
+                self.lost[f"messages of more than {MAX_MESSAGE_BYTES} bytes"] += 1
+                return
+            if self._queued_bytes + size > MAX_QUEUED_BYTES or self._received.full():
+                self.lost["messages that the disk was too slow for"] += 1
+                return
+            self._queued_bytes += size
+            self._received.put_nowait((str(sample.key_expr), sample.payload.to_bytes(), time.time_ns()))
+
+    def _write_next(self, timeout_s: float) -> None:
+        try:
+            key, data, received_ns = (
+                self._received.get(timeout=timeout_s) if timeout_s else self._received.get_nowait()
+            )
+        except queue.Empty:
+            return
+        with self._lock:
+            self._queued_bytes -= len(data)
+        if key not in self._writer.counts and len(self._writer.counts) >= MAX_KEYS:
+            self.lost[f"messages on more than {MAX_KEYS} keys"] += 1
+            return
+        self._writer.put(key, data, received_ns)
+        self._missing.discard(key)
+
+    def _request_missing(self) -> None:
+        """Query the server for the rig and the robots; the replies are recorded as if they were published."""
+        if not self._missing or time.monotonic() < self._request_at_s:
+            return
+        self._request_at_s = time.monotonic() + self._pause_s
+        self._pause_s = min(2 * self._pause_s, REQUEST_S)
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._enqueue(reply.ok)
+
+        for key in self._missing:
+            self._session.get(key, take, timeout=REQUEST_S)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from camera_node.config import is_name, load_yaml
+from camera_node.config import NAME_RULE, is_name, load_yaml
 from camera_node.errors import ConfigError
 from fusion.model.limits import Limits
 
@@ -40,7 +40,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def __post_init__(self) -> None:
         if not is_name(self.arena):
-            raise ValueError(f"'{self.arena}' can't name an arena; use letters, digits, - and _")
+            raise ValueError(f"'{self.arena}' can't name an arena; {NAME_RULE}")
         if self.rate_hz is not None and not 0.1 <= self.rate_hz <= 1000:
             raise ValueError(f"rate_hz is {self.rate_hz}; it must be within 0.1 and 1000")
         if not self.listen:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Synthetic loads: the detections of many robots as messages, and the truth."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -93,7 +93,7 @@ class Load:
     def messages(self, seconds: float) -> Iterator[Detections]:
         """Detections of all cameras in order of time; `id` is the row of the marker table, -1 for false ones."""
         rng = np.random.default_rng(self.seed + 2)
-        scene = _Scene(self)
+        scene = Scene(self)
         stamps = (np.arange(round(seconds * self.hz))[:, None] + self.phases()) / self.hz
         for k in np.argsort(stamps, axis=None, kind="stable"):
             seq, camera = divmod(int(k), self.cameras)
@@ -132,8 +132,8 @@ class Paths:
         return States(R, p, up * self.turn[:, None], v, np.zeros((n, 12, 12)))
 
 
-class _Scene:
-    """Renders the detections of a load."""
+class Scene:
+    """Computes what the cameras of a load detect; `cameras` are at their true places."""
 
     def __init__(self, load: Load) -> None:
         self.load, self.cameras = load, CameraArray(load.rig)
@@ -150,7 +150,16 @@ class _Scene:
     def detect(self, camera: int, seq: int, t_s: float, rng: np.random.Generator) -> Detections:
         """One frame's message."""
         name, t_ns = self.cameras.names[camera], START_NS + round(t_s * 1e9)
-        states = self.load.paths.at((t_ns - START_NS) * 1e-9)
+        lens = self.load.rig[name]
+        roundels = self.roundels(camera, self.load.paths.at((t_ns - START_NS) * 1e-9), rng)
+        return Detections.pack(
+            roundels, camera=name, seq=seq, t_ns=t_ns, sent_ns=t_ns, width=lens.width, height=lens.height
+        )
+
+    def roundels(
+        self, camera: int, states: States, rng: np.random.Generator, hidden: Collection[int] = ()
+    ) -> Roundels:
+        """The roundels in one frame of a camera; those of the robots in `hidden` are covered."""
         exposures = Exposures.exact(np.array([camera]), np.zeros(1))
         n = len(self.marker_table)
         views = self.cameras.views(
@@ -163,10 +172,12 @@ class _Scene:
         row = np.concatenate([np.arange(n), np.full(len(self.clutter), -1)])
         seen = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (q[2] > 0.1)
         seen &= rng.random(len(seen)) >= self.load.missing
-        return self._message(name, seq, t_ns, c[:, seen], normal[:, seen], q[:, seen], row[seen], rng)
+        seen[:n] &= ~np.isin(self.marker_table.robot, list(hidden))
+        lens = self.load.rig[self.cameras.names[camera]]
+        return self._noisy(lens, c[:, seen], normal[:, seen], q[:, seen], row[seen], rng)
 
-    def _message(self, name, seq, t_ns, c, normal, q, row, rng: np.random.Generator) -> Detections:
-        lens, sigma = self.load.rig[name], self.load.sigma_px
+    def _noisy(self, lens: Camera, c, normal, q, row, rng: np.random.Generator) -> Roundels:
+        sigma = self.load.sigma_px
         uv, J = lens.project_with_jacobian(q.T)
         inside = ((uv > 10) & (uv < [lens.width - 10, lens.height - 10])).all(1)
         scale = (J[:, :, :2] * q[2, :, None, None]).transpose(1, 2, 0)
@@ -183,10 +194,7 @@ class _Scene:
         number = np.concatenate([row[inside], np.full(extra, -1)]).astype(np.int32)
         cov, level = np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.6)
         roundels = Roundels(uv, cov, axes, angle, level, 200 * level, number, number)
-        mixed = roundels.select(rng.permutation(n))
-        return Detections.pack(
-            mixed, camera=name, seq=seq, t_ns=t_ns, sent_ns=t_ns, width=lens.width, height=lens.height
-        )
+        return roundels.select(rng.permutation(n))
 
 
 def _robot(rng: np.random.Generator, markers: int) -> Robot:

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import gauge_directions
-from camera_node.arrays import Array
+from calib.wand.bundle_adjustment.problem import Problem, gauge_directions
+from camera_node.arrays import Array, Index
 
 BLOCK_S = 1.0  # longer than the wand stays in one place
+BLOCKS = 10  # of frame sets in order, where these may be any time apart
 MIN_BLOCKS = 4  # fewer do not show a correlation
 
 
@@ -97,8 +98,7 @@ def inflate_covariance(adjusted: Adjusted) -> Adjusted:
 def inflation_factor(adjusted: Adjusted) -> float:
     """The factor of the covariance for residuals correlated in time, at least 1: the estimated motion absorbs errors,
     so an estimate below 1 means nothing."""
-    knot_s = adjusted.problem.knot_s[:-1]
-    first = np.flatnonzero(np.diff((knot_s - knot_s[0]) // BLOCK_S, prepend=-1))
+    first = _first_intervals(adjusted.problem)
     if len(first) < MIN_BLOCKS:
         return 1.0
     # At the optimum the scores sum to minus the priors' gradient: one degree of freedom of the blocks.
@@ -109,3 +109,11 @@ def inflation_factor(adjusted: Adjusted) -> float:
     # The number of parameters that the observations determine; those that only a prior determines do not count.
     determined = float(np.trace(inverse @ (adjusted.information - np.diag(_prior_root(adjusted) ** 2))))
     return max(squares / determined * len(scores) / (len(scores) - 1), 1.0)
+
+
+def _first_intervals(problem: Problem) -> Index:
+    """The first interval between knots of every block: of one second, or of a tenth of the frame sets of
+    synchronous cameras."""
+    knot_s = problem.knot_s[:-1]
+    by_count, by_time = np.arange(len(knot_s)) * BLOCKS // len(knot_s), (knot_s - knot_s[0]) // BLOCK_S
+    return np.flatnonzero(np.diff(by_count if problem.gap_s == 0 else by_time, prepend=-1))

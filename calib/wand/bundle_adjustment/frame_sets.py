@@ -4,30 +4,26 @@
 import numpy as np
 
 from calib.wand.detections import WandDetections
+from calib.wand.tracks import SAME_S
 from camera_node.arrays import Array, Index, Mask
 
-MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
-MIN_SPREAD_S = (
-    0.02  # frames this close form one set at any frame rate: the motion between them is interpolated
-)
 WINDOW = 8  # consecutive frame sets that are chosen together, so that the motion between them is estimated
 CELLS = (4, 3)  # columns and rows of an image, for coverage
 
 
-def group_frames(t_s: Array, camera: Index, period_s: float) -> Index:
+def group_frames(t_s: Array, camera: Index, spread_s: float) -> Index:
     """The frame set of each of F frames, (F,); -1 where only one camera has a frame.
 
-    A frame set is a run of frames within half a frame period, or within 20 ms if that is longer.
+    A frame set is a run of frames within `spread_s`.
 
     Args:
         t_s: (F,) true capture times, ascending.
         camera: (F,) camera of each frame.
-        period_s: frame period of the cameras; 0 if unknown.
+        spread_s: longest time between the frames of a set; 0 where only equal times are simultaneous.
     """
-    spread = min(max(period_s / 2, min(period_s, MIN_SPREAD_S)), MAX_SPREAD_S) if period_s else MAX_SPREAD_S
     sets, first, current = np.empty(len(t_s), np.intp), -np.inf, -1
     for k, t in enumerate(t_s.tolist()):
-        if t - first > spread + 1e-6:
+        if t - first > spread_s + SAME_S:
             first, current = t, current + 1
         sets[k] = current
     pairs = np.unique(np.column_stack([sets, camera]), axis=0)

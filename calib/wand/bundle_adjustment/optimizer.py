@@ -102,12 +102,14 @@ def _spread(norms: Array) -> float:
 
 def _noise_scale(problem: Problem, observations: WandObservations, state: State, weights: Weights) -> float:
     """Square root of chi-square over its degrees of freedom: the equations of observations and motion, less the
-    parameters. Priors fix all parameters of the motion but a few velocities at gaps."""
+    parameters. A knot that no motion connects with another has no velocity that counts: only a prior determines it."""
     B, knots = len(problem.wand.basis), len(problem.knot_s)
-    connected = int(weights.motion.any(axis=(1, 2)).sum())
-    equations = 2 * len(observations) + 6 * B * connected + len(problem.wand.lengths) * knots
+    connected = weights.motion.any(axis=(1, 2))
+    equations = 2 * len(observations) + 6 * B * int(connected.sum()) + len(problem.wand.lengths) * knots
+    moving = np.append(connected, False) | np.append(False, connected)
     with_prior = np.isfinite(problem.prior_sigma()).sum()
-    parameters = 6 * B * knots + len(problem.free) * len(problem.lenses) - 6 - with_prior
+    parameters = 3 * B * (knots + int(moving.sum()))
+    parameters += len(problem.free) * len(problem.lenses) - 6 - with_prior
     chi2 = 2 * error_norms(problem, observations, state, weights).cost()
     return float(np.sqrt(chi2 / max(equations - parameters, equations / 10)))
 

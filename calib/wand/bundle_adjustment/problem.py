@@ -24,6 +24,7 @@ class WandObservations:
     """Observed marker centres, one row each.
 
     Attributes:
+        row: (n,) index of the detection in the labeled recording.
         camera: (n,) index of the camera.
         knot: (n,) index of the frame set, and of its knot.
         label: (n,) marker of the wand.
@@ -33,6 +34,7 @@ class WandObservations:
         axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where unknown.
     """
 
+    row: Index
     camera: Index
     knot: Index
     label: Index

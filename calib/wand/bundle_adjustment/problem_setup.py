@@ -10,10 +10,13 @@ from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_fra
 from calib.wand.bundle_adjustment.initial_motion import initial_positions
 from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
-from calib.wand.detections import WandDetections
-from calib.wand.tracks import MarkerTrack
+from calib.wand.detections import WandDetections, normalise
+from calib.wand.initialization.two_view import TwoViewGeometry
+from calib.wand.labeling import WandRecording
+from calib.wand.timing import Timing
+from calib.wand.tracks import MarkerTrack, build_tracks
 from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
@@ -30,8 +33,7 @@ class LabeledRecording:
         names, lenses: of the cameras.
         tracks: by camera and marker, by stamps.
         wand: that was recorded.
-        period_s: frame period of the cameras; 0 if unknown.
-        gap_s: longest time over which the motion is interpolated.
+        timing: how their frames are related in time.
         middle_s: stamp in the middle of the recording, at which time offsets are defined.
     """
 
@@ -40,9 +42,42 @@ class LabeledRecording:
     lenses: Sequence[Lens]
     tracks: Sequence[Sequence[MarkerTrack]]
     wand: Body
-    period_s: float
-    gap_s: float
+    timing: Timing
     middle_s: float
+
+    @classmethod
+    def of(
+        cls, recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]
+    ) -> "LabeledRecording":
+        """The cameras `placed` of a recording, renumbered in this order."""
+        number = np.full(len(recording.names), -1)
+        number[placed] = np.arange(len(placed))
+        detections = recording.detections.select(number[recording.detections.camera] >= 0)
+        t_s = recording.frames.t_s
+        return cls(
+            replace(detections, camera=number[detections.camera]),
+            [recording.names[k] for k in placed],
+            [recording.lenses[k] for k in placed],
+            [pairs.tracks[k] for k in placed],
+            pairs.wand,
+            recording.timing,
+            float(t_s.min() + t_s.max()) / 2,
+        )
+
+    def with_centres(self, rows: Index, uv: Array) -> "LabeledRecording":
+        """The recording with other centres (n, 2), raw pixels, of the detections `rows` (n,)."""
+        changed = self.detections.uv.copy()
+        changed[rows] = uv
+        xy = normalise(self.lenses, self.detections.camera, changed)
+        return self._with(replace(self.detections, uv=changed, xy=xy))
+
+    def select(self, rows: Mask) -> "LabeledRecording":
+        """The recording with some of its detections (n,) only."""
+        return self._with(self.detections.select(rows))
+
+    def _with(self, detections: WandDetections) -> "LabeledRecording":
+        tracks = build_tracks(detections, len(self.lenses), len(self.wand.markers))
+        return replace(self, detections=detections, tracks=tracks)
 
     def undistort_tracks(self, lenses: Sequence[Lens]) -> "LabeledRecording":
         """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
@@ -73,7 +108,7 @@ def build_problem(
         the problem with its start; None where fewer than two frame sets give the wand's position.
     """
     rows, knot, knot_s = _choose_detections(recording, offset_s, budget)
-    wand, gap_s = AffineWand.of(recording.wand), recording.gap_s
+    wand, gap_s = AffineWand.of(recording.wand), recording.timing.gap_s
     basis = initial_positions(recording.tracks, wand, cameras, offset_s, knot_s, gap_s)
     known = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
     if known.sum() < MIN_KNOTS:
@@ -111,7 +146,7 @@ def _frame_sets(recording: LabeledRecording, true_s: Array, order: Index) -> Ind
     t_s, camera = true_s[order][first], detections.camera[order][first]
     by_time = np.argsort(t_s, kind="stable")
     of_frame = np.empty(len(frames), np.intp)
-    of_frame[by_time] = group_frames(t_s[by_time], camera[by_time], recording.period_s)
+    of_frame[by_time] = group_frames(t_s[by_time], camera[by_time], recording.timing.spread_s)
     frame_set = np.empty(len(order), np.intp)
     frame_set[order] = of_frame[back]
     return frame_set
@@ -128,6 +163,7 @@ def _middle_times(t_s: Array, knot: Index) -> Array:
 def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> WandObservations:
     detections = recording.detections.select(rows)
     return WandObservations(
+        row=rows,
         camera=detections.camera,
         knot=knot,
         label=detections.label,

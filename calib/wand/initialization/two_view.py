@@ -14,7 +14,8 @@ import numpy as np
 from calib.rig.camera import transform
 from calib.wand.detections import WandDetections, ranges
 from calib.wand.initialization.clock_shift import find_shift, spread_evenly, supports_shift
-from calib.wand.tracks import MarkerTrack, build_tracks, interpolate
+from calib.wand.timing import Timing
+from calib.wand.tracks import SAME_S, MarkerTrack, build_tracks, interpolate
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -23,7 +24,6 @@ from camera_node.geometry.pose import invert
 MIN_FRAME_SETS = 8  # that two cameras must share
 SAMPLE = 1500  # detections that the essential matrix is fitted to
 GATE_PX = 5.0
-MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
 MAX_SPREAD = 0.15  # of the logarithm of the scale, over the wand's lengths: a larger one rejects the pose
 QUANTILE = 0.3  # of Sampson distances, that are compared: 30 % of the correspondences are right at the least
 MIN_INLIER_RATIO = 0.5  # of the correspondences: fewer inliers reject a pose
@@ -79,29 +79,35 @@ class TwoViewGeometry:
         detections: labeled, of all cameras.
         lenses: of the C cameras.
         wand: its markers.
-        period_s: the frame period.
+        timing: how the cameras' frames are related in time.
     """
 
     def __init__(
-        self, detections: WandDetections, lenses: Sequence[Lens], wand: Body, period_s: float
+        self, detections: WandDetections, lenses: Sequence[Lens], wand: Body, timing: Timing
     ) -> None:
         self.detections, self.lenses, self.wand = detections, lenses, wand
         self.rows = [np.flatnonzero(detections.camera == k) for k in range(len(lenses))]
         self.tracks: list[list[MarkerTrack]] = build_tracks(detections, len(lenses), len(wand.markers))
-        self.gap_s = longest_gap_s(period_s)
-        self.period_s = period_s
+        self.timing, self.gap_s = timing, timing.gap_s
         self._known: dict[tuple[int, int], TwoView | None] = {}
         self._ranges = ranges(lenses, detections, wand.diameter_m)
 
     def with_detections(self, detections: WandDetections) -> "TwoViewGeometry":
         """Return the geometry of the same cameras with other detections."""
-        return TwoViewGeometry(detections, self.lenses, self.wand, self.period_s)
+        return TwoViewGeometry(detections, self.lenses, self.wand, self.timing)
 
     def count_shared(self) -> Index:
-        """Return (C, C) the approximate number of frame sets, one frame period long, that two cameras share."""
-        bins = (self.detections.t_s / max(self.period_s, 0.02)).astype(np.intp)
+        """Return (C, C) the number of frame sets that two cameras share: of equal stamps for synchronous cameras, else
+        approximately, one frame period long."""
+        t_s = self.detections.t_s
+        if self.timing.synchronous:
+            bins = np.unique(t_s, return_inverse=True)[1]
+        else:
+            bins = (t_s / max(self.timing.period_s, 0.02)).astype(np.intp)
         held = np.zeros((len(self.lenses), int(bins.max(initial=0)) + 1))
         held[self.detections.camera, bins] = 1
+        if self.timing.synchronous:
+            return (held @ held.T).astype(np.intp)
         near = np.maximum(held, np.roll(held, 1, axis=1))
         return (near @ near.T / 2).astype(np.intp)
 
@@ -133,6 +139,8 @@ class TwoViewGeometry:
     def _estimate_with_shift(self, a: int, b: int) -> tuple[_RelativePose | None, float]:
         """Return the relative pose up to scale and the clock shift, 0 unless the data show one."""
         rows = self._overlapping_rows(a, b)
+        if self.timing.synchronous:
+            return self._fit_pose(a, b, rows, 0.0), 0.0
         selected = self.detections.select(rows)
         shift_s = find_shift(self.tracks[b], selected, self.gap_s)
         unshifted = self._fit_pose(a, b, rows, 0.0)
@@ -157,7 +165,7 @@ class TwoViewGeometry:
         before = np.minimum(before, len(times) - 1)
         after = np.minimum(before + 1, len(times) - 1)
         gap = np.minimum(np.abs(times[before] - t_s[rows]), np.abs(times[after] - t_s[rows]))
-        near = rows[gap <= self.gap_s]
+        near = rows[gap <= self.gap_s + SAME_S]
         frames = np.unique(self.detections.frame[near])
         count = max(round(SAMPLE * len(frames) / max(len(near), 1)), 1)
         chosen = frames[spread_evenly(len(frames), count)]
@@ -220,11 +228,6 @@ class TwoViewGeometry:
 def _lengths(rows: Index, points: Array) -> dict[int, float]:
     """Return the distances of points (n, 3) from the origin, by row (n,)."""
     return dict(zip(rows.tolist(), np.linalg.norm(points, axis=1).tolist(), strict=True))
-
-
-def longest_gap_s(period_s: float) -> float:
-    """Return the longest gap over which tracks are interpolated, seconds."""
-    return min(MAX_GAP_PERIODS * period_s, MAX_GAP_S) if period_s else MAX_GAP_S
 
 
 def sampson(E: Array, xy_a: Array, xy_b: Array) -> Array:

@@ -25,6 +25,9 @@ MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance betw
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 WRONG_LENS = 3.0  # usual standard deviations of a lens without figures
+WRONG_CLOCK_S = (
+    1.0  # offset: synchronized clocks differ by milliseconds, unsynchronized ones by more than a second
+)
 SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another camera
 
 
@@ -59,6 +62,21 @@ def _distance(found: Lens, given: Lens, cov: Array) -> float:
     focal = np.log(found.fx * found.fy / (given.fx * given.fy)) / 2
     off = np.array([focal, found.cx - given.cx, found.cy - given.cy, k1[0] - k1[1]])
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
+
+
+def check_clocks(names: Sequence[str], adjusted: Adjusted) -> None:
+    """Raise CameraFault where a clock is farther off than the server's synchronization allows."""
+    offset_s = adjusted.state.clocks[:, 0] - np.median(adjusted.state.clocks[:, 0])
+    k, reference = int(np.abs(offset_s).argmax()), int(np.abs(offset_s).argmin())
+    if abs(offset_s[k]) > WRONG_CLOCK_S:
+        raise CameraFault(
+            {
+                names[k]: (
+                    f"its timestamps are {abs(offset_s[k]):.2f} s {'earlier' if offset_s[k] > 0 else 'later'} than "
+                    f"those of '{names[reference]}'; set its clock (chrony or NTP) and record again"
+                )
+            }
+        )
 
 
 def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:

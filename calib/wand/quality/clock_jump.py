@@ -44,8 +44,8 @@ def find_jump(names: Sequence[str], adjusted: Adjusted, observations: WandObserv
         names: of the C cameras.
         adjusted, observations: a converged adjustment.
     """
-    if not _is_suspicious(adjusted, observations):
-        return None
+    if adjusted.problem.gap_s == 0 or not _is_suspicious(adjusted, observations):
+        return None  # synchronous cameras have no clocks
     problem = adjusted.problem.with_free(POSE, OFFSET, LENS)  # a drift would absorb half of a jump
     steady = replace(adjusted.state, clocks=adjusted.state.clocks * [1.0, 0.0])
     state = optimize_robustly(problem, observations, steady)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Grades a wand calibration, camera by camera and as a whole, and advises what to improve.
 
-Each criterion is a figure with three limits. The grade of a camera is that of its worst figure; the grade of the rig is
-that of its worst camera or of the wand's length.
+Each criterion is a figure with three limits. The grade of a camera is that of its worst figure. The grade of the rig is
+that of its error on held-out detections, or one worse where a camera or the wand's length is worse: what held-out
+detections show to be precise is not graded as useless.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
 from calib.rig.triangulation import JointCovariance, camera_jacobians
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
-from calib.wand.result import NOT_RECORDED, WandCalibration
+from calib.wand.result import NOT_RECORDED, Validation, WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
@@ -36,6 +37,7 @@ LIMITS = {
     ),  # image error by the camera's own covariance; 0.1 px is the noise of a roundel
     "unused": (0.5, 0.7, 0.85),  # part of the image area shared with other cameras
     "length": (0.002, 0.005, 0.02),  # relative mean error of the wand's length
+    "held_out": (5e-4, 1e-3, 3e-3),  # distance of held-out markers from the viewing rays, of their distance
 }
 ADVICE = {
     "residual_px": "calibrate its lens again, and check its timestamps",
@@ -113,18 +115,27 @@ class RigQuality:
         unplaced: reason and remedy, by name of each recorded camera that could not be placed.
         length_error: relative mean error of the wand's length; None with one marker.
         expected: predicted errors of points at the height of robots' roundels; None for a rig without scale.
+        held_out: residuals of held-out detections; None where they could not be measured.
     """
 
     cameras: list[CameraQuality]
     unplaced: dict[str, str]
     length_error: float | None
     expected: PrecisionMap | None
+    held_out: Validation | None = None
 
     @property
     def grade(self) -> str:
-        """A to D: that of the worst camera, or of the wand's length."""
-        grades = [camera.grade for camera in self.cameras] + ["D"] * bool(self.unplaced)
-        return max(grades + ([grade("length", self.length_error)] if self.length_error is not None else []))
+        """A to D: by held-out detections, at most one grade worse for the worst camera or the wand's length; D where a
+        camera is not placed."""
+        grades = [camera.grade for camera in self.cameras]
+        worst = max(grades + ([grade("length", self.length_error)] if self.length_error is not None else []))
+        if self.unplaced:
+            return "D"
+        if self.held_out is None:
+            return worst
+        shown = grade("held_out", self.held_out.relative)
+        return max(shown, min(worst, GRADES[min(GRADES.index(shown) + 1, len(GRADES) - 1)]))
 
     def sentence(self) -> str:
         """State the grade, its cause and the remedy."""
@@ -134,14 +145,22 @@ class RigQuality:
                 f"camera '{name}' is not placed: {why}" for name, why in self.unplaced.items()
             )
             return f"grade D: {reasons}"
-        if self.length_error is not None and grade("length", self.length_error) == self.grade > worst.grade:
-            return f"grade {self.grade}: the wand's length is {self.length_error:.2%} off; {ADVICE['length']}"
-        if self.grade == "A":
-            return "grade A: all cameras meet the limits"
+        start = f"grade {self.grade}: {self._measured()}"
+        if self.length_error is not None and grade("length", self.length_error) > max("A", worst.grade):
+            return f"{start}the wand's length is {self.length_error:.2%} off; {ADVICE['length']}"
+        if worst.grade == "A":
+            return f"{start}all cameras meet the limits"
         cause = _describe(worst.worst, worst.figures[worst.worst])
-        return f"grade {self.grade}: camera '{worst.name}', {cause}" + (
-            f"; {worst.advice}" if worst.advice else ""
-        )
+        advice = f"; to improve it: {worst.advice}" if worst.advice else ""
+        return f"{start}camera '{worst.name}', {cause}{advice}"
+
+    def _measured(self) -> str:
+        """The error on held-out detections, in millimetres where the scale is known."""
+        if self.held_out is None:
+            return ""
+        if self.expected is None:
+            return f"held-out error {1e3 * self.held_out.relative:.2f} per mille of the distance; "
+        return f"held-out error {1e3 * self.held_out.error_m:.2f} mm at {self.held_out.range_m:.1f} m; "
 
     def lens_warnings(self) -> list[str]:
         """List the lenses whose uncertainty limits the poses of cameras, one line each."""
@@ -218,7 +237,7 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     error = None if length_mm is None or extent == 0 else abs(length_mm) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
-    return RigQuality(cameras, unplaced, error, expected)
+    return RigQuality(cameras, unplaced, error, expected, result.report.held_out)
 
 
 def wand_positions(result: WandCalibration) -> Array:

@@ -12,6 +12,7 @@ from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.result import WandCalibration
+from calib.wand.timing import Timing
 from calib.wand.two_markers import label_ends
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -84,7 +85,9 @@ def test_ends_are_distinguished(scenario: WandScenario):
     names = sorted(recorded.truth.cameras)
     lenses = [recorded.truth.cameras[name] for name in names]
     frames, seen = gather(recorded.messages, names, lenses)
-    labels = label_ends(frames, replace(seen, label=np.full(len(seen), -1)), scenario.wand, lenses)
+    labels = label_ends(
+        Timing(frames.period_s()), replace(seen, label=np.full(len(seen), -1)), scenario.wand, lenses
+    )
     both = (np.bincount(seen.frame) == 2)[seen.frame]
     assert (labels >= 0).sum() > 0.9 * both.sum()
     true_s = seen.t_s + 1e-3 * np.array([lens.time_offset_ms for lens in lenses])[seen.camera]

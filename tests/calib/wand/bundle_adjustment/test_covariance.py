@@ -50,9 +50,7 @@ def test_halves_agree_within_their_covariance(correlated: bool, expected: float)
     """
     arena, chi2, degrees, plain, factors = ring(3), 0.0, 0, 0.0, []
     for seed in SEEDS:
-        messages = record(
-            arena, 20.0, sigma_px=0.1, seed=seed, numbered=True, sized=False, free_running=False
-        )
+        messages = record(arena, 20.0, sigma_px=0.1, seed=seed, numbered=True, sized=False)
         found, agreement = halves(arena, with_correlated_errors(messages, seed) if correlated else messages)
         chi2, degrees = chi2 + agreement.chi2, degrees + agreement.degrees
         factor = float(np.mean([half.adjusted.inflation for half in found]))

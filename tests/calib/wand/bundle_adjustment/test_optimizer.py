@@ -20,6 +20,7 @@ from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling import label
+from calib.wand.timing import Timing
 from calib.wand.trajectory import locate, position_weights, velocity_weights
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
@@ -95,8 +96,9 @@ def test_the_initial_clock_shifts_of_pairs_are_right(recorded: SimulatedRecordin
     names = sorted(recorded.truth.cameras)
     lenses = [recorded.truth.cameras[n] for n in names]
     frames, seen = gather(recorded.messages, names, lenses)
-    labelled, _ = label(frames, seen, WandScenario().wand, lenses)
-    pairs = TwoViewGeometry(labelled, lenses, WandScenario().wand, frames.period_s())
+    timing = Timing(frames.period_s())
+    labelled, _ = label(frames, timing, seen, WandScenario().wand, lenses)
+    pairs = TwoViewGeometry(labelled, lenses, WandScenario().wand, timing)
     shared = np.triu(pairs.count_shared(), 1)
     for a, b in np.argwhere(shared > 40):
         pair = pairs.relate(int(a), int(b))

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Grades follow their limits, and the sentence names the camera, the figure and the remedy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.rig.coverage import Coverage
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import ADVICE, GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
+from calib.wand.result import Validation
 from tests.calib.synthetic import record, ring
 
 
@@ -27,7 +30,10 @@ def test_the_quality_of_a_calibration_with_little_noise():
     assert quality.expected is not None
     assert 0.2 < quality.expected.typical_mm < 4
     entries = quality.as_dict()
-    assert entries["grade"] == max(camera.grade for camera in quality.cameras)
+    assert quality.held_out is not None
+    assert quality.held_out.residual_px == pytest.approx(0.1 * np.sqrt(2), rel=0.3)
+    assert max(camera.grade for camera in quality.cameras) == "C"
+    assert entries["grade"] == "B"  # held-out detections deserve an A
     assert set(entries["quality"]) == names
 
 
@@ -70,6 +76,19 @@ def test_the_grade_of_a_rig():
     assert wrong_wand.grade == "D"
     assert "wand's length is 3.00%" in wrong_wand.sentence()
     assert RigQuality([assessed("a", pose_px=float("nan"))], {}, None, None).grade == "D"
+
+
+def test_what_held_out_detections_show_to_be_precise_is_no_d():
+    """0.6 mm at 2 m is 0.3 per mille: an A, or a B with the advice of its worst camera; 1 % stays a D."""
+    precise = Validation(count=100, all_px=0.5, gross=0.0, residual_px=0.5, error_m=6e-4, range_m=2.0)
+    bad = RigQuality([assessed("bad", residual_px=2.0)], {}, 1e-4, None, precise)
+    assert bad.grade == "B"
+    assert "held-out error 0.30 per mille" in bad.sentence()
+    assert f"to improve it: {ADVICE['residual_px']}" in bad.sentence()
+    assert RigQuality([assessed("good")], {}, 1e-4, None, precise).grade == "A"
+    useless = replace(precise, error_m=0.02)
+    assert RigQuality([assessed("good")], {}, 1e-4, None, useless).grade == "D"
+    assert RigQuality([assessed("good")], {"b": "it never saw the wand"}, 1e-4, None, precise).grade == "D"
 
 
 def test_a_lens_that_limits_poses_is_reported_once():

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Reads a YAML file in bounded time and memory: PyYAML and libyaml recurse, and expand aliases without a limit."""
+
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from camera_node.errors import ConfigError
+
+MAX_BYTES = 1 << 20  # 64 cameras with covariances take a tenth of it
+MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6
+MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file: mappings, lists, texts, numbers, dates, booleans and None.
+
+    Raises:
+        ConfigError: the file is missing, not a regular file, too large, or not YAML; or it uses aliases or tags, or
+            has a key twice.
+    """
+    text = _read_bounded(path)
+    try:
+        _require_bounded(text)
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        _require_unique_keys(node)
+        return None if node is None else loader.construct_document(node)
+    except (
+        yaml.YAMLError,
+        ValueError,
+        ArithmeticError,
+    ) as error:  # the last two of impossible dates and numbers
+        where = " ".join(str(error).replace('in "<byte string>", ', "at ").split())
+        raise ConfigError(f"{path} is not valid YAML: {where}") from None
+
+
+def _read_bounded(path: Path) -> bytes:
+    """The bytes of a regular file. Opening a pipe would wait for its writer without O_NONBLOCK."""
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{path} is not a regular file; give a YAML file")
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"{path} does not exist; check the path") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path} is not a regular file; give a YAML file") from None
+    except (OSError, ValueError) as error:  # ValueError: the path has a null character
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{path} can't be read: {reason}; give a readable file") from None
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{path} has more than {MAX_BYTES} bytes; is it the right file?")
+    return data
+
+
+def _require_bounded(text: bytes) -> None:
+    """Raise YAMLError for too many levels or values, and for aliases and tags. The event parser does not recurse."""
+    depth = n_values = 0
+    for event in yaml.parse(text, _Loader):
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError(f"line {line} has the alias *{event.anchor}; write the value out")
+        if getattr(event, "tag", None) is not None:
+            raise yaml.YAMLError(f"line {line} has the tag {event.tag}; write the value without it")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        n_values += isinstance(event, yaml.NodeEvent)
+        if depth > MAX_DEPTH or n_values > MAX_VALUES:
+            fault = f"{MAX_DEPTH} levels" if depth > MAX_DEPTH else f"{MAX_VALUES} values"
+            raise yaml.YAMLError(f"more than {fault} at line {line}; is it the right file?")
+
+
+def _require_unique_keys(node: yaml.Node | None) -> None:
+    """Raise YAMLError where a mapping has a key twice; PyYAML would silently use the last one."""
+    if isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            name, line = str(key.value), key.start_mark.line + 1
+            if name in lines:
+                raise yaml.YAMLError(
+                    f"'{name}' is defined twice, in lines {lines[name]} and {line}; remove one"
+                )
+            lines[name] = line
+            _require_unique_keys(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            _require_unique_keys(value)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A camera node without images: a real `Node` whose detector reports what the scene of a load shows.
+
+It runs as a process of its own. Lines of JSON on its standard input (`CameraCommand`) give it faults.
+"""
+
+import contextlib
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import tyro
+
+from camera_node.arrays import Grey
+from camera_node.detection.detector import Detector
+from camera_node.detection.roundels import DetectedRoundels, Roundels
+from camera_node.geometry.pose import Pose, rotation_from_vector
+from camera_node.node.node import Node
+from camera_node.protocol.messages import MAX_ROUNDELS
+from camera_node.protocol.session import open_client
+from camera_node.sources.frame import Frame, Source
+from tests.benchmarks.faults.world import CameraCommand, CameraFault, World
+from tests.benchmarks.fusion_load import Load, Scene
+
+READOUT_NS = 5_000_000
+GREY = {"black": 0, "bright": 255}  # levels of the images; others are grey
+
+
+def no_roundels() -> Roundels:
+    """An empty frame."""
+    ids = np.empty(0, np.int32)
+    scalars = np.empty(0)
+    return Roundels(
+        np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2)), scalars, scalars, scalars, ids, ids
+    )
+
+
+class SceneDetector(Detector):
+    """Reports the roundels of the frame that the source delivered last."""
+
+    current: Roundels = no_roundels()
+
+    def detect(self, image: Grey) -> DetectedRoundels:
+        columns = {name: getattr(self.current, name) for name in Roundels.__slots__}
+        n = len(self.current)
+        return DetectedRoundels(**columns, offset_px=np.zeros((n, 2)), pose_cov=np.zeros((n, 7, 7)))
+
+    def adjusted(self, **changes: Any) -> Detector:
+        super().adjusted(**changes)  # refuses invalid settings
+        return self
+
+
+class SceneCamera(Source):
+    """Delivers the frames of one camera of a load at their times, with the faults of `fault`."""
+
+    def __init__(self, world: World, name: str, detector: SceneDetector) -> None:
+        self.dropped, self.fault = 0, CameraFault()
+        self._world, self._scene, self._detector = world, Scene(world.load), detector
+        self._name, self._index = name, self._scene.cameras.names.index(name)
+        self._phase = world.load.phases()[self._index]
+        self._rng = np.random.default_rng(self._index)
+        lens = world.load.rig[name]
+        self._images = {
+            p: np.full((lens.height, lens.width), GREY.get(p, 128), np.uint8) for p in (*GREY, "")
+        }
+        self._closed = threading.Event()
+
+    def __iter__(self) -> Iterator[Frame]:
+        held: list[tuple[Frame, Roundels]] = []
+        seq = self._newest() + 1
+        while self._wait_until(self._time_ns(seq) + READOUT_NS + round(self.fault.delay_ms * 1e6)):
+            fault, t_ns = self.fault, self._time_ns(seq)
+            seq = max(seq + 1, self._newest() - round(fault.delay_ms * 1e-3 * self._world.load.hz))
+            if fault.silent or self._rng.random() < fault.loss:
+                continue
+            held += [self._expose(t_ns, fault)] * (2 if fault.doubled else 1)
+            if not (fault.swapped and len(held) < 2):
+                for frame, self._detector.current in reversed(held):
+                    yield frame
+                held.clear()
+
+    def place(self, fault: CameraFault) -> None:
+        """Set the faults, and the true pose of the camera."""
+        T, camera = np.eye(4), self._world.load.rig[self._name]
+        T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(fault.turn_rad)), fault.shift_m
+        moved = Pose.from_matrix(camera.matrix() @ T)
+        self._scene.cameras.place(self._name, msgspec.structs.replace(camera, T_world_cam=moved))
+        self.fault = fault
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def _expose(self, t_ns: int, fault: CameraFault) -> tuple[Frame, Roundels]:
+        world, shown_ns = self._world, fault.since_ns if fault.picture == "frozen" else t_ns
+        rng = np.random.default_rng(shown_ns) if fault.picture == "frozen" else self._rng
+        image = self._images[fault.picture if fault.picture in GREY else ""]
+        if fault.picture in GREY:
+            return Frame(image, fault.stamp_ns(t_ns)), no_roundels()
+        hidden = world.hidden(shown_ns)
+        roundels = self._scene.roundels(self._index, world.states(shown_ns), rng, hidden)
+        if fault.false:
+            roundels = joined(roundels, self._false(min(fault.false, MAX_ROUNDELS - len(roundels))))
+        return Frame(image, fault.stamp_ns(t_ns)), roundels
+
+    def _false(self, n: int) -> Roundels:
+        camera, rng = self._world.load.rig[self._name], self._rng
+        axes = np.sort(rng.uniform(10, 30, (n, 2)))[:, ::-1]
+        cov, level, none = np.tile(0.01 * np.eye(2), (n, 1, 1)), np.full(n, 0.6), np.full(n, -1, np.int32)
+        uv = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (n, 2))
+        return Roundels(uv, cov, axes, rng.uniform(-1.5, 1.5, n), level, 200 * level, none, none)
+
+    def _time_ns(self, seq: int) -> int:
+        return self._world.epoch_ns + round((seq + self._phase) / self._world.load.hz * 1e9)
+
+    def _newest(self) -> int:
+        elapsed_s = (time.time_ns() - self._world.epoch_ns - READOUT_NS) * 1e-9
+        return math.floor(elapsed_s * self._world.load.hz - self._phase)
+
+    def _wait_until(self, t_ns: int) -> bool:
+        return not self._closed.wait(max(0, t_ns - time.time_ns()) * 1e-9)
+
+
+def joined(a: Roundels, b: Roundels) -> Roundels:
+    """The roundels of both."""
+    return Roundels(*(np.concatenate([getattr(a, k), getattr(b, k)]) for k in Roundels.__slots__))
+
+
+def obey(camera: SceneCamera, world: World) -> None:
+    """Execute the commands on standard input."""
+    for line in sys.stdin.buffer:
+        command = msgspec.json.decode(line, type=CameraCommand)
+        if command.event is not None:
+            world.events[command.event.robot] = command.event
+        if command.fault is not None:
+            camera.place(command.fault)
+
+
+def main(name: str, connect: str, arena: str, epoch_ns: int, load: str, zenoh: Path) -> None:
+    """Publish until SIGTERM.
+
+    Args:
+        name: of the camera in the load.
+        connect: Zenoh endpoint of the server.
+        arena: its name.
+        epoch_ns: Unix time of the load's time 0.
+        load: the `Load` as JSON.
+        zenoh: a Zenoh configuration.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    world = World(msgspec.json.decode(load, type=Load), epoch_ns)
+    detector = SceneDetector()
+    camera = SceneCamera(world, name, detector)
+    threading.Thread(target=obey, args=(camera, world), daemon=True).start()
+    with contextlib.suppress(KeyboardInterrupt), open_client([connect], zenoh) as session:
+        Node(name, camera, detector, session, arena).run()
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Starts real programs, ends and pauses them by signals, and reads their logs and their memory."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+END_S = 10.0  # within which a program ends after SIGTERM
+WARM_UP_S = 60.0  # of a process, until its caches are full
+MIN_SLOPE_S = 60.0  # of samples after the warm-up, from which a slope is computed
+
+
+@dataclass
+class Program:
+    """A running program: its process, since when it runs, and its resident memory over time (age s, MB)."""
+
+    process: subprocess.Popen
+    meter: psutil.Process
+    started_s: float = field(default_factory=time.monotonic)
+    memory: list[tuple[float, float]] = field(default_factory=list)
+
+
+class Programs:
+    """Child processes by name; each appends to `<folder>/<name>.log` (stderr) and `<name>.out` (stdout).
+
+    Attributes:
+        crashes: programs that ended although nobody ended them, with their exit codes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.crashes: list[str] = []
+        self.slopes_mb_per_min: dict[str, list[float]] = defaultdict(list)
+        self._running: dict[str, Program] = {}
+        self._read: dict[str, int] = defaultdict(int)  # bytes of each log
+
+    def __enter__(self) -> "Programs":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for name in tuple(self._running):
+            self.pause(name, False)
+            self._running[name].process.terminate()
+        for name in tuple(self._running):
+            self._forget(name, 0)
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """Run a command; `module arguments` runs as `python -m module arguments`."""
+        environment = os.environ | {
+            "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+            "PYTHONUNBUFFERED": "1",
+        }
+        with (self.folder / f"{name}.log").open("ab") as log, (self.folder / f"{name}.out").open("wb") as out:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=out,
+                stderr=log,
+                env=environment,
+                start_new_session=True,
+            )
+        self._running[name] = Program(process, psutil.Process(process.pid))
+
+    def is_running(self, name: str) -> bool:
+        return name in self._running and self._running[name].process.poll() is None
+
+    def pid(self, name: str) -> int:
+        return self._running[name].process.pid
+
+    def write(self, name: str, line: bytes) -> None:
+        """Write a line to a program's standard input; without effect if it has ended."""
+        pipe = self._running[name].process.stdin if self.is_running(name) else None
+        if pipe is not None:
+            pipe.write(line + b"\n")
+            pipe.flush()
+
+    def pause(self, name: str, paused: bool) -> None:
+        """SIGSTOP or SIGCONT."""
+        self._running[name].process.send_signal(signal.SIGSTOP if paused else signal.SIGCONT)
+
+    def kill(self, name: str) -> None:
+        """SIGKILL."""
+        self._forget(name, signal.SIGKILL)
+
+    def end(self, name: str) -> None:
+        """SIGTERM; SIGKILL if that has no effect, which counts as a crash."""
+        self._forget(name, signal.SIGTERM)
+
+    def exit_code(self, name: str, timeout_s: float) -> int | None:
+        """The code with which a program ends by itself; None if it does not. It is forgotten then."""
+        try:
+            code = self._running[name].process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+        self._forget(name, 0)
+        return code
+
+    def check(self) -> None:
+        """Move programs that ended by themselves to `crashes`."""
+        for name, program in tuple(self._running.items()):
+            if (code := program.process.poll()) is not None:
+                self.crashes.append(f"{name}: exit code {code}")
+                self._forget(name, 0)
+
+    def sample_memory(self) -> None:
+        """Note the resident memory of all programs."""
+        for program in self._running.values():
+            if program.process.poll() is None:
+                age_s = time.monotonic() - program.started_s
+                program.memory.append((age_s, program.meter.memory_info().rss / 1e6))
+
+    def memory_mb(self, name: str) -> float:
+        """Of the last sample; 0 without one."""
+        memory = self._running[name].memory if name in self._running else []
+        return memory[-1][1] if memory else 0.0
+
+    def waited_s(self) -> dict[str, float]:
+        """For how long each program has waited for a processor since its start, by the kernel's account."""
+        waits = {}
+        for name, program in tuple(self._running.items()):
+            try:
+                text = Path(f"/proc/{program.process.pid}/schedstat").read_text()
+                waits[name] = int(text.split()[1]) * 1e-9
+            except (OSError, ValueError, IndexError):
+                continue
+        return waits
+
+    def new_lines(self) -> list[tuple[str, str]]:
+        """The complete lines that the programs logged since the last call, with the programs' names."""
+        lines = []
+        for path in self.folder.glob("*.log"):
+            with path.open("rb") as file:
+                file.seek(self._read[path.name])
+                data = file.read()
+            complete = data[: data.rfind(b"\n") + 1]
+            self._read[path.name] += len(complete)
+            lines += [(path.stem, line) for line in complete.decode(errors="replace").splitlines()]
+        return lines
+
+    def _forget(self, name: str, number: int) -> None:
+        """Wait for the end of a program, after a signal unless `number` is 0."""
+        program = self._running.pop(name)
+        process = program.process
+        if number:
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(number)
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self.crashes.append(f"{name}: did not end within {END_S:g} s")
+            process.kill()
+            process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+        self._note_slope(name, program)
+
+    def _note_slope(self, name: str, program: Program) -> None:
+        steady = np.array([sample for sample in program.memory if sample[0] > WARM_UP_S])
+        if len(steady) > 2 and steady[-1, 0] - steady[0, 0] >= MIN_SLOPE_S:
+            self.slopes_mb_per_min[name].append(60 * float(np.polyfit(steady[:, 0], steady[:, 1], 1)[0]))
+
+
+def python(module: str, *arguments: object) -> list[str]:
+    """The command line of a module."""
+    return [sys.executable, "-m", module, *map(str, arguments)]

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The true state of a simulated arena at any time, and the faults that its cameras and robots are given."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from fusion.model.states import States
+from tests.benchmarks.fusion_load import Load
+
+Vector = tuple[float, float, float]
+
+
+class RobotEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot is covered for a while. It may be carried meanwhile: `before` and `after` are offsets of its path, m."""
+
+    robot: str
+    hidden_from_ns: int
+    hidden_until_ns: int
+    before: Vector = (0.0, 0.0, 0.0)
+    after: Vector = (0.0, 0.0, 0.0)
+
+
+class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
+    """The faults of a camera; by default it has none.
+
+    Attributes:
+        since_ns: when they began.
+        silent: it delivers no frames, as if its driver hung.
+        picture: what its images show.
+        false: roundels that are not there, in each frame.
+        loss: share of frames that are lost.
+        delay_ms: of every frame.
+        swapped: each two frames arrive in the wrong order.
+        doubled: every frame arrives twice.
+        step_ms, drift_ppm: errors of its clock.
+        turn_rad, shift_m: its true pose differs from its calibrated pose by a motion in its own frame.
+    """
+
+    since_ns: int = 0
+    silent: bool = False
+    picture: str = "live"  # or frozen, black, bright
+    false: int = 0
+    loss: float = 0.0
+    delay_ms: float = 0.0
+    swapped: bool = False
+    doubled: bool = False
+    step_ms: float = 0.0
+    drift_ppm: float = 0.0
+    turn_rad: Vector = (0.0, 0.0, 0.0)
+    shift_m: Vector = (0.0, 0.0, 0.0)
+
+    def stamp_ns(self, t_ns: int) -> int:
+        """What the camera's clock shows at a time."""
+        return t_ns + round(self.step_ms * 1e6 + self.drift_ppm * 1e-6 * (t_ns - self.since_ns))
+
+
+class CameraCommand(msgspec.Struct, frozen=True, kw_only=True):
+    """One line of JSON on the standard input of a simulated camera."""
+
+    fault: CameraFault | None = None
+    event: RobotEvent | None = None
+
+
+class World:
+    """The robots of a load in real time; thread-safe, since each entry of `events` is replaced as a whole.
+
+    Args:
+        load: the robots and cameras.
+        epoch_ns: the Unix time of the load's time 0.
+    """
+
+    def __init__(self, load: Load, epoch_ns: int) -> None:
+        self.load, self.epoch_ns = load, epoch_ns
+        self.names = tuple(load.bodies)
+        self.events: dict[str, RobotEvent] = {}
+
+    def states(self, t_ns: int) -> States:
+        """The true states at a Unix time."""
+        states = self.load.paths.at((t_ns - self.epoch_ns) * 1e-9)
+        p = states.p.copy()
+        for name, event in tuple(self.events.items()):
+            p[self.names.index(name)] += event.before if t_ns < event.hidden_until_ns else event.after
+        return replace(states, p=p)
+
+    def hidden(self, t_ns: int) -> list[int]:
+        """Rows of the robots that are covered at a Unix time."""
+        events = tuple(self.events.items())
+        return [self.names.index(n) for n, e in events if e.hidden_from_ns <= t_ns < e.hidden_until_ns]
+
+    def position(self, robot: str, t_ns: int) -> np.ndarray:
+        """(3,) true position of a robot's origin, metres."""
+        return self.states(t_ns).p[self.names.index(robot)]

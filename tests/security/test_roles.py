@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Programs of Roundel with the certificate of their role."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from calib.live.collect import publish_rig
+from calib.rig.rig import Rig
+from camera_node.errors import NetworkError
+from camera_node.protocol.messages import Detections, Roundels, encode
+from fusion.client.arena import Arena
+from fusion.protocol.messages import RobotsRequest
+from fusion.protocol.requests import change_robots, request_robots
+from tests.security.lab import ARENA, KEYS, Lab, certificates
+from tests.waiting import DEADLINE_S, wait_for
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    folder = tmp_path_factory.mktemp("lab")
+    certificates(folder, "localhost", "camera.north", "viewer", "operator").check_returncode()
+    with contextlib.ExitStack() as closing:
+        yield Lab(folder, closing)
+
+
+def frame(camera: str) -> bytes:
+    roundels = Roundels.from_points(np.array([[1.0, 2.0]]), 0.3)
+    return encode(Detections.pack(roundels, camera=camera, seq=1, t_ns=time.time_ns(), width=640, height=480))
+
+
+def test_the_server_receives_a_camera_s_frames_and_a_viewer_its_status(lab: Lab):
+    camera = lab.session("camera.north")
+    with Arena.connect(lab.endpoint, zenoh_config=lab.config("viewer")) as arena:
+        statuses = arena.status(timeout_s=DEADLINE_S)
+        camera.put(KEYS.detections("north"), frame("north"))
+        wait_for(
+            lambda: "north" in statuses.next().cameras,
+            lambda: camera.put(KEYS.detections("north"), frame("north")),
+        )
+
+
+def test_a_viewer_reads_robots_and_an_operator_changes_them(lab: Lab):
+    viewer, operator = lab.session("viewer"), lab.session("operator")
+    request = RobotsRequest(remove=("robot_b",))
+    assert "robot_b" in request_robots(viewer, ARENA)
+    with pytest.raises(NetworkError):
+        change_robots(viewer, ARENA, request, timeout_s=1.0)
+    assert "robot_b" in request_robots(viewer, ARENA), "the server did not receive the viewer's request"
+    assert "robot_b" not in change_robots(operator, ARENA, request)
+
+
+def test_an_operator_changes_the_rig(lab: Lab):
+    assert publish_rig(lab.session("operator"), ARENA, Rig(cameras={}))

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Runs every command of docs/security.md, with shorter times and a port of the operating system's choice."""
+
+import contextlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+
+import camera_node.__main__ as camera_program
+from tests.conftest import ROOT
+from tests.security.lab import KEYS, Lab
+from tests.waiting import wait_for
+
+TEXT = (ROOT / "docs" / "security.md").read_text()
+SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE))
+
+
+def commands(section: str) -> list[str]:
+    blocks = re.findall(r"^```sh\n(.*?)^```", SECTIONS[section], re.DOTALL | re.MULTILINE)
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def run(command: str, folder: Path) -> None:
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, f"{command}\n{done.stderr}"
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with configs, after the commands that create the files. The server is reached as localhost."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    for command in commands("Set-up"):
+        if not command.startswith("python"):
+            run(
+                command.replace(" server camera", " localhost camera").replace("0.0.0.0:7447", "127.0.0.1:0"),
+                tmp_path,
+            )
+    return tmp_path
+
+
+def test_every_command_has_a_test():
+    """A command that is added to the page needs a test here."""
+    tested = ("sh configs/", "cp configs/", "sed -i ", "python -m fusion", "python -m camera_node --source")
+    assert [c for section in SECTIONS for c in commands(section) if not c.startswith(tested)] == []
+
+
+def test_the_folders_work_as_the_page_says(checkout: Path):
+    """The server starts in its folder; a recorder and a camera of the page connect in theirs."""
+    server, camera, record = (shlex.split(c) for c in commands("Set-up") if c.startswith("python"))
+    keys = checkout / "keys"
+    with contextlib.ExitStack() as closing:
+        lab = Lab(keys, closing)
+        assert server[3:] == ["--config", "arena.yaml"], "as Lab starts it"
+        tyro.cli(camera_program.Publish, args=camera[3:])
+        north = lab.session("camera.north")
+        recorder = subprocess.Popen(
+            [sys.executable, *(word.replace("tls/server:7447", lab.endpoint) for word in record[1:])],
+            cwd=keys / "viewer",
+        )
+        closing.callback(recorder.wait, 30)
+        closing.callback(recorder.terminate)
+        recording = keys / "viewer" / "arena.mcap"
+        wait_for(recording.exists)
+        assert any(reply.ok for reply in wait_for(lambda: list(north.get(KEYS.clock, timeout=1.0))))
+
+
+@pytest.mark.parametrize("section", ["Renewal", "Revocation"])
+def test_certificates_are_renewed_and_revoked(checkout: Path, section: str):
+    certificate = checkout / "keys" / "camera.north" / "tls" / "member.pem"
+    for command in commands(section):
+        before = certificate.read_bytes() if certificate.exists() else b""
+        run(command.replace(" server camera", " localhost camera"), checkout)
+        assert not certificate.exists() or certificate.read_bytes() != before
+    assert certificate.exists()
