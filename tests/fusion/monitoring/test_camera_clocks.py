@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Clocks that jump or drift: the right camera is reported, excluded and corrected; no pose of a robot or camera suffers."""
+"""Clocks that jump or drift: the right camera is reported, excluded and corrected, and no pose is wrong."""
 
 from dataclasses import replace
 
