@@ -4,24 +4,33 @@
     RoundelError
     ├── ConfigError          a file or an option is missing or invalid
     ├── CameraError          a camera, an image or another source of frames delivers no frames
-    ├── NetworkError         a Zenoh endpoint is taken, unreachable or refused
+    │   └── CameraAbsentError    a camera is not plugged in, or another program uses it
+    ├── NetworkError         a Zenoh endpoint is invalid, unreachable or refused
+    │   └── AddressError         an address to listen on is taken, or its network is not up
     ├── calib.CalibrationError
     ├── fusion.FusionError
     └── web.WebError
 
 Every message names the fault, its place and the remedy. Faults in live data are counted and never raised.
+
+The exit code tells a service manager whether to retry: 2 stays until a user acts, 75 (EX_TEMPFAIL) may pass by itself.
 """
 
 import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 from camera_node.text import printable
+
+USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
 
 
 class RoundelError(Exception):
     """Base class of all errors that a user can fix."""
+
+    exit_code: ClassVar[int] = USER_ERROR
 
 
 class ConfigError(RoundelError):
@@ -32,17 +41,29 @@ class CameraError(RoundelError):
     """A camera, an image or another source of frames delivers no frames."""
 
 
+class CameraAbsentError(CameraError):
+    """A camera is not plugged in, or another program uses it."""
+
+    exit_code = TEMPORARY_FAILURE
+
+
 class NetworkError(RoundelError):
-    """A Zenoh endpoint is taken, unreachable or refused."""
+    """A Zenoh endpoint is invalid, unreachable or refused."""
+
+
+class AddressError(NetworkError):
+    """An address to listen on is taken, or its network is not up."""
+
+    exit_code = TEMPORARY_FAILURE
 
 
 def run(program: Callable[[], int | None]) -> None:
-    """Run a command and exit with its code; a RoundelError is printed as one line, with exit code 2."""
+    """Run a command and exit with its code; a RoundelError is printed as one line, with its own exit code."""
     try:
         code = program()
     except RoundelError as error:
         print(f"error: {printable(error)}", file=sys.stderr)
-        code = 2
+        code = error.exit_code
     except KeyboardInterrupt:
         code = 130
     except BrokenPipeError:  # the reader closed the pipe, as in `detect --json | head`

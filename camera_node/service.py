@@ -1,11 +1,57 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How a program runs as a service: it ends on signals, and reports its state to the service manager."""
+"""How a program runs as a service: it ends on signals, and reports its state to systemd."""
 
 import contextlib
+import os
 import signal
+import socket
 import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
+
+
+class ServiceManager:
+    """Reports readiness, state and progress to systemd as sd_notify(3) describes; silent where systemd did not start
+    this program. A context manager that reports the end of the service.
+
+    A program that stops reporting progress for `WatchdogSec` is restarted.
+    """
+
+    def __init__(self) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "")
+        watchdog_us = os.environ.get("WATCHDOG_USEC", "")
+        is_own = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self._period_s = int(watchdog_us) * 1e-6 / 4 if watchdog_us.isdecimal() and is_own else 0.0
+        self._next_s = 0.0
+
+    def __enter__(self) -> "ServiceManager":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._send("STOPPING=1")
+
+    def ready(self) -> None:
+        """Report that the service works: others may start to use it."""
+        self._send("READY=1")
+
+    def report(self, state: str) -> None:
+        """Report the state in one line, for `systemctl status`."""
+        self._send(f"STATUS={' '.join(state.split())}")
+
+    def progress(self) -> None:
+        """Report progress, at most four times in the time that the watchdog allows; called by the program's loop."""
+        if self._period_s and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + self._period_s
+            self._send("WATCHDOG=1")
+
+    def _send(self, message: str) -> None:
+        if not self._address:
+            return
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as datagram:
+            datagram.setblocking(False)  # the service does not wait for its manager
+            datagram.sendto(message.encode(), address)
 
 
 @contextlib.contextmanager

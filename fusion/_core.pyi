@@ -76,6 +76,26 @@ class Viewpoints:
     def __init__(self, camera: Index, centres: Array, moved: Array, /) -> None:
         """Camera (F,), a row of the centres (C, 3); moved (F,) metres of the fastest marker until the frame."""
 
+class MarkerCloud:
+    """N triangulated markers, among which constellations are searched for."""
+
+    def __init__(
+        self, positions: Array, covariances: Array, slack_m: float, sigmas: float, reach_m: float, /
+    ) -> None:
+        """Positions (N, 3) and covariances (N, 3, 3).
+
+        A distance is known to `slack_m` + `sigmas` standard deviations; constellations extend over `reach_m`.
+        """
+
+    def mappings(
+        self, distances: Array, usable: NDArray[np.bool_], max_steps: int, max_mappings: int, /
+    ) -> tuple[Index, bool]:
+        """Maximal mappings (K, M) of three or more markers of a constellation to points, -1 for unseen markers.
+
+        `distances` (M, M) are the constellation's; `usable` (N,) says which points may be its markers. False if there
+        are more mappings, with as many markers as one limit allows or fewer; beyond `max_steps` there are none.
+        """
+
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
     """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) Jacobians of pixels by coordinates.
 

@@ -19,7 +19,15 @@ ROOT = Path(__file__).resolve().parents[1]
 WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
 LIVE_FOLDERS = ("web", "bridges", "client", "live", "node", "protocol", "security", "server")
-LIVE_FILES = ("test_demo.py", "test_readme.py", "test_lab.py", "test_record.py", "test_publish.py")
+LIVE_FILES = (
+    "test_demo.py",
+    "test_readme.py",
+    "test_lab.py",
+    "test_services.py",
+    "test_faults.py",
+    "test_record.py",
+    "test_publish.py",
+)
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _locked_ports: list[IO[str]] = []
 NICENESS = 10  # of tests that only compute

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 
+from tests.waiting import wait_for
 from web.demo_server import USUAL, start_server
 from web.processes import Processes
 
@@ -33,6 +34,20 @@ def test_the_demo_calibrates_and_tracks(scene: Path):
         p for p in psutil.process_iter(["cmdline"]) if str(scene.parent) in " ".join(p.info["cmdline"] or ())
     ]
     assert not running, "a program of the demo still runs"
+
+
+def test_a_killed_demo_leaves_no_program(scene: Path):
+    """SIGKILL gives the demo no chance to stop its children; they end because it ended."""
+    command = [sys.executable, "-m", "web", "--demo", "--headless", "--scene", str(scene)]
+    demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: len(psutil.Process(demo.pid).children()) >= 6)  # server, four cameras, calibration
+        children = psutil.Process(demo.pid).children(recursive=True)
+    finally:
+        demo.kill()
+        demo.wait()
+    _, running = psutil.wait_procs(children, timeout=10.0)
+    assert not running
 
 
 def test_an_invalid_file_is_one_line(scene: Path):

@@ -3,7 +3,6 @@
 
 import contextlib
 import logging
-import signal
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import tyro
 from camera_node.errors import run
 from camera_node.logs import set_up_logging
 from camera_node.protocol.session import open_client
+from camera_node.service import stopped_by_signals
 from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.subscription import Subscription
@@ -128,14 +128,13 @@ def program() -> int | None:
     options = tyro.cli(Options, prog="python -m web")
     if options.demo:
         return play_demo(options)
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    if options.seconds is not None:
-        threading.Timer(options.seconds, stop.set).start()
-    if options.replay is not None:
-        show_recording(options.replay, options, stop)
-    else:
-        show_live(options, stop)
+    with stopped_by_signals() as stop:
+        if options.seconds is not None:
+            threading.Timer(options.seconds, stop.set).start()
+        if options.replay is not None:
+            show_recording(options.replay, options, stop)
+        else:
+            show_live(options, stop)
     return 0
 
 

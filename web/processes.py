@@ -13,6 +13,7 @@ from types import FrameType
 
 import psutil
 
+from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR
 from web.errors import WebError
 
 GRACE_S = 5.0  # between SIGTERM and SIGKILL
@@ -39,8 +40,8 @@ class Processes:
         self.stop()
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
-        """Run `python -m module arguments`."""
-        command = [sys.executable, "-m", module, *arguments]
+        """Run `python -m module arguments` until it ends, `stop` is called or this process ends, by whatever cause."""
+        command = [sys.executable, "-m", "web.child", module, *arguments]
         # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
         environment = os.environ | {
             "PYTHONUNBUFFERED": "1",
@@ -51,12 +52,14 @@ class Processes:
             # In a session of its own: Ctrl-C reaches this program only, which then stops its children.
             child = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # closed by the end of this process, which ends the child
                 stdout=log,
                 stderr=log,
                 env=environment,
                 start_new_session=True,
             )
+        if name in self._children:
+            _release(self._children[name])
         self._children[name] = child
         self._meters[name] = psutil.Process(child.pid)
 
@@ -94,6 +97,7 @@ class Processes:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
+            _release(child)
         self._children.clear()
 
     def pids(self) -> list[int]:
@@ -116,13 +120,19 @@ class Processes:
 
     def _raise_failed(self, name: str, code: int) -> None:
         lines = self._log(name).read_text(errors="replace").strip().splitlines()
-        if code == 2 and lines and lines[-1].startswith("error: "):
+        if code in (USER_ERROR, TEMPORARY_FAILURE) and lines and lines[-1].startswith("error: "):
             raise WebError(f"{name}: {lines[-1].removeprefix('error: ')}")
         tail = "\n".join(f"  {line}" for line in lines[-TAIL_LINES:])
         raise ProgramFailed(f"{name} stopped with code {code}; its log is {self._log(name)}\n{tail}".rstrip())
 
     def _log(self, name: str) -> Path:
         return self.folder / f"{name}.log"
+
+
+def _release(child: subprocess.Popen) -> None:
+    """Close this process's end of the child's standard input."""
+    if child.stdin is not None:
+        child.stdin.close()
 
 
 @contextmanager

@@ -12,8 +12,9 @@ import numpy as np
 import viser
 
 from calib.rig.rig import Rig
+from camera_node.service import ServiceManager
 from web.drawing import MarkerCloud, RobotDrawing, TruePoints, add_lights, draw_camera
-from web.errors import WebError
+from web.errors import PortError, WebError
 from web.feed import ArenaState, Feed
 from web.panel import Panel
 
@@ -67,10 +68,17 @@ class View:
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def run(self, stop: threading.Event) -> None:
-        """Draw until `stop` is set; late drawings are skipped."""
+        """Draw until `stop` is set; late drawings are skipped. Each drawing is progress of the service."""
+        with ServiceManager() as service:
+            service.ready()
+            service.report(f"the page is at {self.url}")
+            self._draw_until(stop, service)
+
+    def _draw_until(self, stop: threading.Event, service: ServiceManager) -> None:
         due = time.monotonic()
         while not stop.wait(max(0.0, due - time.monotonic())):
             due = max(due + PERIOD_S, time.monotonic())
+            service.progress()
             try:
                 self.update()
             except Exception as error:  # a drawing that fails must not end the view
@@ -139,7 +147,7 @@ def check_port(host: str, port: int) -> None:
             pass
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error
-        raise WebError(
+        raise PortError(
             f"cannot serve the page on {host}:{port} ({reason}); choose another port with --port"
         ) from None
 

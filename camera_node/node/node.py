@@ -28,6 +28,7 @@ from camera_node.protocol.requests import (
     respond,
 )
 from camera_node.protocol.session import ServerWatch
+from camera_node.service import ServiceManager
 from camera_node.sources.frame import Frame, Source
 
 log = logging.getLogger("camera_node")
@@ -69,18 +70,21 @@ class Node:
         self._closed = threading.Event()
 
     def run(self) -> None:
-        """Publish every frame until the source ends or `close` is called.
+        """Publish every frame until the source ends or `close` is called; each frame is progress of the service.
 
         Raises:
             CameraError: a frame of the source can't be read.
         """
         with contextlib.ExitStack() as stack:
-            publisher = self._open(stack)
+            service = stack.enter_context(ServiceManager())
+            publisher = self._open(stack, service)
+            service.ready()
             for seq, frame in enumerate(self._source):
                 detected = self._detect(frame)
                 t_ns, clock_error_us = self._stamp(frame)
                 publisher.put(self._encode(seq, detected, t_ns, clock_error_us))
                 self._statistics.count(detected)
+                service.progress()
 
     def close(self) -> None:
         """End `run`; called from another thread."""
@@ -115,7 +119,7 @@ class Node:
         )
         return encode(message)
 
-    def _open(self, stack: contextlib.ExitStack) -> zenoh.Publisher:
+    def _open(self, stack: contextlib.ExitStack, service: ServiceManager) -> zenoh.Publisher:
         """Declare all publications, queryables and tokens, to be undeclared by `stack`."""
         keys, name, session = self._keys, self.name, self._session
         stack.callback(self.close)
@@ -137,7 +141,9 @@ class Node:
         stack.callback(watch.close)
         self._clock.start()
         stack.callback(self._clock.close)
-        reporter = threading.Thread(target=self._publish_status, args=(watch,), name="status", daemon=True)
+        reporter = threading.Thread(
+            target=self._publish_status, args=(watch, service), name="status", daemon=True
+        )
         reporter.start()
         stack.callback(reporter.join, STATUS_S)
         stack.callback(self._closed.set)
@@ -158,7 +164,7 @@ class Node:
         listener.undeclare()
         self._closed.wait(ROUTES_S)
 
-    def _publish_status(self, watch: ServerWatch) -> None:
+    def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
         while not self._closed.wait(STATUS_S):
             watch.report_absence()
@@ -169,6 +175,7 @@ class Node:
                 self._detector.threshold,
             )
             publisher.put(encode(status))
+            service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
         publisher.undeclare()
 
     def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import zenoh
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.errors import AddressError, ConfigError, NetworkError
 
 log = logging.getLogger("camera_node.network")
 
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
+# In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
+SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
@@ -28,7 +30,8 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
     The operating system chooses the port of an endpoint such as tcp/127.0.0.1:0; `listening_endpoints` reads it.
 
     Raises:
-        NetworkError: an endpoint is taken or invalid.
+        AddressError: an endpoint is taken, or its address is not one of this machine now.
+        NetworkError: an endpoint is invalid, or a certificate is missing.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
     # With a listening timeout other than 0, opening succeeds although the port is taken.
@@ -38,7 +41,8 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
     try:
         return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
-        raise NetworkError(
+        kind = AddressError if SYSTEM_ERROR.search(str(error)) else NetworkError
+        raise kind(
             f"can't listen on {' '.join(listen)}: another server may use the port; stop it or choose another port "
             f"with --listen, such as tcp/0.0.0.0:7447 ({_brief(error)})"
         ) from None

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import cv2
 
-from camera_node.errors import CameraError
+from camera_node.errors import CameraAbsentError, CameraError
 from camera_node.protocol.host_clock import unix_ahead_ns
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import RAW, to_grey
@@ -47,7 +47,7 @@ def find_device(text: str, sys: Path = SYS) -> Path:
         raise CameraError(
             f"several cameras have the name '{text}'; give a path: {', '.join(map(str, matching))}"
         )
-    raise CameraError(f"no folder, video or camera '{text}'; {_present(names)}")
+    raise CameraAbsentError(f"no folder, video or camera '{text}'; {_present(names)}")
 
 
 def camera_names(sys: Path = SYS) -> dict[Path, str]:
@@ -139,19 +139,19 @@ def open_capture(device: Path, settings: SourceSettings) -> cv2.VideoCapture:
     """Open a V4L2 camera and apply its settings; settings that it refuses are logged.
 
     Raises:
-        CameraError: the device does not exist or does not open.
+        CameraAbsentError: the device does not exist or does not open.
     """
     if not device.exists():
-        raise CameraError(f"{device} does not exist; {_present(camera_names())}")
+        raise CameraAbsentError(f"{device} does not exist; {_present(camera_names())}")
     if not os.access(device, os.R_OK | os.W_OK):
-        raise CameraError(
+        raise CameraAbsentError(
             f"no permission to open {device}; add this user to the group video and log in again"
         )
     # Seconds after which a read of a camera that delivers nothing fails.
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")
     capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
     if not capture.isOpened():
-        raise CameraError(f"{device} is not a camera, or another program uses it; close that program")
+        raise CameraAbsentError(f"{device} is not a camera, or another program uses it; close that program")
     apply(capture, properties(settings), device)
     return capture
 

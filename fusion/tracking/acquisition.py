@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.arrays import Array, Index
+from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.states import POSITION, States
-from fusion.tracking.constellation import Criteria, Fit, fits_size, identify
+from fusion.tracking.constellation import Fits, TriangulatedMarkers, search
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
+    DIAMETER_TOLERANCE,
     MAX_CHI2,
     POSITION_GATE,
     START_S,
@@ -24,15 +26,18 @@ from fusion.tracking.gating import (
     mean_by_body,
     misfit,
 )
-from fusion.tracking.multiview import Marker, find_markers
+from fusion.tracking.identification import Question, RefinedFits, identify
+from fusion.tracking.multiview import Marker, Portion, find_markers, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
 SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
 START_M = 0.1  # standard deviation of `start_m`
 FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
-MAX_DETECTIONS = 600  # unassigned, of one frame; more come from a texture or a fault, and are not searched
-MAX_BODIES = 12  # constellations searched for in one frame set; the others follow in the next ones
+MAX_DETECTIONS = (
+    1_000  # unassigned, of one frame; of more, those around one of them are searched, each in its turn
+)
+MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,39 +59,29 @@ class Acquired:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """A robot at R, p with the assignments that support it."""
+class _Starts:
+    """K robots (rows) at rest, the assignments that support them, and the start of each assignment."""
 
-    robot: int
-    R: Array
-    p: Array
-    assignments: Assignments
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Refined:
-    """N starts after an update.
-
-    Attributes:
-        states: of the starts.
-        body: (K,) the start of each observation.
-        misfit: (K,) squared residuals in standard deviations.
-        assignments: of the observations.
-    """
-
+    robot: Index
     states: States
-    body: Index
-    misfit: Array
     assignments: Assignments
+    body: Index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Accepted:
-    """The starts that their observations confirm."""
+class _Found:
+    """Robots at their states, with the assignments that support these."""
 
     rows: Index
     states: States
     assignments: Assignments
+
+    def joined(self, fits: RefinedFits) -> "_Found":
+        return _Found(
+            np.concatenate([self.rows, fits.robot]),
+            self.states.joined(fits.states),
+            self.assignments.joined(fits.assignments),
+        )
 
 
 class Acquisition:
@@ -100,7 +95,8 @@ class Acquisition:
 
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
-        self._turn = 0  # rotates through more than MAX_BODIES missing constellations
+        self._turn = 0  # row of the first constellation to search for, if there are too many
+        self._frame_sets = 0  # searched so far
 
     def acquire(
         self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
@@ -113,73 +109,69 @@ class Acquisition:
             detections: of a frame set.
             assignments: of the tracked robots.
         """
-        none = _Accepted(missing[:0], table.states.select(missing[:0]), Assignments.none())
         if not len(missing) and not self._leads:
-            return Acquired(none.rows, none.states, missing, assignments, [])
+            return Acquired(missing, table.states.select(missing), missing, assignments, [])
         bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
-        found, displaced = none, missing[:0]
-        if len(bodies):
-            found, displaced, assignments = self._acquire_bodies(table, bodies, detections, assignments)
-        markers = self._find_markers(table, detections, assignments)
-        if len(singles):
-            more = self._acquire_singles(table, singles, markers, detections)
-            assignments = assignments.joined(more.assignments)
-            taken = set(more.assignments.detection.tolist())
-            markers = [m for m in markers if not taken.intersection(m.detections.tolist())]
-            found = replace(
-                found,
-                rows=np.concatenate([found.rows, more.rows]),
-                states=found.states.joined(more.states),
-            )
-        return Acquired(found.rows, found.states, displaced, assignments, markers)
+        # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
+        is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
+        of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
+        markers = self._find_markers(table, detections, of_bodies)
+        usual = _usual_misfit(table, detections, of_bodies)
+        found = self._acquire_bodies(table, bodies, markers, detections, usual)
+        of_bodies = of_bodies.joined(found.assignments)
+        displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
+        assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
+        markers = _without(markers, assignments)
+        more = self._acquire_singles(table, singles, markers, detections)
+        return Acquired(
+            np.concatenate([found.rows, more.robot]),
+            found.states.joined(more.states),
+            table.markers.robot[displaced],
+            assignments.joined(more.assignments),
+            _without(markers, more.assignments),
+        )
 
     def _acquire_bodies(
-        self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
-    ) -> tuple[_Accepted, Index, Assignments]:
-        """The constellations found, the single-marker robots that they displace, and all assignments.
-
-        A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
-        """
-        is_single = table.single[table.markers.robot[assignments.marker]]
-        of_singles, assignments = assignments.select(is_single), assignments.select(~is_single)
-        markers = self._find_markers(table, detections, assignments)
-        turn = np.roll(missing, -self._turn)[:MAX_BODIES]
-        self._turn = (self._turn + MAX_BODIES) % len(missing) if len(missing) > MAX_BODIES else 0
-        fits = identify(
-            {int(k): table.robots[k] for k in turn}, markers, self._criteria(table, markers, detections)
+        self,
+        table: TrackTable,
+        missing: Index,
+        markers: list[Marker],
+        detections: DetectionTable,
+        usual: float,
+    ) -> _Found:
+        """The constellations of this shard that the markers identify."""
+        turn = self._turn
+        rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
+        robots = {row: table.robots[row] for row in rows.tolist()}
+        scene = TriangulatedMarkers.of(markers, self._cameras)
+        identified = identify(
+            Question(robots, scene, search(robots, scene)),
+            lambda fits: self._refine(table, _starts_of(fits, markers, table), detections),
+            usual,
+            turn,
         )
-        starts = [_start_of(fit, markers, table) for fit in fits if table.owned[fit.robot]]
-        found = self._confirm(table, starts, detections, START_SIGMAS)
-        assignments = assignments.joined(found.assignments)
-        taken = np.isin(of_singles.detection, assignments.detection)
-        displaced = np.unique(of_singles.marker[taken])
-        remaining = of_singles.select(~np.isin(of_singles.marker, displaced))
-        return found, table.markers.robot[displaced], assignments.joined(remaining)
-
-    def _criteria(self, table: TrackTable, markers: list[Marker], detections: DetectionTable) -> Criteria:
-        def faces(marker: Marker, normal: Array) -> bool:
-            to = self._cameras.centres[marker.cameras] - marker.position
-            return bool((to @ normal > 0).all())
-
-        def history(k: int, p: Array) -> float:
-            return min(_history_chi2(table, k, p, np.zeros((3, 3))), FAR_CHI2)
-
-        def judge(fits: list[Fit]) -> Array:
-            starts = [_start_of(fit, markers, table) for fit in fits]
-            refined = self._refine(table, starts, detections, START_SIGMAS)
-            return np.bincount(refined.body, refined.misfit, len(starts)).astype(float)
-
-        return Criteria(faces, history, judge)
+        self._turn = identified.turn
+        if self._turn == turn and len(rows) < len(missing):
+            self._turn = int(rows[-1]) + 1
+        found = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
+        for fits in identified.fits:
+            found = found.joined(fits.select(table.owned[fits.robot]))
+        return found
 
     def _acquire_singles(
         self, table: TrackTable, missing: Index, markers: list[Marker], detections: DetectionTable
-    ) -> _Accepted:
-        starts = []
-        for robot, marker in _pair_singles(table, missing.tolist(), markers):
-            R, _ = start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)
-            assignments = _assignments_of(table, robot, (0,), [marker])
-            starts.append(_Start(robot, R, marker.position, assignments))
-        return self._confirm(table, starts, detections, START_SIGMAS_SINGLE)
+    ) -> RefinedFits:
+        pairs = _pair_singles(table, missing.tolist(), markers)
+        R = [
+            start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)[0]
+            for robot, marker in pairs
+        ]
+        p = np.array([marker.position for _, marker in pairs]).reshape(-1, 3)
+        states = States.at_rest(np.array(R).reshape(-1, 3, 3), p, START_SIGMAS_SINGLE)
+        robot = np.array([robot for robot, _ in pairs], np.intp)
+        assignments, body = _assigned([marker for _, marker in pairs], table.markers.first[robot])
+        refined = self._refine(table, _Starts(robot, states, assignments, body), detections)
+        return refined.select(refined.misfit < MAX_CHI2)
 
     def _find_markers(
         self, table: TrackTable, detections: DetectionTable, assignments: Assignments
@@ -187,53 +179,64 @@ class Acquisition:
         """Triangulate markers from unassigned detections."""
         free = np.ones(len(detections), bool)
         free[assignments.detection] = False
-        count = np.bincount(detections.frame[free], minlength=len(detections.exposures.camera))
-        free &= (count <= MAX_DETECTIONS)[detections.frame]
         diameters = np.unique(2 * table.markers.radius)
         if not free.any() or not len(diameters):
             return []
-        return find_markers(self._cameras, detections, np.flatnonzero(free), diameters)
+        self._frame_sets += 1
+        portion = Portion(MAX_DETECTIONS, self._frame_sets, float(np.median(diameters)))
+        rows = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
+        return find_markers(self._cameras, detections, rows, diameters)
 
-    def _confirm(
-        self, table: TrackTable, starts: list[_Start], detections: DetectionTable, sigmas: tuple
-    ) -> _Accepted:
-        """Refine starts by their observations; returns those that fit."""
-        if not starts:
-            none = np.empty(0, np.intp)
-            return _Accepted(none, table.states.select(none), Assignments.none())
-        refined = self._refine(table, starts, detections, sigmas)
-        good = mean_by_body(refined.misfit, refined.body, len(starts)) < MAX_CHI2
-        rows = np.array([start.robot for start in starts])[good]
-        return _Accepted(rows, refined.states.select(good), refined.assignments.select(good[refined.body]))
-
-    def _refine(
-        self, table: TrackTable, starts: list[_Start], detections: DetectionTable, sigmas: tuple
-    ) -> _Refined:
-        """Update each start independently with its observations, from these standard deviations."""
-        at = States.at_rest(np.array([s.R for s in starts]), np.array([s.p for s in starts]), sigmas)
-        assignments = Assignments.none().joined(*(start.assignments for start in starts))
-        observations = MatchedObservations.of(assignments, detections, table.markers)
-        body = np.repeat(np.arange(len(starts)), [len(start.assignments) for start in starts])
+    def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
+        """Update each start independently with its detections."""
+        n, body = len(starts.robot), starts.body
+        observations = MatchedObservations.of(starts.assignments, detections, table.markers)
         observations = replace(observations, discs=replace(observations.discs, body=body))
-        estimator = self._estimator.select(np.array([start.robot for start in starts]))
-        prediction = estimator.predict(at, np.full(len(starts), START_S))
+        estimator = self._estimator.select(starts.robot)
+        prediction = estimator.predict(starts.states, np.full(n, START_S))
         states, residuals = estimator.update(prediction, observations, SMALL)
         d2 = misfit(observations, residuals)
-        return _Refined(states, body, d2, assignments.with_residuals(residuals))
+        history = [
+            _history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(starts.robot, states.p, strict=True)
+        ]
+        return RefinedFits(
+            starts.robot,
+            states,
+            np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
+            mean_by_body(d2, body, n),
+            starts.assignments.with_residuals(residuals),
+            body,
+        )
 
 
-def _start_of(fit: Fit, markers: list[Marker], table: TrackTable) -> _Start:
-    assignments = _assignments_of(table, fit.robot, fit.numbers, [markers[p] for p in fit.points])
-    return _Start(fit.robot, fit.R, fit.t, assignments)
+def _starts_of(fits: Fits, markers: list[Marker], table: TrackTable) -> _Starts:
+    mappings = fits.mappings
+    rows = table.markers.first[mappings.robot][:, None] + mappings.numbers
+    assignments, of = _assigned([markers[p] for p in mappings.points.ravel().tolist()], rows.ravel())
+    body = np.repeat(np.arange(len(fits)), mappings.points.shape[1])[of]
+    return _Starts(mappings.robot, States.at_rest(fits.R, fits.t, START_SIGMAS), assignments, body)
 
 
-def _assignments_of(
-    table: TrackTable, robot: int, numbers: tuple[int, ...], markers: list[Marker]
-) -> Assignments:
-    """The detections of triangulated markers, assigned to the robot's markers `numbers`."""
-    rows = table.markers.first[robot] + np.array(numbers, np.intp)
-    counts = [len(marker.detections) for marker in markers]
-    return Assignments.of(np.concatenate([m.detections for m in markers]), np.repeat(rows, counts))
+def _assigned(markers: list[Marker], rows: Index) -> tuple[Assignments, Index]:
+    """The detections of triangulated markers, assigned to `rows` of the marker table; and the marker of each."""
+    detections = [np.empty(0, np.intp), *(marker.detections for marker in markers)]
+    of = np.repeat(np.arange(len(markers)), [len(marker.detections) for marker in markers])
+    return Assignments.of(np.concatenate(detections), rows[of]), of
+
+
+def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
+    """The median of the mean squared residuals of tracked robots, in standard deviations; 0 without any."""
+    cov = detections.cov[:, :, assignments.detection]
+    d2 = assignments.squared_px / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
+    robot = table.markers.robot[assignments.marker[np.isfinite(d2)]]
+    means = mean_by_body(d2[np.isfinite(d2)], robot, len(table.robots))[np.unique(robot)]
+    return float(np.median(means)) if len(means) else 0.0
+
+
+def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:
+    """The markers none of whose detections is assigned."""
+    taken = set(assignments.detection.tolist())
+    return [marker for marker in markers if taken.isdisjoint(marker.detections.tolist())]
 
 
 def _pair_singles(table: TrackTable, missing: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
@@ -249,7 +252,7 @@ def _pair_singles(table: TrackTable, missing: list[int], markers: list[Marker]) 
 
 def _reaches(table: TrackTable, k: int, marker: Marker) -> bool:
     """Whether the size and the history of single-marker robot k allow this marker."""
-    if not fits_size(marker, table.robots[k]):
+    if abs(marker.diameter_m / table.robots[k].diameter_m - 1) >= DIAMETER_TOLERANCE:  # False where unknown
         return False
     return _history_chi2(table, k, marker.position, marker.covariance) < POSITION_GATE
 

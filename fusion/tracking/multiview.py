@@ -33,6 +33,7 @@ SIGMAS = 3.5
 RAY_SLACK_PX = 0.5  # error of the calibration, and of an outline's centre as the centre of the disc
 FAR_M = 50.0  # largest range of a ray without a size
 CLEARLY = 0.5  # largest ratio of a ray's distances to the closest and the second closest marker
+BLOCK = 64  # rays compared with all markers at a time: the distances stay in the cache
 JOIN_ROUNDS = 2  # of refinement before ambiguous rays are reassigned
 
 
@@ -96,6 +97,39 @@ def find_markers(
     group, centres = _refine(rays, np.where(_ambiguous(rays), -1, group), centres)
     group = _join_unassigned(rays, group, centres)
     return _markers(rays, group, centres, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Portion:
+    """Of a frame with more than `limit` detections, those nearest to one point; another one in each turn.
+
+    The point is on the ray of a detection of such a frame, at the range of a marker of `diameter_m`.
+    """
+
+    limit: int
+    turn: int
+    diameter_m: float
+
+
+def portion_of(cameras: CameraArray, detections: DetectionTable, rows: Index, portion: Portion) -> Index:
+    """The rows of this portion; all rows of frames below the limit."""
+    limit, diameter_m = portion.limit, portion.diameter_m
+    rows = rows[np.isfinite(detections.xy[0, rows])]
+    count = np.bincount(detections.frame[rows], minlength=len(detections.exposures.camera))
+    crowded = np.flatnonzero(count > limit)
+    if not len(crowded):
+        return rows
+    rays = _rays_of(cameras, detections, rows)
+    seeds = np.flatnonzero(np.isin(rays.frame, crowded) & np.isfinite(rays.size))
+    if not len(seeds):
+        return rows[~np.isin(rays.frame, crowded)]
+    seed = seeds[np.random.default_rng(portion.turn).integers(len(seeds))]
+    to = rays.o[seed] + rays.d[seed] * diameter_m / rays.size[seed] - rays.o
+    off = -np.einsum("ni,ni->n", rays.d, to / np.linalg.norm(to, axis=1, keepdims=True))
+    rank = np.empty(len(rows), np.intp)
+    order = np.lexsort((off, rays.frame))
+    rank[order] = np.arange(len(rows)) - np.concatenate([[0], np.cumsum(count)])[rays.frame[order]]
+    return rows[rank < limit]
 
 
 def _rays_of(cameras: CameraArray, detections: DetectionTable, rows: Index) -> _Rays:
@@ -205,6 +239,18 @@ def _misses(rays: _Rays, rows: Index, points: Array) -> Array:
     return np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
 
 
+def _two_closest(rays: _Rays, rows: Index, points: Array) -> tuple[Index, Array, Array]:
+    """The closest point of each ray, and the distances (see `_misses`) to it and to the second closest one."""
+    o, d = rays.o[rows], rays.d[rows]
+    along = d @ points.T - np.einsum("ni,ni->n", o, d)[:, None]
+    squared = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ points.T + np.einsum("ki,ki->k", points, points)
+    distance = np.sqrt(np.maximum(squared - along**2, 0))
+    reach = (SIGMAS * rays.sigma[rows])[:, None] * along + (MAX_SPEED_M_S * np.abs(rays.tau[rows]))[:, None]
+    miss = np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
+    two = np.partition(np.column_stack([miss, np.full(len(rows), np.inf)]), 1, axis=1)
+    return np.argmin(miss, 1), two[:, 0], two[:, 1]
+
+
 def _join_unassigned(rays: _Rays, group: Index, centres: Array) -> Index:
     """Add each unassigned ray to the one marker that it clearly intersects, unless that has a ray in its frame."""
     free = np.flatnonzero(group < 0)
@@ -212,11 +258,10 @@ def _join_unassigned(rays: _Rays, group: Index, centres: Array) -> Index:
         return group
     taken = np.zeros((len(centres), int(rays.frame.max()) + 1), bool)
     taken[group[group >= 0], rays.frame[group >= 0]] = True
-    every = np.tile(np.arange(len(centres)), len(free))
-    miss = _misses(rays, np.repeat(free, len(centres)), centres[every]).reshape(len(free), -1)
-    two = np.partition(np.column_stack([miss, np.full(len(free), np.inf)]), 1, axis=1)[:, :2]
-    best = np.argmin(miss, 1)
-    clear = (two[:, 0] < 1) & (two[:, 0] < CLEARLY * two[:, 1]) & ~taken[best, rays.frame[free]]
+    blocks = np.array_split(free, -(-len(free) // BLOCK))
+    closest = [_two_closest(rays, block, centres) for block in blocks]
+    best, first, second = (np.concatenate(column) for column in zip(*closest, strict=True))
+    clear = (first < 1) & (first < CLEARLY * second) & ~taken[best, rays.frame[free]]
     group = group.copy()
     group[free[clear]] = best[clear]
     return group

@@ -6,6 +6,7 @@ void bind_poses(nanobind::module_& m);
 void bind_detections(nanobind::module_& m);
 void bind_equations(nanobind::module_& m);
 void bind_rays(nanobind::module_& m);
+void bind_constellation(nanobind::module_& m);
 }  // namespace roundel::fusion
 
 NB_MODULE(_core, m) {
@@ -14,4 +15,5 @@ NB_MODULE(_core, m) {
     roundel::fusion::bind_detections(m);
     roundel::fusion::bind_equations(m);
     roundel::fusion::bind_rays(m);
+    roundel::fusion::bind_constellation(m);
 }

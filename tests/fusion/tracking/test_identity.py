@@ -2,6 +2,7 @@
 """Identities: identical robots, occlusions, crowds, and ambiguous detections."""
 
 import time
+from itertools import combinations, islice, product
 
 import numpy as np
 import pytest
@@ -12,13 +13,15 @@ from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import DetectionTable
-from fusion.model.robots import Robot, require_distinct
-from fusion.tracking.constellation import Criteria, Fit, identify
-from fusion.tracking.multiview import Marker, find_markers
-from tests.benchmarks.fusion_accuracy import accuracy
+from fusion.model.robots import Robot, distances, require_distinct
+from fusion.tracking import acquisition, identification
+from fusion.tracking.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
+from fusion.tracking.multiview import find_markers
+from fusion.tracking.tracker import Tracker
+from tests.benchmarks.fusion_accuracy import accuracy, frame_sets
 from tests.benchmarks.fusion_grouping import cold_grouping
-from tests.benchmarks.fusion_load import DIAMETER_M, Load
-from tests.benchmarks.fusion_swaps import identity
+from tests.benchmarks.fusion_load import DIAMETER_M, START_NS, Load
+from tests.benchmarks.fusion_swaps import WRONG_M, identity
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line, ring
 from tests.fusion.tracks import errors, track
 
@@ -123,26 +126,84 @@ def test_no_detection_is_in_two_markers():
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
 
 
+def test_two_hundred_robots_are_acquired_at_once():
+    """800 markers, of which a camera sees more than 600. Half of the robots must be tracked from the first frame set,
+    all within 0.1 s, and never under a wrong name."""
+    load = Load(200, 4, 8, 60.0)
+    tracker, tracked = Tracker(load.rig, load.bodies), []
+    for frame_set in islice(frame_sets(load, 0.5), 7):
+        tracker.track(frame_set)
+        truth = load.paths.at((frame_set.t_ns - START_NS) * 1e-9)
+        rows = tracker.table.tracked
+        assert (np.linalg.norm(tracker.table.states.p - truth.p, axis=1)[rows] < WRONG_M).all()
+        tracked.append(int(rows.sum()))
+    assert tracked[0] > 100
+    assert tracked[-1] == 200
+
+
+@pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_BODIES", "MAX_DETECTIONS"])
+def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.MonkeyPatch, limit: str):
+    """Each limit is a tenth of what the twelve robots need."""
+    module, value = {
+        "MAX_COMPARED": (identification, 3),
+        "MAX_BODIES": (acquisition, 1),
+        "MAX_DETECTIONS": (acquisition, 10),
+    }[limit]
+    monkeypatch.setattr(module, limit, value)
+    load = Load(12, 4, 6, 30.0, seed=5)
+    tracker = Tracker(load.rig, load.bodies)
+    tracked = [
+        tracker.track(frame_set) and int(tracker.table.tracked.sum()) for frame_set in frame_sets(load, 3.0)
+    ]
+    assert tracked[0] < 12
+    assert tracked[-1] == 12
+
+
 def test_uncertain_distances_identify_nothing_in_bounded_time():
     """Markers with position sigmas of 0.2 m, as from late frames: hundreds of thousands of mappings to a robot."""
     begun = time.process_time()
-    assert not fits_among(0.2, DIAMETER_M)
+    found = mappings_among(0.2, DIAMETER_M)
+    assert len(found.crowded) == 12
+    assert not any(len(table) for table in found.tables.values())
     assert time.process_time() - begun < 10  # 0.1 s; minutes without the bound
 
 
 def test_markers_of_another_size_identify_no_robot():
-    assert not fits_among(0.002, 2 * DIAMETER_M)
+    assert any(len(table) for table in mappings_among(0.002, DIAMETER_M).tables.values())
+    assert not any(len(table) for table in mappings_among(0.002, 2 * DIAMETER_M).tables.values())
 
 
-def fits_among(sigma_m: float, diameter_m: float) -> list[Fit]:
-    """The fits of twelve robots to 80 markers at random positions with standard deviation `sigma_m`."""
-    rng, none = np.random.default_rng(4), np.empty(0, np.intp)
-    places = rng.uniform([-2, -1, 0], [2, 1, 0.5], (80, 3))
-    markers = [Marker(p, sigma_m**2 * np.eye(3), none, none, diameter_m) for p in places]
-    robots = dict(enumerate(Load(12, 4).bodies.values()))
-    return identify(
-        robots, markers, Criteria(lambda *_: True, lambda *_: 0.0, lambda fits: np.zeros(len(fits)))
+def mappings_among(sigma_m: float, diameter_m: float) -> Candidates:
+    """The mappings of twelve robots to 80 markers at random positions with standard deviation `sigma_m`."""
+    places = np.random.default_rng(4).uniform([-2, -1, 0], [2, 1, 0.5], (80, 3))
+    covariance, diameters = np.tile(sigma_m**2 * np.eye(3), (80, 1, 1)), np.full(80, diameter_m)
+    scene = TriangulatedMarkers(places, covariance, diameters, np.empty((80, 0, 3)))
+    return search(dict(enumerate(Load(12, 4).bodies.values())), scene)
+
+
+def test_the_search_finds_every_maximal_mapping():
+    """Compared with all mappings of three and four markers to nine points, tried one by one."""
+    rng = np.random.default_rng(8)
+    robot = next(iter(Load(1, 4).bodies.values()))
+    places = np.concatenate([robot.points, robot.points[:3] + 0.4, rng.uniform(-0.3, 0.3, (2, 3))])
+    scene = TriangulatedMarkers(
+        places, np.tile(4e-4 * np.eye(3), (9, 1, 1)), np.full(9, np.nan), np.empty((9, 0, 3))
     )
+    D, E = distances(robot.points), distances(places)
+    slack = SLACK_M + SIGMAS * np.sqrt(2 * 4e-4)
+
+    def consistent(mapping: tuple[int, ...]) -> bool:
+        used = [(m, p) for m, p in enumerate(mapping) if p >= 0]
+        return all(p != q and abs(D[m, n] - E[p, q]) < slack for (m, p), (n, q) in combinations(used, 2))
+
+    every = [m for m in product(range(-1, 9), repeat=4) if sum(p >= 0 for p in m) >= 3 and consistent(m)]
+    maximal = {
+        m
+        for m in every
+        if not any(o != m and all(p in (-1, q) for p, q in zip(m, o, strict=True)) for o in every)
+    }
+    assert len(maximal) > 10
+    assert {tuple(row) for row in search({0: robot}, scene).tables[0].tolist()} == maximal
 
 
 @pytest.mark.parametrize("robot", ["a", "c"])

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Identifies constellations: accepts a fit that explains more markers, or fits clearly better, than every rival.
+
+Rivals are fits of one robot, and fits with a common marker. Free-running cameras see a moving marker at different
+positions, which makes its distances uncertain; so the detections decide, with an estimated velocity.
+
+In a crowd, detections of two markers make a third one, and a false fit may use it. Such a fit is poorer than those of
+other robots. So may be the fit of a robot whose markers are not quite as declared: a poor fit is accepted if all
+markers are seen and no good fit contradicts it.
+
+All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera_node.arrays import Array, Index, Mask
+from fusion.model.observations import Assignments
+from fusion.model.robots import Robot
+from fusion.model.states import States
+from fusion.tracking.constellation import MIN_MARKERS, Candidates, Fits, Mappings, TriangulatedMarkers, fit
+from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2
+
+POOR = 10.0  # times the usual squared residual, above which a fit is poor
+MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
+MAX_RIVALS = (
+    3_000  # mappings that compete with those of one robot; with more it waits until others are acquired
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedFits:
+    """K fits after an update with their detections.
+
+    Attributes:
+        robot: (K,) rows.
+        states: with velocities.
+        chi2: (K,) of the detections, and of the position relative to the last one.
+        misfit: (K,) mean squared residual of a detection in standard deviations.
+        assignments, body: detections, and the fit of each.
+    """
+
+    robot: Index
+    states: States
+    chi2: Array
+    misfit: Array
+    assignments: Assignments
+    body: Index
+
+    def __len__(self) -> int:
+        return len(self.robot)
+
+    def select(self, rows: Mask) -> "RefinedFits":
+        """The rows of a mask."""
+        used, number = rows[self.body], np.cumsum(rows) - 1
+        return RefinedFits(
+            self.robot[rows],
+            self.states.select(rows),
+            self.chi2[rows],
+            self.misfit[rows],
+            self.assignments.select(used),
+            number[self.body[used]],
+        )
+
+
+Refine = Callable[[Fits], RefinedFits]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identified:
+    """The accepted fits, the robots (rows) with plausible fits that were not accepted, and where to go on.
+
+    Attributes:
+        fits: one for each number of markers.
+        rivals: by robot, the robot of the best rival; the robot itself where it fits in several places.
+        turn: row of the first robot whose turn it is in the next frame set.
+    """
+
+    fits: list[RefinedFits]
+    rivals: dict[int, int]
+    turn: int
+
+
+class _Claims:
+    """Robots and points of fits."""
+
+    def __init__(self, n_robots: int, n_points: int) -> None:
+        self._robots, self._points = np.zeros(n_robots, bool), np.zeros(n_points, bool)
+
+    def add(self, mappings: Mappings) -> None:
+        self._robots[mappings.robot] = True
+        self._points[mappings.points] = True
+
+    def touch(self, mappings: Mappings) -> Mask:
+        """(K,) mappings of a claimed robot or to a claimed point."""
+        return self._robots[mappings.robot] | self._points[mappings.points].any(1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Level:
+    """K fits with one number of markers, refined; chi-square and robot (K,) of the best rival of each."""
+
+    fits: Fits
+    refined: RefinedFits
+    best: Array
+    rival: Index
+
+    @property
+    def wins(self) -> Mask:
+        """(K,) fits that are clearly better than all rivals."""
+        return self.refined.chi2 + DECISIVE_CHI2 <= self.best
+
+    def select(self, rows: Mask) -> "_Level":
+        return _Level(self.fits.select(rows), self.refined.select(rows), self.best[rows], self.rival[rows])
+
+
+def identify(question: "Question", refine: Refine, usual: float, turn: int) -> Identified:
+    """Accept fits, those with most markers first.
+
+    Args:
+        question: which robots, and among which markers.
+        refine: updates fits with their detections.
+        usual: mean squared residual of tracked robots in standard deviations; 0 if none is tracked.
+        turn: row of the first robot to decide about, where the limit allows only some.
+    """
+    robots = question.robots
+    decisions = _Decisions(question, usual, turn)
+    most = max((len(robot.markers) for robot in robots.values()), default=0)
+    for count in range(most, MIN_MARKERS - 1, -1):
+        decisions.decide(count, refine)
+    decisions.decide_poor()
+    return Identified(decisions.fits, decisions.rivals, decisions.turn)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """Missing constellations by row, the unassigned markers, and what the search found for these."""
+
+    robots: dict[int, Robot]
+    scene: TriangulatedMarkers
+    candidates: Candidates
+
+
+class _Decisions:
+    """The decisions about the fits of a frame set, from those with most markers to those with fewest."""
+
+    def __init__(self, question: Question, usual: float, turn: int) -> None:
+        size = max(question.robots, default=-1) + 1, len(question.scene)
+        self._question, self._usual = question, usual
+        self._accepted, self._open, self._open_good = _Claims(*size), _Claims(*size), _Claims(*size)
+        self._poor: list[_Level] = []
+        self.fits: list[RefinedFits] = []
+        self.rivals: dict[int, int] = {}
+        self.turn = turn
+
+    def decide(self, count: int, refine: Refine) -> None:
+        """Decide about the good fits with `count` markers."""
+        mappings = self._question.candidates.with_markers(count)
+        mappings = mappings.select(~self._accepted.touch(mappings))
+        compared, decided, self.turn = _portion(mappings, self.turn)
+        self._open.add(mappings.select(~compared))
+        level = self._compare(mappings.select(compared), refine)
+        if level.wins.any():
+            self._usual = max(self._usual, float(np.median(level.refined.misfit[level.wins])))
+        is_good = level.refined.misfit <= POOR * self._usual
+        is_free = ~self._open.touch(level.fits.mappings) & np.isin(level.refined.robot, decided)
+        self._accept(level, is_good & is_free & level.wins)
+        rest = level.select(~self._accepted.touch(level.fits.mappings))
+        self._open.add(rest.fits.mappings)
+        is_good = rest.refined.misfit <= POOR * self._usual
+        self._open_good.add(rest.fits.mappings.select(is_good))
+        self._poor.append(rest.select(~is_good))
+
+    def decide_poor(self) -> None:
+        """Decide about the poor fits, each with all markers of its robot."""
+        for level in self._poor:
+            mappings = level.fits.mappings
+            sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
+            is_full = np.array(sizes, np.intp) == mappings.points.shape[1]
+            is_free = ~self._open_good.touch(mappings) & ~self._accepted.touch(mappings)
+            self._accept(level, is_full & is_free & level.wins)
+
+    def _compare(self, mappings: Mappings, refine: Refine) -> _Level:
+        """Refine mappings and compare those that the detections allow."""
+        fits = fit(mappings, self._question.robots, self._question.scene)
+        refined = refine(fits)
+        is_plausible = refined.misfit < MAX_CHI2
+        fits, refined = fits.select(is_plausible), refined.select(is_plausible)
+        return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
+
+    def _accept(self, level: _Level, rows: Mask) -> None:
+        self._accepted.add(level.fits.mappings.select(rows))
+        self.fits.append(level.refined.select(rows))
+        for k in np.flatnonzero(~level.wins).tolist():
+            self.rivals.setdefault(int(level.refined.robot[k]), int(level.rival[k]))
+
+
+def _portion(mappings: Mappings, turn: int) -> tuple[Mask, Index, int]:
+    """(K,) mappings to compare, the robots all of whose rivals are among them, and whose turn is next."""
+    robots = np.unique(mappings.robot)
+    if len(mappings) <= MAX_COMPARED:
+        return np.ones(len(mappings), bool), robots, turn
+    compared, decided = np.zeros(len(mappings), bool), []
+    for robot in np.roll(robots, -int(np.searchsorted(robots, turn))).tolist():
+        claim = _Claims(int(robots.max()) + 1, int(mappings.points.max()) + 1)
+        claim.add(mappings.select(mappings.robot == robot))
+        rivals = claim.touch(mappings)
+        if rivals.sum() > MAX_RIVALS:
+            continue
+        if decided and (compared | rivals).sum() > MAX_COMPARED:
+            return compared, np.array(decided), robot
+        compared |= rivals
+        decided.append(robot)
+    return compared, np.array(decided, np.intp), turn
+
+
+def _best_rivals(mappings: Mappings, chi2: Array) -> tuple[Array, Index]:
+    """(K,) smallest chi-square of the rivals of each mapping, infinite without any, and that rival's robot."""
+    if not len(mappings):
+        return chi2, mappings.robot
+    uses = np.zeros((len(mappings), int(mappings.points.max()) + 1), np.float32)
+    np.put_along_axis(uses, mappings.points, 1, 1)
+    exclusive = (mappings.robot[:, None] == mappings.robot) | (uses @ uses.T > 0)
+    np.fill_diagonal(exclusive, False)
+    others = np.where(exclusive, chi2, np.inf)
+    rival = others.argmin(1)
+    return others[np.arange(len(chi2)), rival], mappings.robot[rival]
