@@ -29,6 +29,7 @@ from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_tim
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
 
+COMPARED_NS, CHECKED_NS = 45_000_000, 500_000_000  # between comparisons, and between searches for a drift
 FAST_NS = 120_000_000  # of frame sets that show a jump
 SLOW_S = 8.0  # time constant of the information that shows a drift
 JUMP_PX, DRIFT_PX = 1.5, 0.4  # RMS image motion that an offset must explain
@@ -43,7 +44,7 @@ STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the 
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
-MAX_MARKERS = 160  # observations of a frame set that are compared
+MAX_MARKERS = 96  # observations of a frame set that are compared
 MIN_SPEED_M_S = 0.03  # of a robot that is compared
 UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
 MAX_SPREAD_S = 0.1  # standard deviation of all stamps meanwhile
@@ -100,6 +101,7 @@ class CameraClocks:
         self._fast: deque[tuple[int, OffsetInformation]] = deque()
         self._slow, self._slow_since_ns = OffsetInformation.none(len(cameras.names)), 0
         self._now_ns = self._undecided_ns = self._reported_ns = 0
+        self._compared_ns = self._checked_ns = 0
         self._undecided_s = 0.0
 
     @property
@@ -150,13 +152,8 @@ class CameraClocks:
         self._history.append(Snapshot(t_ns, states, tracked))
         while self._history[0].t_ns < t_ns - (RANGE_S + 0.5) * 1e9:
             self._history.popleft()
-        moving = np.linalg.norm(states.v, axis=1) > MIN_SPEED_M_S
-        chosen = self._choose(states, tracked & moving, detections, assignments)
-        if len(chosen):
-            observations = MatchedObservations.of(chosen, detections, self._markers)
-            info = offset_information(self._cameras, states, observations, self._single)
-            self._find_jumps(info)
-            self._find_drifts(info)
+        if t_ns >= self._compared_ns + COMPARED_NS:
+            self._compare(states, tracked, detections, assignments)
         for name in self.excluded:
             self._search(name)
 
@@ -187,6 +184,20 @@ class CameraClocks:
         return self._undecided_s if self._is_undecided() else 0.0
 
     # Evidence.
+
+    def _compare(
+        self, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
+    ) -> None:
+        """Compare the cameras by the robots that move."""
+        interval_s = min((self._now_ns - self._compared_ns) * 1e-9, SLOW_S)
+        self._compared_ns = self._now_ns
+        moving = np.linalg.norm(states.v, axis=1) > MIN_SPEED_M_S
+        chosen = self._choose(states, tracked & moving, detections, assignments)
+        if len(chosen):
+            observations = MatchedObservations.of(chosen, detections, self._markers)
+            info = offset_information(self._cameras, states, observations, self._single)
+            self._find_jumps(info)
+            self._find_drifts(info, interval_s)
 
     def _choose(
         self, states: States, robots: Mask, detections: DetectionTable, assignments: Assignments
@@ -222,17 +233,15 @@ class CameraClocks:
                 self._exclude(clock, self._now_ns, FAST_NS)
         self._forget()
 
-    def _find_drifts(self, info: OffsetInformation) -> None:
+    def _find_drifts(self, info: OffsetInformation, interval_s: float) -> None:
         """Correct the cameras that depart slowly from the others."""
-        interval_s = (
-            (self._history[-1].t_ns - self._history[-2].t_ns) * 1e-9 if len(self._history) > 1 else 0.0
-        )
         n = len(self._cameras.names)
         kept = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
         self._slow = kept.plus(info.relative_to(-self._offsets_s()))
         self._slow_since_ns = self._slow_since_ns or self._now_ns
-        if self._now_ns < self._slow_since_ns + MIN_SLOW_NS:
+        if self._now_ns < max(self._slow_since_ns + MIN_SLOW_NS, self._checked_ns + CHECKED_NS):
             return
+        self._checked_ns = self._now_ns
         found = disagreement(self._slow.relative_to(self._offsets_s()), DRIFT_PX, has_shifts=True)
         for k, offset_s, sigma_s in zip(*found.columns, strict=True) if found else ():
             if MIN_DRIFT_S < abs(offset_s) < MAX_DRIFT_S:

@@ -147,9 +147,11 @@ def disagreement(
     known = np.flatnonzero((info.count > 0) & (np.diag(M) > 1.0))
     M, y = M[np.ix_(known, known)], y[known]
     speed_px = np.sqrt(info.motion_px2[known] / info.count[known])
+    if len(known) < 2 or float(np.max(np.abs(y) / np.diag(M) * speed_px)) < min_shift_px:
+        return None
     offsets = np.linalg.pinv(M, rcond=1e-6, hermitian=True) @ y
     total = float(y @ offsets)
-    if len(known) < 2 or total < SIGMAS**2 or float(np.max(np.abs(y) / np.diag(M) * speed_px)) < min_shift_px:
+    if total < SIGMAS**2:
         return None
     group = _smallest_group(M, y, EXPLAINED * total)
     if not group:

@@ -189,7 +189,10 @@ class Estimator:
         return MatchedObservations.of_discs(replace(detections, cov=detections.cov + moved), discs)
 
     def _inflate_by_clock(self, states: States, observations: MatchedObservations) -> MatchedObservations:
-        """Add the motion during the standard deviation of the capture time: sigma_t^2 u u^T, u the image velocity."""
+        """Add the motion during the standard deviation of the capture time: n sigma_t^2 u u^T, u the image velocity.
+
+        The n detections of a body in one frame have a common error, so that their mean has the variance sigma_t^2.
+        """
         detections, discs = observations.detections, observations.discs
         exposures = detections.exposures
         if not (exposures.tau_sigma > EXACT_S).any():
@@ -197,7 +200,9 @@ class Estimator:
         later = replace(exposures, tau=exposures.tau + EXACT_S)
         moved = (self.cameras.views(states, at, discs).xy for at in (later, exposures))
         velocity = np.einsum("ijn,jn->in", detections.scale, np.subtract(*moved)) / EXACT_S
-        shift = np.nan_to_num(velocity) * exposures.tau_sigma[detections.frame]
+        view = discs.frame * len(states) + discs.body
+        sigma = exposures.tau_sigma[discs.frame] * np.sqrt(np.bincount(view)[view])
+        shift = np.nan_to_num(velocity) * sigma
         cov = detections.cov + shift[:, None] * shift
         return MatchedObservations.of_discs(replace(detections, cov=cov), discs)
 
