@@ -110,6 +110,7 @@ def _synchronize(
             if frame is not None:
                 synchronizer.add(frame)
             else:
+                synchronizer.ignore(message.camera)
                 faults[f"frames of camera '{message.camera}', whose clock was wrong"] += 1
             yield from synchronizer.take(received_ns)
     for name, late in synchronizer.late.items():

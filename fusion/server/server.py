@@ -227,6 +227,7 @@ class Server:
             return
         frame, name = self.pipeline.admit(frame), frame.camera
         if frame is None:
+            self.pipeline.synchronizer.ignore(name)
             if name not in self.pipeline.excluded_clocks():
                 self.statistics.count_fault("implausible time", name)
             return

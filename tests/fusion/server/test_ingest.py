@@ -45,8 +45,10 @@ class Pipeline:
         admitted = self.tracker.clocks.admit(frame) if frame is not None else None
         if admitted is not None:
             self.synchronizer.add(admitted)
-        elif frame is not None and frame.camera not in self.tracker.clocks.excluded:
-            self.statistics.count_fault("implausible time", frame.camera)
+        elif frame is not None:
+            self.synchronizer.ignore(frame.camera)
+            if frame.camera not in self.tracker.clocks.excluded:
+                self.statistics.count_fault("implausible time", frame.camera)
         results = []
         for frame_set in self.synchronizer.take(received_ns):
             results.append(self.tracker.track(frame_set))
