@@ -22,6 +22,7 @@ class CalibratedFrame:
         t_ns: capture time including the calibrated offset of the camera.
         xy: (2, N) undistorted centres; NaN where the lens has no inverse.
         scale: (2, 2, N) Jacobians of raw pixels with respect to `xy`.
+        stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
         exposure_us, detect_us: durations; 0 where unknown.
         clock_sigma_s: standard deviation of `t_ns` by the clock.
@@ -32,6 +33,7 @@ class CalibratedFrame:
     roundels: Roundels
     xy: Array
     scale: Array
+    stamp_ns: int = 0
     sent_ns: int = 0
     received_ns: int = 0
     exposure_us: float = 0.0
@@ -46,6 +48,7 @@ class CalibratedFrame:
             message.t_ns + round(camera.time_offset_ms * 1e6),
             message.unpack(),
             camera,
+            stamp_ns=message.t_ns,
             sent_ns=message.sent_ns,
             received_ns=received_ns,
             exposure_us=message.exposure_us,

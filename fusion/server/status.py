@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion.model.limits import Limits
 from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
@@ -26,12 +27,14 @@ class PipelineStatus:
     """The pipeline's part of the status.
 
     Attributes:
+        limits: with which the server tracks.
         calibrated: cameras with a pose in the active rig.
         excluded: cameras that were moved, whose detections are excluded.
         clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
     """
 
+    limits: Limits | None = None
     calibrated: frozenset[str] = frozenset()
     excluded: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
@@ -146,6 +149,7 @@ class ServerStatistics:
             },
             robots=dict(self._robots),
             faults=faults,
+            limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
