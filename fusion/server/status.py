@@ -32,6 +32,7 @@ class PipelineStatus:
         excluded: cameras that were moved, whose detections are excluded.
         clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        rig_t_ns: since when the active rig is in force.
     """
 
     limits: Limits | None = None
@@ -39,6 +40,7 @@ class PipelineStatus:
     excluded: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    rig_t_ns: int | None = None
 
 
 @dataclass
@@ -151,6 +153,7 @@ class ServerStatistics:
             faults=faults,
             limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            rig_t_ns=pipeline.rig_t_ns,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()
