@@ -13,6 +13,7 @@ from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import States
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
 from fusion.monitoring.geometry_check import GeometryCheck
 from fusion.monitoring.residual_monitor import ResidualMonitor
@@ -103,6 +104,7 @@ class Tracker:
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
+        self.clocks = CameraClocks(self.cameras, self.table.markers, self.table.single)
         self.extrinsics = ExtrinsicsMonitor()
         self.residuals = ResidualMonitor()
         self.geometry = GeometryCheck(self.table.names, self.table.single)
@@ -168,6 +170,8 @@ class Tracker:
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         update, markers = self._acquire(update)
+        table = self.table
+        self.clocks.observe(update.t_ns, table.states, table.tracked, update.detections, update.assignments)
         unlabeled = self._track_unlabeled(update, markers)
         return self._report(update, unlabeled)
 
@@ -177,7 +181,7 @@ class Tracker:
         """Compare the frames with the tracked robots; exclude moved cameras and apply recalibrated poses."""
         table, seen_by = self.table, result.summary.robot_cameras
         scene = TrackedScene(self.cameras, table.markers, table.states, table.tracked, seen_by)
-        corrections = self.extrinsics.check(frame_set, scene, self.shard.leads)
+        corrections = self.extrinsics.check(frame_set, scene, self.shard.leads, self.clocks.suspects)
         for correction in corrections:
             if correction.camera is not None:
                 self.cameras.place(correction.name, correction.camera)
@@ -185,6 +189,8 @@ class Tracker:
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
+        if camera.time_offset_ms != self.cameras[name].time_offset_ms:
+            self.clocks.reset(name)
         self.cameras.place(name, camera)
         (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)
 
@@ -196,6 +202,7 @@ class Tracker:
             renamed: old name -> new name.
         """
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
+        other.clocks.inherit(self.clocks)
         other.extrinsics, other.residuals = self.extrinsics, self.residuals
         other.table.inherit(self.table, renamed)
         return other
