@@ -14,7 +14,8 @@ MAX_GAP = 5  # intervals; a longer gap of a recording may be a jump
 class StampCheck:
     """The lags between stamps and arrivals of one camera, and its usual interval.
 
-    A stamp that is too late gives a lag below all earlier ones: no frame arrives before it is sent. A stamp that is too
+    A stamp that is too late gives a lag below all earlier ones: no frame arrives before it is sent; the interval to
+    the stamp before it is unusual, unlike those of queued frames that arrive together. A stamp that is too
     early gives a longer lag, as a slow network does; but then the interval between the stamps is irregular. In a
     recording without arrival times, where all lags are equal, only the interval counts.
     """
@@ -30,7 +31,7 @@ class StampCheck:
         if len(self._lags) >= LEARNED:
             first, usual, late, last = np.percentile(self._lags, [0, 50, 95, 100])
             is_known = not first == last == lag
-            is_early = lag < first - MIN_JUMP_NS
+            is_early = lag < first - MIN_JUMP_NS and not self._is_next(t_ns)
             is_late = (lag > late + MIN_JUMP_NS or not is_known) and self._is_irregular(t_ns)
             jumped = is_early or is_late or (not is_known and self._is_after_gap(t_ns))
             if jumped:
@@ -52,6 +53,11 @@ class StampCheck:
         """Whether the time since the last stamp is no multiple of the usual interval."""
         interval, since = self._interval_ns(), t_ns - self._stamps[-1]
         return abs(since - max(1, round(since / interval)) * interval) > MIN_IRREGULAR * interval
+
+    def _is_next(self, t_ns: int) -> bool:
+        """Whether one usual interval passed since the last stamp; a lag that falls is then that of queued frames."""
+        interval = self._interval_ns()
+        return abs(t_ns - self._stamps[-1] - interval) <= MIN_IRREGULAR * interval
 
     def _is_after_gap(self, t_ns: int) -> bool:
         return t_ns - self._stamps[-1] > MAX_GAP * self._interval_ns()
