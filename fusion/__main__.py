@@ -10,7 +10,16 @@ from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
 from fusion.commands.serve import Serve
 
-COMMANDS = ("run", "replay", "record", "repair", "define", "undo", "ros2")  # modules of fusion.commands
+COMMANDS = (
+    "run",
+    "replay",
+    "record",
+    "repair",
+    "define",
+    "robots",
+    "undo",
+    "ros2",
+)  # modules of fusion.commands
 
 
 def main() -> None:

@@ -25,8 +25,8 @@ from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.protocol.requests import RETRY_S, change_robots, undo_correction
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, RobotsRequest
+from fusion.protocol.requests import RETRY_S, change_robots, request_robots, undo_correction
 
 T = TypeVar("T")
 TIMEOUT_S = 10.0
@@ -197,8 +197,11 @@ class Arena:
         rename: dict[str, str] | None = None,
         remove: Sequence[str] = (),
         define: dict[str, RobotBody] | None = None,
+        replace: bool = False,
     ) -> dict[str, RobotBody]:
         """Rename, then remove, then define robots while the server runs, all or none.
+
+        Defining a robot that exists is refused, unless `replace`.
 
         Returns:
             All robots that the server tracks after the change.
@@ -207,8 +210,18 @@ class Arena:
             FusionError: the server refuses the change; the message is the server's.
             NetworkError: no server answers in time.
         """
-        request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
-        return change_robots(self._session, self.keys.arena, request)
+        request = RobotsRequest(
+            rename=rename or {}, remove=tuple(remove), define=define or {}, replace=replace
+        )
+        return change_robots(self._session, self.keys.arena, request).robots
+
+    def declared_robots(self) -> Robots:
+        """All robots that the server tracks, with their markers, and the names that a restart would lose.
+
+        Raises:
+            NetworkError: no server answers in time.
+        """
+        return request_robots(self._session, self.keys.arena)
 
     def undo_correction(self) -> Rig:
         """Undo the last recalibration of a moved camera by the server.

@@ -117,6 +117,7 @@ class Server:
         transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
         transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
+        transport.watch_token(keys.wand, self.pipeline.pause_acquisition)
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
         if isinstance(self.clock, ServerClock):
@@ -184,6 +185,8 @@ class Server:
             late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
+            not_acquired=self.pipeline.not_acquired(),
+            unsaved_robots=self.pipeline.unsaved_robots(),
         )
         status = self.statistics.report(now_ns, pipeline)
         self._publisher.publish_status(status)
@@ -241,13 +244,17 @@ class Server:
         payload = payload_of(query)
         if payload and parse_request(payload, RobotsRequest) != RobotsRequest():
             raise RequestError(f"send changes of robots to {set_robots_key(self.keys.arena)}")
-        return encode_reply(payload, Robots(robots=self.pipeline.robots))
+        return self._robots_reply(payload)
+
+    def _robots_reply(self, payload: bytes) -> bytes:
+        robots = Robots(robots=self.pipeline.robots, unsaved=self.pipeline.unsaved_robots())
+        return encode_reply(payload, robots)
 
     def _change_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
         request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self.pipeline.change_robots(request))
-        return encode_reply(payload, Robots(robots=self.pipeline.robots))
+        return self._robots_reply(payload)
 
 
 @contextlib.contextmanager

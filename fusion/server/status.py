@@ -29,12 +29,16 @@ class PipelineStatus:
         late: frames dropped since the start because they were late, by camera.
         excluded: cameras that were moved, whose detections are excluded.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        not_acquired: why robots were not acquired, by name.
+        unsaved_robots: names of the robots whose changes a restart would undo.
     """
 
     calibrated: frozenset[str] = frozenset()
     late: dict[str, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    not_acquired: dict[str, str] = field(default_factory=dict)
+    unsaved_robots: tuple[str, ...] = ()
 
 
 @dataclass
@@ -138,6 +142,8 @@ class ServerStatistics:
             robots=dict(self._robots),
             faults=faults,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            not_acquired=pipeline.not_acquired,
+            unsaved_robots=pipeline.unsaved_robots,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()

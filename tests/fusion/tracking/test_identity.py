@@ -14,8 +14,9 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, distances, require_distinct
-from fusion.tracking import acquisition, identification
-from fusion.tracking.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
+from fusion.tracking import acquisition
+from fusion.tracking.identity import identification
+from fusion.tracking.identity.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
 from fusion.tracking.multiview import find_markers
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_accuracy import accuracy, frame_sets

@@ -20,8 +20,15 @@ from camera_node.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments
 from fusion.model.robots import Robot
 from fusion.model.states import States
-from fusion.tracking.constellation import MIN_MARKERS, Candidates, Fits, Mappings, TriangulatedMarkers, fit
 from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2
+from fusion.tracking.identity.constellation import (
+    MIN_MARKERS,
+    Candidates,
+    Fits,
+    Mappings,
+    TriangulatedMarkers,
+    fit,
+)
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
@@ -193,7 +200,8 @@ class _Decisions:
     def _accept(self, level: _Level, rows: Mask) -> None:
         self._accepted.add(level.fits.mappings.select(rows))
         self.fits.append(level.refined.select(rows))
-        for k in np.flatnonzero(~level.wins).tolist():
+        is_close = np.abs(level.refined.chi2 - level.best) < DECISIVE_CHI2
+        for k in np.flatnonzero(is_close).tolist():
             self.rivals.setdefault(int(level.refined.robot[k]), int(level.rival[k]))
 
 
