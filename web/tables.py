@@ -2,6 +2,7 @@
 """Formats the state of an arena: tables for the panel, and one line for a terminal."""
 
 import html
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,11 +183,15 @@ def describe_latency(state: ArenaState) -> str:
 
 
 def tabulate_faults(state: ArenaState) -> HtmlTable:
-    """One row per reason for which the server or this viewer skipped something."""
-    server = state.status.message.faults if state.status else {}
-    counts = [(reason, count) for reason, count in server.items() if count]
-    counts += [(f"viewer: {reason}", count) for reason, count in state.faults.items()]
-    return HtmlTable(("fault", "count"), [TableRow((reason, str(count)), "warn") for reason, count in counts])
+    """One row per reason for which the server or this viewer skipped something, and per camera where it is known."""
+    status = state.status.message if state.status else None
+    counts = Counter(status.faults if status else {})
+    for name, health in status.cameras.items() if status else ():
+        counts.subtract(health.faults)  # the remaining ones are of no known camera
+        counts.update({f"{name}: {reason}": count for reason, count in health.faults.items()})
+    counts.update({f"viewer: {reason}": count for reason, count in state.faults.items()})
+    rows = [TableRow((reason, str(count)), "warn") for reason, count in counts.items() if count > 0]
+    return HtmlTable(("fault", "count"), rows)
 
 
 def describe_arena(state: ArenaState) -> str:

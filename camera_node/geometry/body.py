@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rigid bodies with printed roundels: wands and robots."""
 
-import math
-
 import msgspec
 import numpy as np
 
 from camera_node.arrays import Array
 
 Vector = tuple[float, float, float]
+MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter
 
 
 class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -27,10 +26,12 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     surround_ratio: float = 9 / 7
 
     def __post_init__(self) -> None:
-        if not 0.001 <= self.diameter_m <= 10:
+        if not 0.001 <= self.diameter_m <= MAX_EXTENT_M:
             raise ValueError(f"diameter_m is {self.diameter_m}; give the black disc's diameter d_o in metres")
-        if not self.markers or not all(map(math.isfinite, np.ravel(self.markers))):
-            raise ValueError("markers must be one or more [x, y, z], finite, in metres")
+        if not self.markers or not all(abs(x) <= MAX_EXTENT_M for marker in self.markers for x in marker):
+            raise ValueError(
+                f"markers must be one or more [x, y, z] in metres, each within {MAX_EXTENT_M:g} m"
+            )
         if not (0.1 <= self.inner_ratio <= 0.95 and 1.0 <= self.surround_ratio <= 10):
             raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
 

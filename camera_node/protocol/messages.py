@@ -42,6 +42,11 @@ class Keys:
     def detections(self, camera: str = "*") -> str:
         return f"{self.arena}/camera/{camera}/detections"
 
+    def camera_in(self, key: str) -> str | None:
+        """The camera of a key on which detections are published; None for other keys."""
+        camera = key.removeprefix(f"{self.arena}/camera/").removesuffix("/detections")
+        return camera if key == self.detections(camera) else None
+
     def camera_status(self, camera: str = "*") -> str:
         return f"{self.arena}/camera/{camera}/status"
 

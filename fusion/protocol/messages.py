@@ -14,6 +14,7 @@ from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.robots import Robot
 
 Vector = tuple[float, float, float]
+QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
 
 
@@ -53,12 +54,12 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     latency: Latency | None = None  # None offline
 
     def check(self) -> None:
-        """Raise MessageError unless numbers are finite, the quaternion is not zero and the covariance is 12 x 12."""
+        """Raise MessageError unless numbers are finite, the quaternion has length 1 and the covariance is 12 x 12."""
         if not is_name(self.robot):
             raise MessageError("an invalid robot name")
         numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
-        if not any(self.quaternion_wxyz):
-            raise MessageError("the pose has a zero quaternion")
+        if not abs(math.hypot(*self.quaternion_wxyz) - 1.0) < QUATERNION_SLACK:
+            raise MessageError("the pose's quaternion is not of length 1")
         if len(self.covariance) != 576 or not all(map(math.isfinite, numbers)):
             raise MessageError("the pose is not finite, or its covariance is not 12 x 12")
 
@@ -83,13 +84,16 @@ class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
     covariance: bytes
 
     def check(self) -> None:
-        """Raise MessageError unless the columns' sizes agree, the numbers are finite and no quaternion is zero."""
+        """Raise MessageError unless the columns' sizes agree, the numbers are finite and quaternions of length 1."""
         n = len(self.robots)
         if (len(self.states), len(self.motion), len(self.covariance)) != (n, 104 * n, 576 * n):
             raise MessageError(f"the columns have other sizes than those of {n} robots")
         motion, covariance = self.motions(), np.frombuffer(self.covariance, "<f4")
-        if not (np.isfinite(motion).all() and np.isfinite(covariance).all() and motion[:, 3:7].any(1).all()):
-            raise MessageError("the poses are not finite, or a quaternion is zero")
+        if not (np.isfinite(motion).all() and np.isfinite(covariance).all()):
+            raise MessageError("the poses are not finite")
+        norms = np.linalg.norm(motion[:, 3:7].clip(-2.0, 2.0), axis=1)  # the limits avoid an overflow
+        if not (np.abs(norms - 1.0) < QUATERNION_SLACK).all():
+            raise MessageError("a quaternion is not of length 1")
 
     def motions(self) -> Array:
         """(R, 13) positions, quaternions, velocities and angular velocities."""
@@ -181,6 +185,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     calibrated: bool
     excluded: bool = False  # the camera was moved: its detections are excluded until it is recalibrated
     duplicate_publisher: bool = False  # two nodes publish under its name
+    faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,6 +10,8 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 
 RATE_FRAMES = 8  # of one camera, from which its rate is estimated
 DEFAULT_PERIOD_NS = 33_333_333  # where no camera sent two frames
+MAX_RATE_HZ = 240.0  # of frame sets, where the cameras' rates decide
+FAR_FASTER = 2.5  # times the median rate of the cameras: a camera beyond does not decide the rate
 SILENT_NS = 500_000_000  # a camera silent for this long is not waited for
 MAX_GAP_NS = 2_000_000_000  # a longer silence of all cameras starts a new sequence of frame sets
 PERIOD_CHANGE = (
@@ -44,7 +46,8 @@ class FrameSynchronizer:
     more than `lateness_ns`: then it is dropped and counted.
 
     Args:
-        period_ns: of the frame sets; without it that of the fastest camera, estimated from its first frames.
+        period_ns: of the frame sets; without it that of the fastest camera, estimated from its first frames. A camera
+            far faster than the median one does not count, and the rate is at most `MAX_RATE_HZ`.
         lateness_ns: the wait limit.
     """
 
@@ -61,6 +64,11 @@ class FrameSynchronizer:
     def at_rate(cls, rate_hz: float | None, lateness_ms: float) -> "FrameSynchronizer":
         """A synchronizer of so many frame sets a second; None for the rate of the fastest camera."""
         return cls(round(1e9 / rate_hz) if rate_hz else None, round(lateness_ms * 1e6))
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Frame sets a second; None before it is known."""
+        return 1e9 / self.period_ns if self.period_ns else None
 
     @property
     def late(self) -> dict[str, int]:
@@ -132,9 +140,13 @@ class FrameSynchronizer:
         return [c for c in self._cameras.values() if c.times and c.times[-1] > oldest_ns]
 
     def _fastest_interval_ns(self) -> int:
-        """The interval of the fastest live camera, 0 if none is known."""
-        intervals = (camera.interval_ns for camera in self._live_cameras())
-        return min((interval for interval in intervals if interval > 0), default=0)
+        """The interval of the fastest live camera that is not far faster than the median one, 0 if none is known."""
+        intervals = sorted(c.interval_ns for c in self._live_cameras() if c.interval_ns > 0)
+        if not intervals:
+            return 0
+        usual_ns = intervals[len(intervals) // 2]  # the slower one of two in the middle
+        fastest_ns = next(i for i in intervals if i * FAR_FASTER >= usual_ns)
+        return max(fastest_ns, round(1e9 / MAX_RATE_HZ))
 
     def _has_rate_changed(self, period_ns: int) -> bool:
         """Whether the rate of the cameras changed, as in dim light or on a busy machine."""

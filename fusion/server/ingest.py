@@ -18,6 +18,10 @@ from fusion.server.status import ServerStatistics
 MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
 MAX_AHEAD_NS = 200_000_000  # as is one in the future: clocks are aligned to milliseconds
 MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a fault of the publisher
+MAX_BYTES = 1 << 19  # of a message; one with the most roundels has 240 kB
+MAX_DETECTIONS = (
+    1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
+)
 HISTORY = 64  # frames of a camera
 MIN_STEPS_BACK = 4  # of sequence numbers in the history, for two publishers: a restarted node makes one
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
@@ -57,29 +61,43 @@ class Ingest:
             received_ns: when it arrived.
             cameras: the placed ones.
         """
+        message = self._decode(data, key, received_ns)
+        if message is None:
+            return None
+        name, camera = message.camera, cameras.get(message.camera)
+        if not self._is_admitted(name, camera is not None):
+            return self._refuse("too many cameras")
+        self._statistics.count_arrival(name, message.t_ns, received_ns)
+        if camera is None:
+            return self._refuse("unknown camera", name) if cameras else None
+        if (message.width, message.height) != (camera.width, camera.height):
+            return self._refuse("wrong image size", name)
+        if not self._is_new(message):
+            return self._refuse("duplicate frame", name)
+        frame = CalibratedFrame.of(message, camera, received_ns)
+        frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+        if len(frame.roundels) > MAX_DETECTIONS:
+            self._statistics.count_fault("frames with too many roundels", name)
+            return _with_strongest(frame)
+        return frame
+
+    def _decode(self, data: bytes, key: str, received_ns: int) -> Detections | None:
+        """The message, if its content, its camera and its time are possible."""
+        name = self._keys.camera_in(key)
         try:
+            if len(data) > MAX_BYTES:
+                raise MessageError("the message is too long")
             message = decode(data, Detections)
-            if key != self._keys.detections(message.camera):
+            if name != message.camera:
                 raise MessageError("the key is another camera's")
         except MessageError:
-            return self._refuse("undecodable detections")
+            return self._refuse("undecodable detections", name)
         if not -MAX_AHEAD_NS <= received_ns - message.t_ns <= MAX_AGE_NS:
-            return self._refuse("implausible time")
-        camera = cameras.get(message.camera)
-        if not self._is_admitted(message.camera, camera is not None):
-            return self._refuse("too many cameras")
-        self._statistics.count_arrival(message.camera, message.t_ns, received_ns)
-        if camera is None:
-            return self._refuse("unknown camera") if cameras else None
-        if (message.width, message.height) != (camera.width, camera.height):
-            return self._refuse("wrong image size")
-        if not self._is_new(message):
-            return self._refuse("duplicate frame")
-        frame = CalibratedFrame.of(message, camera, received_ns)
-        return replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+            return self._refuse("implausible time", name)
+        return message
 
-    def _refuse(self, reason: str) -> None:
-        self._statistics.count_fault(reason)
+    def _refuse(self, reason: str, camera: str | None = None) -> None:
+        self._statistics.count_fault(reason, camera)
 
     def _is_admitted(self, name: str, is_calibrated: bool) -> bool:
         """Whether the camera is in the rig, or there is room for another one that is not."""
@@ -114,3 +132,12 @@ def _with_plausible_outlines(roundels: Roundels) -> Roundels:
         return roundels
     axes_px = np.where(good[:, None], roundels.axes_px, np.nan)
     return replace(roundels, axes_px=axes_px, angle_rad=np.where(good, roundels.angle_rad, np.nan))
+
+
+def _with_strongest(frame: CalibratedFrame) -> CalibratedFrame:
+    """The frame with the `MAX_DETECTIONS` detections of the highest contrast; those of textures have a low one."""
+    contrast = np.nan_to_num(frame.roundels.contrast, nan=-np.inf, posinf=-np.inf)
+    rows = np.sort(np.argpartition(-contrast, MAX_DETECTIONS)[:MAX_DETECTIONS])
+    return replace(
+        frame, roundels=frame.roundels.select(rows), xy=frame.xy[:, rows], scale=frame.scale[:, :, rows]
+    )

@@ -11,11 +11,11 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 
-import numpy as np
 import zenoh
 
 from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
+from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
 from camera_node.protocol.session import listening_endpoints
 from camera_node.service import ServiceManager
@@ -35,17 +35,20 @@ from fusion.protocol.messages import (
 )
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
+from fusion.server.frame_quotas import FrameQuotas
+from fusion.server.frame_synchronizer import MAX_RATE_HZ
 from fusion.server.ingest import MAX_AGE_NS, Ingest
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.server_clock import ServerClock, clock_of
 from fusion.server.status import PipelineStatus, ServerStatistics
-from fusion.server.transport import Transport, open_session
+from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
 from fusion.tracking.result import latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # resolution at which a wait for frames ends
+RIG_ANSWERS_HZ = 20.0  # answers with the rig, of any number of clients
 MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
 
 
@@ -68,6 +71,8 @@ class Server:
         self.statistics = ServerStatistics(config.limits.lateness_ms)
         self.pipeline = TrackingPipeline(config, self.shard)
         self._ingest = Ingest(self.keys, self.statistics)
+        self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
+        self._max_lag_ns = max(MAX_LAG_NS, round(config.limits.lateness_ms * 1e6))
         self._stopped = threading.Event()
         self._closing = contextlib.ExitStack()
 
@@ -78,7 +83,7 @@ class Server:
                 self.endpoints = listening_endpoints(self.session, self.config.listen)
             self.clock = clock_of(self.shard, self.session, self.keys)
             stack.callback(self.clock.close)
-            self.transport = Transport(self.session, self.clock, self.statistics.count_fault, stack)
+            self.transport = Transport(self.session, self.clock, self._count_fault, stack)
             self._publisher = ArenaPublisher(self.transport, self.keys, self.shard)
             self._declare()
             self._closing = stack.pop_all()
@@ -100,20 +105,20 @@ class Server:
         with ServiceManager() as service, collecting_between_frame_sets() as collect_garbage:
             service.ready()
             while not self._stopped.is_set():
-                is_backlogged = self.transport.receive(TICK_S)
+                is_backlogged = self.transport.receive(TICK_S, self._max_lag_ns)
                 now_ns = self.clock.now_ns()
-                for frame_set in self._synchronize(now_ns, is_backlogged):
-                    self._track(frame_set)
-                if not is_backlogged:
-                    self.pipeline.associate_early()
-                if status := self._report_status(now_ns):
-                    service.report(describe_status(status))
-                    collect_garbage()
+                with self._guarded("tracking"):
+                    self._fuse(now_ns, is_backlogged)
+                with self._guarded("the status"):
+                    if status := self._report_status(now_ns):
+                        service.report(describe_status(status))
+                        collect_garbage()
                 service.progress()
 
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
-        transport.subscribe(keys.detections(), self._receive_detections)
+        self._update_quotas()
+        transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
         transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
         transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
@@ -123,11 +128,31 @@ class Server:
         if isinstance(self.clock, ServerClock):
             transport.answer(keys.clock, partial(self._answer_clock, self.clock))
         if self.shard.leads:
-            transport.answer(keys.rig, self._answer_rig)
+            transport.answer(keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
             transport.answer_on_server_thread(undo_key(keys.arena), self._undo_correction)
             transport.declare_alive(keys.fusion_alive)
 
+    @contextlib.contextmanager
+    def _guarded(self, stage: str) -> Iterator[None]:
+        """Count and log an exception of a stage. The server continues: the next frames are not those that failed."""
+        try:
+            yield
+        except Exception:
+            self.statistics.count_fault(INTERNAL_ERROR)
+            log.exception("%s failed; the server continues", stage)
+
+    def _count_fault(self, reason: str, key: str) -> None:
+        """Count what was skipped of the sender on a key."""
+        self.statistics.count_fault(reason, self.keys.camera_in(key))
+
     # The steps of the loop.
+
+    def _fuse(self, now_ns: int, is_backlogged: bool) -> None:
+        """Track the frame sets that are due; while frames of the next one are missing, associate the others."""
+        for frame_set in self._synchronize(now_ns, is_backlogged):
+            self._track(frame_set)
+        if not is_backlogged:
+            self.pipeline.associate_early()
 
     def _synchronize(self, now_ns: int, is_backlogged: bool) -> list[FrameSet]:
         """The frame sets that are due. Queued frames count as on time unless the server lags by more than 0.5 s."""
@@ -141,7 +166,7 @@ class Server:
             return
         try:
             self._track_and_publish(self.pipeline.tracker, frame_set)
-        except (np.linalg.LinAlgError, RuntimeError):  # NumPy's and GTSAM's, of a singular system
+        except Exception:  # NumPy's and GTSAM's of a singular system, or a bug that some input shows
             self.statistics.count_fault("frame set without a solution")
             log.exception("a frame set has no solution; all robots are acquired again")
             self.pipeline.restart()
@@ -182,7 +207,6 @@ class Server:
             return None
         pipeline = PipelineStatus(
             calibrated=frozenset(self.pipeline.cameras),
-            late=self.pipeline.synchronizer.late,
             excluded=frozenset(self.pipeline.excluded_cameras()),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
             not_acquired=self.pipeline.not_acquired(),
@@ -190,15 +214,22 @@ class Server:
         )
         status = self.statistics.report(now_ns, pipeline)
         self._publisher.publish_status(status)
+        self._update_quotas()
         return status
+
+    def _update_quotas(self) -> None:
+        keys = [self.keys.detections(name) for name in self.pipeline.cameras]
+        self._quotas.update(keys, self.pipeline.synchronizer.rate_hz or MAX_RATE_HZ)
 
     # Received messages.
 
     def _receive_detections(self, data: bytes, key: str, received_ns: int) -> None:
         frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
-        if frame is not None:
-            is_on_time = self.pipeline.synchronizer.add(frame)
-            self.statistics.note_lateness(frame.camera, is_on_time, (self.clock.now_ns() - frame.t_ns) * 1e-6)
+        if frame is None:
+            return
+        age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns
+        is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)
+        self.statistics.note_lateness(frame.camera, is_on_time, age_ns * 1e-6)
 
     def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:
         try:

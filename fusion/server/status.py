@@ -26,7 +26,6 @@ class PipelineStatus:
 
     Attributes:
         calibrated: cameras with a pose in the active rig.
-        late: frames dropped since the start because they were late, by camera.
         excluded: cameras that were moved, whose detections are excluded.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         not_acquired: why robots were not acquired, by name.
@@ -34,7 +33,6 @@ class PipelineStatus:
     """
 
     calibrated: frozenset[str] = frozenset()
-    late: dict[str, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
@@ -53,6 +51,10 @@ class _CameraCounts:
     assigned: int = 0
     unassigned: int = 0
     squared_px: float = 0.0
+    late: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    reported: Counter[str] = field(default_factory=Counter)  # the faults at the last status
+    growing: frozenset[str] = frozenset()  # faults that occurred in the second before it
 
 
 class ServerStatistics:
@@ -73,10 +75,12 @@ class ServerStatistics:
         self._since_ns = 0
         self._cpu_s = time.process_time()
 
-    def count_fault(self, reason: str) -> None:
-        """Count something that was skipped."""
+    def count_fault(self, reason: str, camera: str | None = None) -> None:
+        """Count something that was skipped, also among a camera's own faults if it is one of the known cameras."""
         with self._lock:
             self._faults[reason] += 1
+            if camera is not None and camera in self._cameras:
+                self._cameras[camera].faults[reason] += 1
 
     def count_arrival(self, name: str, t_ns: int, received_ns: int) -> None:
         """Count a camera's frame; log a camera that is new or back."""
@@ -98,6 +102,7 @@ class ServerStatistics:
     def note_lateness(self, name: str, is_on_time: bool, age_ms: float) -> None:
         """Log once that a camera's frames begin to arrive too late, and once that they are on time again."""
         camera, limit_ms = self._cameras[name], self._lateness_limit_ms
+        camera.late += not is_on_time
         if not is_on_time and not camera.is_late:
             log.warning("%s is %.0f ms late (limit %.0f ms); its frames are dropped", name, age_ms, limit_ms)
             camera.is_late = True
@@ -127,6 +132,7 @@ class ServerStatistics:
         """The status since the last one; resets the counts of that period."""
         seconds = (now_ns - self._since_ns) * 1e-9 if 0 < self._since_ns < now_ns else 1.0
         self._find_silent_cameras(now_ns)
+        self._find_faulty_cameras()
         cpu_s = time.process_time()
         with self._lock:
             faults = dict(self._faults)
@@ -163,6 +169,16 @@ class ServerStatistics:
                 log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S)
                 camera.is_gone = True
 
+    def _find_faulty_cameras(self) -> None:
+        """Log the faults of a camera once when they begin."""
+        for name, camera in self._cameras.items():
+            with self._lock:
+                new = camera.faults - camera.reported
+                camera.reported = camera.faults.copy()
+            for reason in sorted(new.keys() - camera.growing):
+                log.warning("camera %s: %s, %d in the last second", name, reason, new[reason])
+            camera.growing = frozenset(new)
+
 
 def memory_mb() -> float:
     """Resident memory of this process; its peak where the system does not report the present one."""
@@ -181,8 +197,9 @@ def _camera_health(
         residual_px=float(np.sqrt(camera.squared_px / camera.assigned)) if camera.assigned else None,
         assigned=camera.assigned,
         unassigned=camera.unassigned,
-        late=pipeline.late.get(name, 0),
+        late=camera.late,
         calibrated=name in pipeline.calibrated,
         excluded=name in pipeline.excluded,
         duplicate_publisher=camera.has_two_publishers,
+        faults=dict(camera.faults),
     )

@@ -2,25 +2,37 @@
 """The server's side of Zenoh: queues received messages for the server's thread, and publishes."""
 
 import contextlib
-import queue
+import logging
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.node.clock_sync import ClockSync
+from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import encode
+from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
+from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.server_clock import ServerClock
+from fusion.server.task_queue import Task, TaskQueue
 
-QUEUE_SIZE = 2000  # messages: seconds of a large arena
-Task = Callable[[], object]
+log = logging.getLogger("fusion")
+MESSAGES = 256  # queued, of one key that is not a camera's
+REQUESTS = 16  # queued, of one key
+ABOVE_QUOTA = "frames above the quota"
+TOO_SLOW = "messages that the server was too slow for"
+INTERNAL_ERROR = "internal error"
+MessageHandler = Callable[[bytes, str, int], None]
+T = TypeVar("T")
 
 
 def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
@@ -41,12 +53,12 @@ def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
 
 
 class Transport:
-    """Subscribes, answers queries and publishes on an open session. Callbacks only enqueue tasks.
+    """Subscribes, answers queries and publishes on an open session. Callbacks only enqueue tasks, and never raise.
 
     Args:
         session: an open Zenoh session.
         clock: the server's time, of arrivals.
-        count_fault: called with the name of a fault, from any thread.
+        count_fault: called with the name of a fault, and with the key of its sender, from any thread.
         closing: undeclares everything that this object declares.
     """
 
@@ -54,31 +66,58 @@ class Transport:
         self,
         session: zenoh.Session,
         clock: ServerClock | ClockSync,
-        count_fault: Callable[[str], None],
+        count_fault: Callable[[str, str], None],
         closing: contextlib.ExitStack,
     ) -> None:
         self.session = session
         self._clock, self._count_fault, self._closing = clock, count_fault, closing
-        self._tasks: queue.Queue[tuple[int, Task]] = queue.Queue(QUEUE_SIZE)
-        self.received_ns = 0  # arrival time of the last task that was executed
+        self._tasks = TaskQueue()
+        self.received_ns = 0  # arrival time of the last message that was handled
         self._publishers: dict[str, zenoh.Publisher] = {}
 
-    def subscribe(self, key: str, handle: Callable[[bytes, str, int], None]) -> None:
+    def subscribe(self, key: str, handle: MessageHandler) -> None:
         """Call `handle(data, key, received_ns)` for each message, on the server's thread."""
 
-        def enqueue(sample: zenoh.Sample) -> None:  # anything else would stall the link
-            data, key = sample.payload.to_bytes(), str(sample.key_expr)
-            self.enqueue(lambda: handle(data, key, self.received_ns))
+        def enqueue(sample: zenoh.Sample) -> None:
+            self._enqueue(str(sample.key_expr), sample.payload.to_bytes(), handle, key, MESSAGES)
 
-        self._closing.callback(self.session.declare_subscriber(key, enqueue).undeclare)
+        self._declare_subscriber(key, enqueue)
 
-    def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
+    def subscribe_frames(self, key: str, handle: MessageHandler, quotas: FrameQuotas) -> None:
+        """The same for the frames of cameras, each within its quota."""
+
+        def enqueue(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            sender = quotas.sender_of(key)
+            if quotas.admits(sender):
+                self._enqueue(key, sample.payload.to_bytes(), handle, sender, quotas.burst)
+            else:
+                self._count_fault(ABOVE_QUOTA, key)
+
+        self._declare_subscriber(key, enqueue)
+
+    def answer(
+        self, key: str, reply: Callable[[zenoh.Query], object], limit: RateLimit | None = None
+    ) -> None:
         """Answer queries at once on Zenoh's thread: `reply` must not modify the server's state."""
-        self._closing.callback(self.session.declare_queryable(key, reply).undeclare)
+
+        def take(query: zenoh.Query) -> None:
+            if limit is None or limit.passes():
+                reply(query)
+            else:
+                self._refuse(query)
+
+        queryable = self.session.declare_queryable(key, self._guarded(key, take))
+        self._closing.callback(queryable.undeclare)
 
     def answer_on_server_thread(self, key: str, answer: Callable[[zenoh.Query], bytes]) -> None:
         """Answer queries on the server's thread; a RoundelError becomes the reply."""
-        self.answer(key, lambda query: self.enqueue(partial(respond, query, answer)))
+
+        def enqueue(query: zenoh.Query) -> None:
+            run, drop = partial(respond, query, answer), partial(self._refuse, query)
+            self._put(Task(key, self._clock.now_ns(), run, drop, is_request=True), REQUESTS)
+
+        self.answer(key, enqueue)
 
     def watch_token(self, key: str, handle: Callable[[bool], object]) -> None:
         """Call `handle` on the server's thread with whether the liveliness token is there, now and on each change."""
@@ -94,19 +133,59 @@ class Transport:
         """Declare a liveliness token."""
         self._closing.callback(self.session.liveliness().declare_token(key).undeclare)
 
-    def enqueue(self, task: Task) -> None:
-        """Execute a task on the server's thread; callable from any thread."""
-        try:
-            self._tasks.put_nowait((self._clock.now_ns(), task))
-        except queue.Full:
-            self._count_fault("queue full")
+    def enqueue(self, run: Callable[[], object]) -> None:
+        """Execute something on the server's thread; callable from any thread."""
+        self._put(Task("the server", self._clock.now_ns(), run, run), MESSAGES)
 
-    def receive(self, timeout_s: float) -> bool:
-        """Execute the next task, waiting for it at most `timeout_s`; return whether more tasks are queued."""
-        with contextlib.suppress(queue.Empty):
-            self.received_ns, task = self._tasks.get(timeout=timeout_s)
-            task()
-        return not self._tasks.empty()
+    def receive(self, timeout_s: float, max_wait_ns: int) -> bool:
+        """Execute the next task, waiting for it at most `timeout_s`. No exception of a task leaves this method.
+
+        Args:
+            timeout_s: of waiting.
+            max_wait_ns: messages that were queued for longer are dropped.
+
+        Returns:
+            whether more messages are queued.
+        """
+        task = self._tasks.take(timeout_s)
+        if task is None:
+            return False
+        begun_s = time.monotonic()
+        try:
+            if task.is_request:
+                task.run()
+            else:
+                self.received_ns = task.received_ns
+                is_stale = self._clock.now_ns() - task.received_ns > max_wait_ns
+                (task.drop if is_stale else task.run)()
+        except Exception:  # of a bug that some input shows: the next task is another's
+            self._count_fault(INTERNAL_ERROR, task.sender)
+            log.exception("a task of %s failed; the server continues without it", task.sender)
+        if task.is_request:
+            self._tasks.charge_request(time.monotonic() - begun_s)
+        return self._tasks.has_messages()
+
+    def _declare_subscriber(self, key: str, enqueue: Callable[[zenoh.Sample], object]) -> None:
+        subscriber = self.session.declare_subscriber(key, self._guarded(key, enqueue))
+        self._closing.callback(subscriber.undeclare)
+
+    def _guarded(self, key: str, callback: Callable[[T], object]) -> Callable[[T], None]:
+        return guarded(f"a message on {key}", callback, partial(self._count_fault, INTERNAL_ERROR, key))
+
+    def _enqueue(self, key: str, data: bytes, handle: MessageHandler, sender: str, limit: int) -> None:
+        received_ns = self._clock.now_ns()
+        run, drop = partial(handle, data, key, received_ns), partial(self._count_fault, TOO_SLOW, key)
+        self._put(Task(sender, received_ns, run, drop), limit)
+
+    def _put(self, task: Task, limit: int) -> None:
+        dropped = self._tasks.put(task, limit)
+        if dropped is not None:
+            dropped.drop()
+
+    def _refuse(self, query: zenoh.Query) -> None:
+        self._count_fault("requests that were too many", str(query.key_expr))
+        with query:
+            query.reply_err("the server has too many requests; try again later")
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Put a message on a key."""

@@ -28,6 +28,8 @@ from fusion.tracking.gating import (
 from fusion.tracking.multiview import Marker
 from fusion.tracking.normals import start_rotation
 
+MAX_TRACKS = 64  # markers with a velocity and a normal; false detections make hundreds of markers
+MAX_STARTS = 8  # tracks that begin in one frame set; a start costs a millisecond
 NORMAL_RAD = 0.2  # largest standard deviation of a published normal
 ANCHOR_NS = 1_000_000_000  # motions are compared over this time
 MOVED_M = 0.05  # since the anchor: far above the noise
@@ -154,25 +156,32 @@ class UnlabeledTracker:
         self._anchored_ns = 0
 
     def track(self, t_ns: int, detections: DetectionTable, markers: Sequence[Marker]) -> UnlabeledMarkers:
-        """Continue tracks with the markers that grouping found, and start tracks for the others."""
+        """Continue tracks with the markers that grouping found, and start tracks for others.
+
+        At most `MAX_TRACKS` markers have a track, of which `MAX_STARTS` begin in one frame set; the others are reported
+        as triangulated.
+        """
         if not markers and not len(self._tracks):
             return UnlabeledMarkers.none()
         position = np.array([marker.position for marker in markers]).reshape(-1, 3)
         covariance = np.array([marker.covariance for marker in markers]).reshape(-1, 3, 3)
         tracks = self._predict(t_ns)
         pair = _pair(tracks.states, position, covariance)
-        old, new = np.flatnonzero(pair >= 0), np.flatnonzero(pair < 0)
+        old = np.flatnonzero(pair >= 0)
+        new = np.flatnonzero(pair < 0)[: min(MAX_STARTS, MAX_TRACKS - len(tracks))]
         started = self._start(t_ns, detections, [markers[k] for k in new.tolist()])
-        current = tracks.select(pair[old]).joined(started).select(np.argsort(np.concatenate([old, new])))
-        states, good = self._update(current, detections, markers)
-        current = replace(current, states=states, seen_ns=np.full(len(states), t_ns, np.int64))
+        rows = np.concatenate([old, new])
+        current = tracks.select(pair[old]).joined(started)
+        states, good = self._update(current, detections, [markers[k] for k in rows.tolist()])
+        times = np.full(len(states), t_ns, np.int64)
+        current = replace(current, states=states, seen_ns=times).select(good)
         unseen = np.setdiff1d(np.arange(len(tracks)), pair)
         is_due = not 0 <= t_ns - self._anchored_ns < ANCHOR_NS
         self._anchored_ns = t_ns if is_due else self._anchored_ns
-        self._tracks = tracks.select(unseen).joined(current.select(good)).with_motion(is_due)
+        self._tracks = tracks.select(unseen).joined(current).with_motion(is_due)
         self._t_ns = t_ns
         grouped = UnlabeledMarkers(markers, position, covariance, *_unknown(len(markers)))
-        return _with_tracks(grouped, current, good)
+        return _with_tracks(grouped, rows[good], current)
 
     def histories(self, t_ns: int, markers: Sequence[Marker]) -> MarkerHistories:
         """The histories of markers of the present frame set, before `track` continues them."""
@@ -239,9 +248,12 @@ def _pair(states: States, position: Array, covariance: Array) -> Index:
     """(M,) the track of each marker if both are closest to each other and within the gate, else -1."""
     if not len(states) or not len(position):
         return np.full(len(position), -1)
-    off = position[:, None] - states.p
-    S = covariance[:, None] + states.P[:, POSITION, POSITION]
-    d2 = np.einsum("mki,mki->mk", off, np.linalg.solve(S, off[..., None])[..., 0])
+    off, own = position[:, None] - states.p, states.P[:, POSITION, POSITION]
+    spread = np.einsum("mii->m", covariance)[:, None] + np.einsum("kii->k", own)
+    m, k = np.nonzero(np.einsum("mki,mki->mk", off, off) < POSITION_GATE * spread)  # necessary for the gate
+    d2 = np.full(off.shape[:2], np.inf)
+    e = off[m, k]
+    d2[m, k] = np.einsum("pi,pi->p", e, np.linalg.solve(covariance[m] + own[k], e[:, :, None])[:, :, 0])
     track = d2.argmin(1)
     mutual = d2.argmin(0)[track] == np.arange(len(position))
     return np.where(mutual & (d2.min(1) < POSITION_GATE), track, -1)
@@ -252,16 +264,15 @@ def _unknown(n: int) -> tuple[Array, Array, Array]:
     return np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 2, 3), np.nan)
 
 
-def _with_tracks(grouped: UnlabeledMarkers, tracks: _Tracks, good: Mask) -> UnlabeledMarkers:
-    """The estimates of good tracks in place of the triangulated positions."""
-    states, known = tracks.states, good[:, None]
+def _with_tracks(grouped: UnlabeledMarkers, rows: Index, tracks: _Tracks) -> UnlabeledMarkers:
+    """The markers, those of `rows` with the estimates of their tracks in place of the triangulated positions."""
+    states = tracks.states
     tilt2 = np.einsum("nii->n", states.P[:, :2, :2]) / 2
-    has_normal = good & tracks.has_normal & (tilt2 < NORMAL_RAD**2)
-    return UnlabeledMarkers(
-        grouped.markers,
-        np.where(known, states.p, grouped.position),
-        np.where(known[:, None], states.P[:, POSITION, POSITION], grouped.covariance),
-        np.where(known, states.v, np.nan),
-        np.where(has_normal[:, None], states.R[:, :, 2], np.nan),
-        grouped.candidates,
-    )
+    has_normal = tracks.has_normal & (tilt2 < NORMAL_RAD**2)
+    columns = {
+        name: getattr(grouped, name).copy() for name in ("position", "covariance", "velocity", "normal")
+    }
+    columns["position"][rows], columns["velocity"][rows] = states.p, states.v
+    columns["covariance"][rows] = states.P[:, POSITION, POSITION]
+    columns["normal"][rows[has_normal]] = states.R[has_normal, :, 2]
+    return replace(grouped, **columns)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """An arena of real programs: server, cameras, viewer, recorder and client, whose robots are simulated."""
 
-import random
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -27,6 +27,16 @@ RENDERED = "north"  # the camera of the demo's scene that a real node renders; t
 RENDERED_FPS = 5.0
 
 
+@dataclass(frozen=True)
+class Fuzz:
+    """The options of the program `fuzzer`."""
+
+    messages: int = 1000
+    rate: float = 2000.0
+    seed: int = 1
+    only: str = ""
+
+
 class LiveArena:
     """A running arena; a context manager. The poses of its robots are judged as they arrive.
 
@@ -35,6 +45,9 @@ class LiveArena:
         load: robots and cameras.
         extra: programs besides server and cameras: viewer, page, recorder, listener, rendered.
         network: where the programs run.
+
+    Attributes:
+        rig: the cameras that the server knows; more may be added before entry.
     """
 
     def __init__(
@@ -42,6 +55,7 @@ class LiveArena:
     ) -> None:
         self.folder, self.load, self.extra = folder, load, extra
         self.network = network or Loopback()
+        self.rig = dict(load.rig)
         self.world = World(load, time.time_ns())
         self.judge = PoseJudge(self.world)
         self.keys = Keys(ARENA)
@@ -54,6 +68,7 @@ class LiveArena:
         self._pause = threading.Event()
         self._stack = ExitStack()
         self._recordings = 0
+        self.fuzz = Fuzz()
 
     def __enter__(self) -> "LiveArena":
         with self._stack as stack:
@@ -94,11 +109,19 @@ class LiveArena:
     def start(self, name: str) -> None:
         """Start a program, also again after its end."""
         command = self._camera(name) if name in self.cameras else getattr(self, f"_{name}")()
-        self.programs.start(name, self.network.command(name, command))
+        self.programs.start(name, self.network.command(name, command), name == "fuzzer")
         if name in self.cameras:
             self.place(name, self.camera_faults[name])
             for event in self.world.events.values():
                 self._command(name, CameraCommand(event=event))
+
+    def start_twin(self, camera: str, name: str) -> None:
+        """Start another node with the name of a camera."""
+        self.programs.start(name, self.network.command(name, self._camera(camera)))
+
+    def start_recorder_on_full_disk(self, free_bytes: int) -> None:
+        """Start the recorder with a limit on the size of its file."""
+        self.programs.start("recorder", ["prlimit", f"--fsize={free_bytes}", *self._recorder()], ends=True)
 
     def place(self, camera: str, fault: CameraFault) -> None:
         """Give a camera other faults."""
@@ -144,6 +167,13 @@ class LiveArena:
         out = self.folder / f"recording-{self._recordings}.mcap"
         return python("fusion", "record", out, "--connect", self.endpoint, "--arena", ARENA)
 
+    def _fuzzer(self) -> list[str]:
+        options = ("--messages", self.fuzz.messages, "--rate", self.fuzz.rate, "--seed", self.fuzz.seed)
+        options += ("--only", self.fuzz.only) if self.fuzz.only else ()
+        return python(
+            "tests.benchmarks.faults.fuzzer", "--connect", self.endpoint, "--arena", ARENA, *options
+        )
+
     def _listener(self) -> list[str]:
         return python("tests.benchmarks.faults.listener", "--connect", self.endpoint, "--arena", ARENA)
 
@@ -153,7 +183,7 @@ class LiveArena:
 
     def _write_files(self) -> None:
         folder = self.folder
-        save_rig(Rig(cameras=self.load.rig), folder / "rig.yaml")
+        save_rig(Rig(cameras=self.rig), folder / "rig.yaml")
         bodies = {name: msgspec.to_builtins(body) for name, body in self.load.bodies.items()}
         write(folder / "robots.yaml", {"robots": bodies})
         files = {"rig": "rig.yaml", "saved_rig": "saved_rig.yaml", "robots": "robots.yaml"}
@@ -178,8 +208,3 @@ def write(path: Path, data: object) -> None:
 def small_load(robots: int = 10, cameras: int = 4) -> Load:
     """Ten robots that four cameras see at 30 Hz."""
     return Load(robots=robots, cameras=cameras, hz=30.0, speed_m_s=0.5)
-
-
-def a_robot(arena: LiveArena, rng: random.Random) -> str:
-    """One of the arena's robots."""
-    return rng.choice(arena.world.names)

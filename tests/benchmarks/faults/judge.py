@@ -18,10 +18,7 @@ LONGEST = 100_000  # gaps and wrong poses that are kept
 
 @dataclass(frozen=True)
 class Gap:
-    """No tracked pose of a visible robot between two moments of the monotonic clock, s.
-
-    `waited_s` is how long a program of the arena waited for a processor meanwhile, the longest of all.
-    """
+    """No tracked pose of a visible robot between two moments of the monotonic clock, s."""
 
     robot: str
     from_s: float
@@ -48,7 +45,7 @@ class PoseJudge:
 
     Attributes:
         min_gap_s: gaps that are longer are kept.
-        robots: whose poses are judged; others are ignored.
+        count, rms_m, largest_m: of tracked poses: their number, and their errors.
     """
 
     world: World
@@ -80,10 +77,17 @@ class PoseJudge:
         return sum(now_s - at_s < within_s for at_s in tuple(self._last_s.values()))
 
     def forget(self) -> None:
-        """Begin again: no robot was tracked so far, and no gap was seen."""
+        """Begin again: no robot was tracked so far, and nothing was seen."""
         with self._lock:
             self._last_s.clear()
             self.gaps.clear()
+            self.wrong.clear()
+            self.count, self.squared_m2, self.largest_m = 0, 0.0, 0.0
+
+    @property
+    def rms_m(self) -> float:
+        """Of the errors of tracked poses."""
+        return float(np.sqrt(self.squared_m2 / max(1, self.count)))
 
     def close_gaps(self) -> None:
         """At the end: gaps of robots that did not come back."""

@@ -21,10 +21,14 @@ MIN_SLOPE_S = 60.0  # of samples after the warm-up, from which a slope is comput
 
 @dataclass
 class Program:
-    """A running program: its process, since when it runs, and its resident memory over time (age s, MB)."""
+    """A running program: its process, since when it runs, and its resident memory over time (age s, MB).
+
+    `ends` is whether it ends by itself, which `Programs.exit_code` awaits.
+    """
 
     process: subprocess.Popen
     meter: psutil.Process
+    ends: bool = False
     started_s: float = field(default_factory=time.monotonic)
     memory: list[tuple[float, float]] = field(default_factory=list)
 
@@ -53,8 +57,13 @@ class Programs:
         for name in tuple(self._running):
             self._forget(name, 0)
 
-    def start(self, name: str, command: Sequence[str]) -> None:
-        """Run a command; `module arguments` runs as `python -m module arguments`."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the programs that were started and not ended."""
+        return tuple(self._running)
+
+    def start(self, name: str, command: Sequence[str], ends: bool = False) -> None:
+        """Run a command; `ends` if it is expected to end by itself."""
         environment = os.environ | {
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
@@ -69,7 +78,7 @@ class Programs:
                 env=environment,
                 start_new_session=True,
             )
-        self._running[name] = Program(process, psutil.Process(process.pid))
+        self._running[name] = Program(process, psutil.Process(process.pid), ends)
 
     def is_running(self, name: str) -> bool:
         return name in self._running and self._running[name].process.poll() is None
@@ -108,7 +117,7 @@ class Programs:
     def check(self) -> None:
         """Move programs that ended by themselves to `crashes`."""
         for name, program in tuple(self._running.items()):
-            if (code := program.process.poll()) is not None:
+            if not program.ends and (code := program.process.poll()) is not None:
                 self.crashes.append(f"{name}: exit code {code}")
                 self._forget(name, 0)
 

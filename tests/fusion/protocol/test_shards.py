@@ -92,11 +92,17 @@ def used_detections(tracker: Tracker, result: TrackingResult) -> set[int]:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"motion": b"\0" * 8}, {"states": ()}, {"covariance": b"\xff" * 576}, {"motion": b"\0" * 104}],
+    [
+        {"motion": b"\0" * 8},
+        {"states": ()},
+        {"covariance": b"\xff" * 576},
+        {"motion": b"\0" * 104},
+        {"motion": np.full(13, 1e308).tobytes()},
+    ],
 )
 def test_invalid_shard_poses_are_refused(wrong: dict):
     poses = ShardPoses(
-        t_ns=0, robots=("a",), states=("tracked",), motion=np.ones(13).tobytes(), covariance=b"\0" * 576
+        t_ns=0, robots=("a",), states=("tracked",), motion=np.eye(1, 13, 3).tobytes(), covariance=b"\0" * 576
     )
     assert decode(encode(poses), ShardPoses) == poses
     with pytest.raises(MessageError):

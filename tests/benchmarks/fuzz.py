@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Mutated messages on all keys of a running arena: `python -m tests.benchmarks.fuzz [--messages 1000000] [--seed 1]`.
+
+Server, cameras, viewer, page, recorder and client run as processes and follow ten robots meanwhile.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+from rich.table import Table
+
+from camera_node.terminal import console, say, track
+from tests.benchmarks.faults.arena import Fuzz, LiveArena, small_load
+from tests.benchmarks.faults.fuzzer import FUZZED
+from tests.benchmarks.fusion_load import Load
+
+EXTRA = ("viewer", "page", "recorder", "listener", "rendered")
+CAMERAS = 4
+SETTLE_S = 3.0  # after the acquisition of all robots
+UNDISTURBED_S = 10.0  # of poses before the first fault
+MAX_OFFSET_M = 0.002  # by which the largest error may grow
+MAX_LINES = 100  # of all logs
+FILL_MB = (
+    60.0  # by which a program may grow until its caches are full, in a run that is too short for a slope
+)
+MAX_MB_PER_MIN = 0.5  # after the warm-up
+CLOSE_S = 2.0  # after the last message, until its effects are over
+
+
+@dataclass
+class FuzzResult:
+    """What a run of the fuzzer did to an arena.
+
+    Attributes:
+        errors_m: largest error of a tracked pose without faults, and with them.
+        gap_s: the longest gap in the poses of a robot.
+        lines: of all logs during the run.
+        growth_mb: of the resident memory of each program, from the first to the last sample.
+        slopes_mb_per_min: of the resident memory after the warm-up; empty after a short run.
+        summary: what the fuzzer says that it sent.
+    """
+
+    errors_m: tuple[float, float] = (0.0, 0.0)
+    rms_m: tuple[float, float] = (0.0, 0.0)
+    gap_s: float = 0.0
+    lines: list[tuple[str, str]] = field(default_factory=list)
+    growth_mb: dict[str, float] = field(default_factory=dict)
+    slopes_mb_per_min: dict[str, float] = field(default_factory=dict)
+    crashes: list[str] = field(default_factory=list)
+    faults: dict[str, int] = field(default_factory=dict)
+    summary: str = ""
+
+    def failures(self) -> list[str]:
+        """What does not hold, one line each."""
+        offset_m = self.errors_m[1] - self.errors_m[0]
+        growth = {n: mb for n, mb in self.growth_mb.items() if mb > FILL_MB}
+        slopes = {n: mb for n, mb in self.slopes_mb_per_min.items() if mb > MAX_MB_PER_MIN}
+        return [
+            *self.crashes,
+            *([f"poses are off by {offset_m * 1e3:.1f} mm"] if offset_m > MAX_OFFSET_M else []),
+            *([f"{len(self.lines)} log lines"] if len(self.lines) >= MAX_LINES else []),
+            *(f"{name} grew by {mb:.0f} MB" for name, mb in growth.items()),
+            *(f"{name} grows by {mb:.2f} MB a minute" for name, mb in slopes.items()),
+        ]
+
+
+def fuzz(
+    folder: Path, options: Fuzz, extra: tuple[str, ...] = EXTRA, robots: int = 10
+) -> Iterator[int | FuzzResult]:
+    """Run an arena and send faults to it; yields the number of sent messages about once a second, then the result."""
+    load = small_load(robots, CAMERAS)
+    arena = LiveArena(folder, load, extra)
+    arena.fuzz = options
+    arena.rig[FUZZED] = Load(cameras=CAMERAS + 1).rig[f"cam{CAMERAS}"]
+    result = FuzzResult()
+    with arena:
+        arena.wait_until_tracked()
+        arena.wait(SETTLE_S)
+        arena.judge.forget()
+        arena.wait(UNDISTURBED_S)
+        before = arena.judge.largest_m, arena.judge.rms_m
+        arena.programs.new_lines()
+        arena.programs.sample_memory()
+        first = {name: arena.programs.memory_mb(name) for name in arena.programs.names}
+        arena.judge.forget()
+        arena.start("fuzzer")
+        while (code := arena.programs.exit_code("fuzzer", 1.0)) is None:
+            arena.programs.sample_memory()
+            arena.programs.check()
+            yield sent(folder)
+        arena.wait(CLOSE_S)
+        arena.judge.close_gaps()
+        result.crashes += [f"fuzzer: exit code {code}"] if code else []
+        result.errors_m, result.rms_m = (before[0], arena.judge.largest_m), (before[1], arena.judge.rms_m)
+        result.gap_s = max((gap.seconds for gap in arena.judge.gaps), default=0.0)
+        result.lines += arena.programs.new_lines()
+        result.growth_mb = {n: arena.programs.memory_mb(n) - mb for n, mb in first.items()}
+        result.faults = dict(arena.status.faults) if arena.status else {}
+    result.crashes += arena.programs.crashes
+    result.slopes_mb_per_min = {n: s[-1] for n, s in arena.programs.slopes_mb_per_min.items()}
+    result.summary = (folder / "fuzzer.out").read_text()
+    yield result
+
+
+def sent(folder: Path) -> int:
+    """The number of messages that the fuzzer has sent, by its own report."""
+    words = (folder / "fuzzer.out").read_text().split()
+    return int(words[-1]) if words and words[-1].isdecimal() else 0
+
+
+def main(messages: int = 1_000_000, seed: int = 1, rate: float = 2000.0, only: str = "") -> int:
+    """Print what was sent and what it did; exit code 1 if something does not hold.
+
+    Args:
+        messages: how many.
+        seed: of the choices.
+        rate: messages a second.
+        only: part of the name of a target of `Fuzzer`; all unless given.
+    """
+    result = FuzzResult()
+    with tempfile.TemporaryDirectory(prefix="roundel-fuzz-") as folder:
+        steps = fuzz(Path(folder), Fuzz(messages, rate, seed, only))
+        for step in track(steps, "fuzzing", messages / rate):
+            if isinstance(step, FuzzResult):
+                result = step
+    report(result)
+    return int(bool(result.failures()))
+
+
+def report(result: FuzzResult) -> None:
+    """Print the result."""
+    table = Table("program", "grew by MB", "MB a minute", "log lines")
+    for name, mb in result.growth_mb.items():
+        slope = result.slopes_mb_per_min.get(name)
+        lines = sum(program == name for program, _ in result.lines)
+        table.add_row(name, f"{mb:.1f}", "" if slope is None else f"{slope:.2f}", str(lines))
+    console().print(table)
+    for line in result.summary.splitlines()[-15:]:
+        say(line)
+    for name, line in result.lines[:MAX_LINES]:
+        say(f"{name}: {line[:200]}")
+    errors, rms = ([1e3 * value for value in pair] for pair in (result.errors_m, result.rms_m))
+    say(
+        f"error before: {errors[0]:.2f} mm (RMS {rms[0]:.2f}), with faults: {errors[1]:.2f} mm (RMS {rms[1]:.2f})"
+    )
+    say(
+        f"longest gap: {result.gap_s:.2f} s; {len(result.lines)} log lines; counted by the server: {result.faults}"
+    )
+    for failure in result.failures():
+        say(f"FAILED {failure}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(main))

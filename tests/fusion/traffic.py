@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A server in its own process, and cameras that publish a synthetic arena in real time, well-behaved or not."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calib.rig.rig import Rig, save_rig
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
+from camera_node.protocol.session import open_client
+from fusion.client.arena import Arena as Client
+from fusion.protocol.messages import FusionStatus, RobotPose
+from tests.fusion.serving import ARENA
+from tests.waiting import Inbox, wait_for
+
+KEYS = Keys("test")
+HZ = 30.0
+Alter = Callable[[Detections], Detections]
+
+
+@dataclass
+class RunningServer:
+    """A server process: its endpoint and its log."""
+
+    process: subprocess.Popen
+    endpoint: str
+    log: Path
+
+
+@contextmanager
+def server_process(folder: Path, *options: str) -> Iterator[RunningServer]:
+    """`python -m fusion` with the rig and the robots of the synthetic arena."""
+    save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
+    robots = {name: msgspec.to_builtins(robot) for name, robot in ARENA.robots.items()}
+    (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": robots}))
+    endpoints, log = folder / "endpoints", folder / "server.log"
+    files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml", "--endpoints-file", endpoints]
+    command = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
+    with log.open("w") as stderr, subprocess.Popen([*map(str, command), *options], stderr=stderr) as process:
+        try:
+            wait_for(lambda: process.poll() is not None or endpoints.exists())
+            yield RunningServer(process, endpoints.read_text().split()[0], log)
+        finally:
+            process.terminate()
+
+
+class PublishingCamera:
+    """A camera that publishes its frames of the arena in real time, in a thread and a session of its own."""
+
+    def __init__(self, endpoint: str, name: str, hz: float = HZ, alter: Alter = lambda m: m) -> None:
+        self._endpoint, self._name, self._hz, self._alter = endpoint, name, hz, alter
+        self._messages = [m for m in ARENA.messages(4) if m.camera == name]
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._publish)
+
+    def __enter__(self) -> "PublishingCamera":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _publish(self) -> None:
+        with open_client([self._endpoint]) as session:
+            publisher = session.declare_publisher(KEYS.detections(self._name))
+            seq, due_s = 0, time.monotonic()
+            while not self._stopped.wait(max(0.0, due_s - time.monotonic())):
+                due_s = max(due_s + 1 / self._hz, time.monotonic() - 1 / self._hz)  # no burst after a delay
+                now_ns = time.time_ns()
+                message = msgspec.structs.replace(
+                    self._messages[seq % len(self._messages)], seq=seq, t_ns=now_ns, sent_ns=now_ns
+                )
+                publisher.put(encode(self._alter(message)))
+                seq += 1
+
+
+@dataclass
+class Flood:
+    """Adds false roundels at random places to every frame, as a texture or an attacker does."""
+
+    n: int = MAX_ROUNDELS
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
+
+    def __call__(self, message: Detections) -> Detections:
+        true = message.unpack()
+        uv = self.rng.uniform([10, 10], [790, 590], (self.n - len(true), 2))
+        axes = np.sort(self.rng.uniform(10, 30, uv.shape))[:, ::-1]
+        false = msgspec.structs.asdict(Detections.pack(Roundels.from_points(uv, 0.1), **_header(message)))
+        false["axes_px"], false["angle_rad"] = (
+            axes.astype("<f4").tobytes(),
+            np.zeros(len(uv), "<f4").tobytes(),
+        )
+        columns = ("uv", "cov", "axes_px", "angle_rad", "ratio", "contrast", "id", "track")
+        return msgspec.structs.replace(message, **{c: getattr(message, c) + false[c] for c in columns})
+
+
+def _header(message: Detections) -> dict[str, object]:
+    names = ("camera", "seq", "t_ns", "sent_ns", "width", "height")
+    return {name: getattr(message, name) for name in names}
+
+
+class Observer:
+    """A client that measures the poses of robot a, and reads the server's status."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._client = Client.connect(endpoint, arena="test")
+        self._poses, self._statuses = Inbox(), Inbox()
+        self._client.robot("a").on_pose(self._poses.put)
+        self._client.status().on_message(self._statuses.put)
+
+    def __enter__(self) -> "Observer":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._client.close()
+
+    def collect(self, seconds: float) -> list[RobotPose]:
+        """The next poses of so many seconds at `HZ`, by their own time."""
+        first = len(self._poses.items)
+        end_ns = time.time_ns() + round(seconds * 1e9)
+        assert self._poses.until(lambda poses: len(poses) > first and poses[-1].t_ns > end_ns)
+        return self._poses.items[first:]
+
+    def status(self) -> FusionStatus:
+        """The next status."""
+        n = len(self._statuses.items)
+        assert self._statuses.until(lambda statuses: len(statuses) > n)
+        return self._statuses.items[-1]
+
+
+def latency_ms(poses: list[RobotPose], percentile: float = 50.0) -> float:
+    """A percentile of the latencies of poses."""
+    return float(np.percentile([pose.latency.total_ms for pose in poses if pose.latency], percentile))
