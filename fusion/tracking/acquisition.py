@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera_node.arrays import Index
+from camera_node.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
@@ -35,6 +35,8 @@ FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried 
 MAX_DETECTIONS = (
     1_000  # unassigned, of one frame; of more, those around one of them are searched, each in its turn
 )
+CONFIRMATIONS = 5  # frame sets in which a poor fit must be at one place
+SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
 
@@ -96,6 +98,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
+        self._poor: dict[int, tuple[Array, int]] = {}  # by robot, where poor fits were, and how often
         self._frame_sets = 0  # searched so far
 
     def acquire(
@@ -122,8 +125,7 @@ class Acquisition:
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
         markers = self._find_markers(table, detections, of_bodies)
-        usual = _usual_misfit(table, detections, of_bodies)
-        found, reasons = self._acquire_bodies(table, bodies, markers, detections, usual)
+        found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
         of_bodies = of_bodies.joined(found.assignments)
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
         assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
@@ -145,9 +147,12 @@ class Acquisition:
         missing: Index,
         markers: list[Marker],
         detections: DetectionTable,
-        usual: float,
+        assignments: Assignments,
     ) -> tuple[_Found, dict[int, str]]:
         """The constellations of this shard that the markers identify, and why the others are not among them."""
+        none = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
+        if not len(missing):
+            return none, {}
         turn = self._turn
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
@@ -156,14 +161,14 @@ class Acquisition:
         identified = identify(
             question,
             lambda fits: self._refine(table, _starts_of(fits, markers, table), detections),
-            usual,
+            _usual_misfit(table, detections, assignments),
             turn,
         )
         self._turn = identified.turn
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
-        found = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
-        for fits in identified.fits:
+        found = none
+        for fits in (*identified.fits, *self._confirmed(identified.poor)):
             found = found.joined(fits.select(table.owned[fits.robot]))
         left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
         return found, {k: _reason(table, k, question, identified) for k in left}
@@ -196,6 +201,19 @@ class Acquisition:
         portion = Portion(MAX_DETECTIONS, self._frame_sets, float(np.median(diameters)))
         rows = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         return find_markers(self._cameras, detections, rows, diameters)
+
+    def _confirmed(self, poor: list[RefinedFits]) -> list[RefinedFits]:
+        """The poor fits that were at one place in `CONFIRMATIONS` successive frame sets."""
+        before, self._poor = self._poor, {}
+        for fits in poor:
+            for robot, p in zip(fits.robot.tolist(), fits.states.p, strict=True):
+                place, count = before.get(robot, (p, 0))
+                stayed = np.linalg.norm(p - place) < SAME_PLACE_M
+                self._poor[robot] = p, count + 1 if stayed else 1
+        return [
+            fits.select(np.array([self._poor[k][1] >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
+            for fits in poor
+        ]
 
     def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
         """Update each start independently with its detections."""
@@ -245,6 +263,8 @@ def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: As
 
 def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:
     """The markers none of whose detections is assigned."""
+    if not markers:
+        return []
     taken = set(assignments.detection.tolist())
     return [marker for marker in markers if taken.isdisjoint(marker.detections.tolist())]
 

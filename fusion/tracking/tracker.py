@@ -246,8 +246,6 @@ class Tracker:
         states, fitted = self._fit(prediction, detections, assignments)
         if self.residuals.is_unusual(fitted.squared_px):
             states, fitted = self._leave_one_out(prediction, detections, fitted, states)
-        else:
-            self.residuals.learn(fitted.squared_px)
         self.table.states = states
         return fitted.joined(others)
 

@@ -113,10 +113,19 @@ class _Tracks:
         return len(self.states)
 
     def select(self, rows: NDArray) -> "_Tracks":
-        return _Tracks(*(_rows(getattr(self, name), rows) for name in self.__slots__))
+        return _Tracks(
+            self.states.select(rows),
+            self.radius[rows],
+            self.has_normal[rows],
+            self.seen_ns[rows],
+            self.since_ns[rows],
+            self.anchor[rows],
+            self.in_company[rows],
+            self.alone[rows],
+        )
 
     def joined(self, other: "_Tracks") -> "_Tracks":
-        names = self.__slots__[1:]
+        names = "radius", "has_normal", "seen_ns", "since_ns", "anchor", "in_company", "alone"
         columns = (np.concatenate([getattr(self, k), getattr(other, k)]) for k in names)
         return _Tracks(self.states.joined(other.states), *columns)
 
@@ -238,10 +247,6 @@ class UnlabeledTracker:
         if not np.isfinite(marker.diameter_m):
             return float(self._radii[0])
         return float(self._radii[np.argmin(np.abs(self._radii - marker.diameter_m / 2))])
-
-
-def _rows(column: States | NDArray, rows: NDArray) -> States | NDArray:
-    return column.select(rows) if isinstance(column, States) else column[rows]
 
 
 def _pair(states: States, position: Array, covariance: Array) -> Index:

@@ -6,7 +6,7 @@ positions, which makes its distances uncertain; so the detections decide, with a
 
 In a crowd, detections of two markers make a third one, and a false fit may use it. Such a fit is poorer than those of
 other robots. So may be the fit of a robot whose markers are not quite as declared: a poor fit is accepted if all
-markers are seen and no good fit contradicts it.
+markers are seen and no good fit contradicts it, in several frame sets.
 
 All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
 """
@@ -80,12 +80,14 @@ class Identified:
     """The accepted fits, the robots (rows) with plausible fits that were not accepted, and where to go on.
 
     Attributes:
-        fits: one for each number of markers.
+        fits: one entry for each number of markers.
+        poor: the same of poor fits, which the caller should confirm in several frame sets.
         rivals: by robot, the robot of the best rival; the robot itself where it fits in several places.
         turn: row of the first robot whose turn it is in the next frame set.
     """
 
     fits: list[RefinedFits]
+    poor: list[RefinedFits]
     rivals: dict[int, int]
     turn: int
 
@@ -138,7 +140,7 @@ def identify(question: "Question", refine: Refine, usual: float, turn: int) -> I
     for count in range(most, MIN_MARKERS - 1, -1):
         decisions.decide(count, refine)
     decisions.decide_poor()
-    return Identified(decisions.fits, decisions.rivals, decisions.turn)
+    return Identified(decisions.fits, decisions.poor, decisions.rivals, decisions.turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,6 +161,7 @@ class _Decisions:
         self._accepted, self._open, self._open_good = _Claims(*size), _Claims(*size), _Claims(*size)
         self._poor: list[_Level] = []
         self.fits: list[RefinedFits] = []
+        self.poor: list[RefinedFits] = []
         self.rivals: dict[int, int] = {}
         self.turn = turn
 
@@ -187,7 +190,7 @@ class _Decisions:
             sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
             is_full = np.array(sizes, np.intp) == mappings.points.shape[1]
             is_free = ~self._open_good.touch(mappings) & ~self._accepted.touch(mappings)
-            self._accept(level, is_full & is_free & level.wins)
+            self.poor.append(level.refined.select(is_full & is_free & level.wins))
 
     def _compare(self, mappings: Mappings, refine: Refine) -> _Level:
         """Refine mappings and compare those that the detections allow."""
