@@ -118,8 +118,15 @@ class Detector:
         """The threshold theta of the "paper" detector for the next frame, grey levels; None for "chords"."""
         return self._core.theta
 
+    @property
+    def tone_exponent(self) -> float:
+        """The exponent that makes this camera's levels proportional to light, learned from roundels; 1 at first."""
+        return self._core.tone_exponent
+
     def adjusted(self, **changes: Any) -> "Detector":
-        """A detector with other settings, by the names of the constructor, that continues the tracks of this one.
+        """A detector with other settings, by the names of the constructor.
+
+        It continues this one's tracks and keeps what this one has learned about the camera.
 
         Raises:
             ConfigError: a setting is out of its range.

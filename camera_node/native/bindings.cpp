@@ -61,5 +61,6 @@ NB_MODULE(_core, m) {
              nb::arg("by_paper"))
         .def("detect", &detect, nb::arg("image").noconvert())
         .def("take_over", &roundel::Detector::take_over, nb::arg("other"))
-        .def_prop_ro("theta", &roundel::Detector::theta);
+        .def_prop_ro("theta", &roundel::Detector::theta)
+        .def_prop_ro("tone_exponent", &roundel::Detector::tone_exponent);
 }

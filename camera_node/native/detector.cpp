@@ -37,7 +37,8 @@ Detector::FrameState::FrameState(const ImageView& view)
 FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
-    FrameState frame(image);
+    const ImageView linear = response_.linearize(image);
+    FrameState frame(linear);
     fit_tracked(frame);
     if (paper_)
         search_by_paper(frame);
@@ -50,6 +51,7 @@ FrameResult Detector::detect(const ImageView& image) {
         update_theta(frame);
     else
         mark_searched(frame);
+    learn_response(frame);
     return {std::move(frame.found), n_postponed_};
 }
 
@@ -170,6 +172,14 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
     }
 }
 
+/// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
+void Detector::learn_response(const FrameState& frame) {
+    std::vector<const RoundelFit*> fits;
+    for (const TrackedFit& roundel : frame.found)
+        if (roundel.fit.unoccluded) fits.push_back(&roundel.fit);
+    if (response_.learn(fits, limits_)) change_mask_.invalidate(), tracks_.forget_models();
+}
+
 /// Section III-B of the paper: theta follows the mean levels of the roundels.
 void Detector::update_theta(const FrameState& frame) {
     if (frame.found.empty()) return paper_->step();
@@ -207,10 +217,15 @@ std::optional<double> Detector::theta() const {
     return paper_ ? std::optional(paper_->theta()) : std::nullopt;
 }
 
+double Detector::tone_exponent() const {
+    const std::lock_guard lock(mutex_);
+    return response_.exponent();
+}
+
 void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
-    tracks_ = from.tracks_;
+    tracks_ = from.tracks_, response_ = from.response_;
     if (paper_ && from.paper_) paper_ = from.paper_;
 }
 

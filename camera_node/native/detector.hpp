@@ -13,6 +13,7 @@
 #include "search/chords.hpp"
 #include "search/suppression.hpp"
 #include "tracks.hpp"
+#include "verify/camera_response.hpp"
 
 namespace roundel {
 
@@ -38,6 +39,8 @@ class Detector {
     std::optional<double> theta() const;
     /// Continues another detector's tracks and theta with this one's settings.
     void take_over(Detector& from);
+    /// The exponent of the camera's tone curve; 1 if it is linear.
+    double tone_exponent() const;
 
   private:
     /// The state of one frame's detection.
@@ -65,16 +68,20 @@ class Detector {
     void fit_moving_streaks(FrameState& frame) const;
     void update_theta(const FrameState& frame);
     void mark_searched(const FrameState& frame);
+    void learn_response(const FrameState& frame);
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
-    AcceptanceContext context(const FrameState& frame) const { return {limits_, frame.noise}; }
+    AcceptanceContext context(const FrameState& frame) const {
+        return {limits_, frame.noise, response_.edge_noise(), response_.shading_sigma()};
+    }
 
     RoundelLimits limits_;
     double search_share_;
     ChordSearch chords_;
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
+    CameraResponse response_;
     Tracks tracks_;
     ChangeMask change_mask_;
     double searched_to_ = 0;  // share of the height, of the bands searched in turns

@@ -58,6 +58,10 @@ const Tracks::Track* Tracks::nearest(const RoundelFit& fit, const std::vector<bo
     return best;
 }
 
+void Tracks::forget_models() {
+    for (Track& t : tracks_) t.steady = false;
+}
+
 void Tracks::update(std::vector<TrackedFit>& found) {
     std::vector<bool> taken(tracks_.size(), false);
     std::vector<Track> now;

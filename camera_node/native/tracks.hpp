@@ -34,6 +34,8 @@ class Tracks {
     /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that
     /// is predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
     void update(std::vector<TrackedFit>& found);
+    /// Lets the next fits start from rays, since the models of the last frame hold no longer.
+    void forget_models();
 
   private:
     struct Track {

@@ -30,7 +30,8 @@ constexpr double kMaxMotion = 4;     // mean radii
 constexpr double kMaxMisfit = 0.15;  // residuals over the contrast after the coarse stage
 constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
 constexpr double kPatch = 64;                         // pixels of the ground with correlated levels
-constexpr SanityLimits kLimits{.shift = 0.6, .min_size = 0.6, .max_size = 1.6, .blur = 0, .overflow = 100};
+constexpr SanityLimits kLimits{
+    .shift = 0.6, .min_size = 0.6, .max_size = 1.6, .blur = 0, .underflow = 100, .overflow = 100};
 
 /// A motion followed by the parameters of a still picture.
 MovingParameters join(double x, double y, const Parameters& picture) {

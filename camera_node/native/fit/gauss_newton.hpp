@@ -41,10 +41,10 @@ inline Parameters prior_information(double major, double ratio, double blur) {
 
 /// How far an estimate may be from its initial guess.
 struct SanityLimits {
-    double shift;               // of the centre, mean radii; one pixel more is always allowed
-    double min_size, max_size;  // mean radius over that of the guess
-    double blur;                // mean radii; three pixels more are always allowed
-    double overflow;            // grey levels outside of [0, 255]
+    double shift;                // of the centre, mean radii; one pixel more is always allowed
+    double min_size, max_size;   // mean radius over that of the guess
+    double blur;                 // mean radii; three pixels more are always allowed
+    double underflow, overflow;  // grey levels below 0 and above 255
 };
 
 /// J^T W J, of which the lower triangle is set, and J^T W r.
@@ -87,7 +87,7 @@ class GaussNewton {
         return std::hypot(dx, dy) < 1 + limits.shift * radius && at(kAxx) > 0 &&
                area > square(limits.min_size) && area < square(limits.max_size) && at(kRatio) > 0.1 &&
                at(kRatio) < 0.95 && at(kBlur) < 3 + limits.blur * radius && at(kCard) > 1 &&
-               at(kDark) > -limits.overflow && at(kBright) < 255 + limits.overflow &&
+               at(kDark) > -limits.underflow && at(kBright) < 255 + limits.overflow &&
                square(at(kGx)) + square(at(kGy)) < square(0.5 / at(kCard));
     }
 

@@ -137,6 +137,52 @@ ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const
     });
 }
 
+/// Sums of the products with one column of shading.
+struct ShadingSums {
+    Lanes by[kCount], residual;
+};
+
+/// Adds the products of `pixels` (the part's first one) with level x and level y, and of these two.
+ROUNDEL_CLONES void add_shading(const Gradient* chunks, int lanes, Edge edge, const float* x, const float* y,
+                                const float* level, float per_cut, ShadingSums (&sums)[2], Lanes (&own)[3]) {
+    with_edge(edge, [&](auto e) __attribute__((always_inline)) {
+        Lanes wx[kChunk], wy[kChunk];
+        for (; lanes > 0; lanes -= kChunk, ++chunks) {
+            const int count = std::min(kChunk, lanes);
+            for (int k = 0; k < count; ++k, x += kLanes, y += kLanes, level += kLanes) {
+                const Lanes residual = chunks->residual[k], root = root_weight(residual * per_cut);
+                const Lanes model = load(level) - residual, w = root * root * model;
+                const Lanes by_x = load(x), by_y = load(y);
+                wx[k] = w * by_x, wy[k] = w * by_y;
+                own[0] += wx[k] * model * by_x, own[1] += wx[k] * model * by_y;
+                own[2] += wy[k] * model * by_y;
+            }
+            const auto multiply = [&](const Lanes* column, Lanes& sum_x, Lanes& sum_y)
+                                      __attribute__((always_inline)) {
+                                          for (int k = 0; k < count; ++k)
+                                              sum_x += wx[k] * column[k], sum_y += wy[k] * column[k];
+                                      };
+            for (const int i : kBy<e>) multiply(chunks->by[i], sums[0].by[i], sums[1].by[i]);
+            multiply(chunks->residual, sums[0].residual, sums[1].residual);
+        }
+    });
+}
+
+/// Transforms products with the columns of a part's gradient to those of all parameters.
+Parameters to_parameters(const ShadingSums& sums, Edge edge, const EdgeEllipse::Jacobian& J) {
+    Parameters to{};
+    for (size_t i = 0; i < kCount; ++i) to[i] = double(sum(sums.by[i]));
+    if (edge == kAnyEdge) return to;
+    const Parameters of_ellipse = to;
+    for (int m = 0; m < kPoseCount; ++m) to[kX + m] = 0;
+    for (int j = 0; j < EdgeEllipse::kShape; ++j) {
+        for (int m = 0; m < kPoseCount; ++m) to[kX + m] += J[j][m] * of_ellipse[kX + j];
+        if (edge != kOuterEdge)
+            to[edge == kInnerEdge ? kRatio : kCard] += J[j][kPoseCount] * of_ellipse[kX + j];
+    }
+    return to;
+}
+
 struct LaneResidualSums {
     Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
 };
@@ -230,7 +276,8 @@ void NormalEquations::linearize(const EdgePixels& pixels, const Parameters& p) {
     for (int k = 0; k < part_count_; ++k) {
         const EdgePixels::EdgePart& from = pixels.parts[size_t(k)];
         LinearPart& part = parts_[size_t(k)];
-        part.edge = from.edge, part.lanes = from.count / kLanes, part.chunks = chunks;
+        part.edge = from.edge, part.lanes = from.count / kLanes, part.begin = from.begin;
+        part.chunks = chunks;
         if (part.edge == kAnyEdge) {
             evaluate(pixels, from, p, chunks);
         } else {
@@ -271,6 +318,24 @@ ResidualSums NormalEquations::residuals_after(const Parameters& delta, double sc
             .mrr = double(sum(s.mrr)),
             .mwrr = double(sum(s.mwrr)),
             .mpsi = double(sum(s.mpsi))};
+}
+
+ShadingProducts NormalEquations::shading(const EdgePixels& pixels, double scale) const {
+    ShadingProducts products;
+    for (const LinearPart& part : parts()) {
+        ShadingSums sums[2]{};
+        Lanes own[3]{};
+        add_shading(part.chunks, part.lanes, part.edge, pixels.x + part.begin, pixels.y + part.begin,
+                    pixels.level + part.begin, float(1 / (kTukey * scale)), sums, own);
+        for (size_t a = 0; a < 2; ++a) {
+            const Parameters of_part = to_parameters(sums[a], part.edge, part.jacobian);
+            for (size_t i = 0; i < kCount; ++i) products.parameters[a][i] += of_part[i];
+            products.residuals[a] += double(sum(sums[a].residual));
+        }
+        products.own.xx += double(sum(own[0])), products.own.xy += double(sum(own[1]));
+        products.own.yy += double(sum(own[2]));
+    }
+    return products;
 }
 
 }  // namespace roundel

@@ -22,6 +22,14 @@ struct ResidualSums {
 /// Tukey's biweight is (1 - (r / c)^2)^2 for |r| < c = 6 scales and 0 beyond.
 constexpr float kTukey = 6;
 
+/// Products of the two columns of linear shading, level x and level y, with those of the parameters, with
+/// each other and with the residuals; x and y in the pixels' frame.
+struct ShadingProducts {
+    std::array<Parameters, 2> parameters{};
+    Symmetric own{};
+    std::array<double, 2> residuals{};
+};
+
 /// The normal equations of weighted least squares: the model's levels at all pixels, linearized at one point
 /// of the parameters.
 class NormalEquations {
@@ -34,12 +42,15 @@ class NormalEquations {
     /// J^T W J and J^T W r with Tukey's weights W for residuals of a standard deviation `scale`.
     GaussNewtonSystem<kCount> accumulate(double scale) const;
     ResidualSums residuals_after(const Parameters& delta, double scale) const;
+    /// The products that a fit with shading needs in addition. `pixels` are those of `linearize`.
+    ShadingProducts shading(const EdgePixels& pixels, double scale) const;
 
   private:
     /// Chunks of the pixels of one edge, or of all edges.
     struct LinearPart {
         Edge edge;
         int lanes;
+        int begin;  // in the pixels
         const Gradient* chunks;
         EdgeEllipse::Jacobian jacobian;  // of a single edge's ellipse
     };

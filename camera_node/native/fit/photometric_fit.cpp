@@ -39,12 +39,28 @@ constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kPrintSigma = 0.002;                // of the ratios of prints of one kind
 constexpr double kMaxPrintError = 3;                 // standard deviations
-constexpr SanityLimits kLimits{.shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .overflow = 64};
+constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
+constexpr float kPlateau = 235;        // level that compression leaves of clipped paper
+constexpr SanityLimits kLimits{
+    .shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .underflow = 64, .overflow = 600};
+
+/// Sets bright pixels to the scale's end if many are there, since compression scatters the levels of clipped
+/// paper; returns whether it did.
+bool restore_clipped(EdgePixels& pixels) {
+    float* const end = pixels.level + pixels.count;
+    const auto clipped = std::count_if(pixels.level, end, [](float level) { return level > kSaturated; });
+    if (double(clipped) < kClippedShare * pixels.used) return false;
+    std::replace_if(pixels.level, end, [](float level) { return level > kPlateau; }, 255.0f);
+    return true;
+}
 
 class PhotometricFitter : GaussNewton<kCount> {
   public:
     PhotometricFitter(const ImageView& image, const InitialGuess& guess)
-        : image_(image), occlusion_(guess.occlusion), resumed_(guess.model.has_value()) {
+        : image_(image),
+          occlusion_(guess.occlusion),
+          resumed_(guess.model.has_value()),
+          shading_sigma_(guess.shading_sigma) {
         pixels_.origin_x = int(std::lround(guess.outer.x));
         pixels_.origin_y = int(std::lround(guess.outer.y));
         p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
@@ -74,6 +90,7 @@ class PhotometricFitter : GaussNewton<kCount> {
 
     double ratio() const { return p_[kRatio]; }
     void use_print(double print_ratio);
+    void allow_shading();
     RoundelFit fit() const;
 
   private:
@@ -85,6 +102,7 @@ class PhotometricFitter : GaussNewton<kCount> {
         if (occlusion_.any()) band.separate = 0;
         select_pixels(image_, p_, band, limit, pixels_);
         if (occlusion_.any()) remove_occluded(occlusion_, start_, pixels_);
+        clipped_ = restore_clipped(pixels_);
         return pixels_.used >= 2 * kCount;
     }
 
@@ -105,7 +123,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     bool iterate(const EdgePixels& pixels, int steps_to_go) {
         const bool coarse = steps_to_go > 1;
         for (int k = 0; k < kMaxSteps; ++k) {
-            equations_.linearize(pixels, p_);
+            equations_.linearize(pixels, p_), linearized_at_ = p_;
             const double seen = edge_scale();
             if (resumed_ && coarse && seen < kSlack * scale_) return true;
             if (resumed_ && (k == kMaxResumedSteps || seen > kMaxResumedMisfit * contrast())) return false;
@@ -178,10 +196,14 @@ class PhotometricFitter : GaussNewton<kCount> {
     NormalEquations equations_;
     GaussNewtonSystem<kCount> system_;
     ResidualSums sums_;
+    Parameters linearized_at_{};
+    PoseCovariance shading_effect_{};    // on the covariance, in units of the noise
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
     double print_ratio_ = 0;             // that the estimate is conditioned on; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
-    bool resumed_;
+    bool resumed_, clipped_ = false;
+    double shading_sigma_;
+    Shading shading_;
 };
 
 Parameters PhotometricFitter::covariance_with_ratio() const {
@@ -212,16 +234,47 @@ void PhotometricFitter::use_print(double print_ratio) {
     const double off = print_ratio - p_[kRatio];
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kLimits)) {
-        equations_.linearize(pixels_, p_);
+        equations_.linearize(pixels_, p_), linearized_at_ = p_;
         if (solve(scale_) && (advance(scale_), is_sane(kLimits)) && condition_on_print(print_ratio)) return;
     }
     std::tie(p_, factor_, sums_, noise_, scale_) = saved;
 }
 
+/// Includes the two unknowns of a linear shading in the pose, after convergence: with C the products of their
+/// columns with those of the parameters, D their own and e their residuals,
+///   S = D + prior - C^T H^-1 C,  shading = S^-1 (e - C^T step),  pose <- pose - (H^-1 C shading)_pose.
+/// The covariance grows by H^-1 C S^-1 C^T H^-1. The shading is relative to the level at the pixels' origin.
+void PhotometricFitter::allow_shading() {
+    const ShadingProducts products = equations_.shading(pixels_, scale_);
+    const auto& [Cx, Cy] = products.parameters;
+    const Parameters yx = factor_->halfway(Cx), yy = factor_->halfway(Cy);
+    Symmetric S = products.own;
+    auto [ex, ey] = products.residuals;
+    for (int i = 0; i < kCount; ++i) {
+        const double step = p_[i] - linearized_at_[i];
+        ex -= Cx[i] * step, ey -= Cy[i] * step;
+        S.xx -= yx[i] * yx[i], S.xy -= yx[i] * yy[i], S.yy -= yy[i] * yy[i];
+    }
+    if (!(S.det() > 0 && S.xx > 0)) return;
+    shading_ = {(square(S.yy * ex - S.xy * ey) + square(S.xx * ey - S.xy * ex)) / square(S.det()),
+                square(noise_) * (S.xx + S.yy) / (2 * S.det())};
+    const double prior = square(noise_ / shading_sigma_);
+    S.xx += prior, S.yy += prior;
+    const double det = S.det();
+    const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
+    const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);
+    for (int i = 0; i < kPoseCount; ++i) p_[kX + i] -= Kx[i] * sx + Ky[i] * sy;
+    for (int i = 0; i < kPoseCount; ++i)
+        for (int j = 0; j < kPoseCount; ++j)
+            shading_effect_[i][j] =
+                (S.yy * Kx[i] * Kx[j] - S.xy * (Kx[i] * Ky[j] + Ky[i] * Kx[j]) + S.xx * Ky[i] * Ky[j]) / det;
+}
+
 PoseCovariance PhotometricFitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
-        for (int j = 0; j < kPoseCount; ++j) inverse[i][j] -= print_effect_[i] * print_effect_[j];
+        for (int j = 0; j < kPoseCount; ++j)
+            inverse[i][j] += shading_effect_[i][j] - print_effect_[i] * print_effect_[j];
     return scaled(inverse, square(noise_));
 }
 
@@ -230,7 +283,7 @@ RoundelFit PhotometricFitter::fit() const {
     if (print_ratio_ > 0) fit.p[kRatio] = print_ratio_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
-    fit.noise = scale_;
+    fit.noise = scale_, fit.shading = shading_, fit.clipped = clipped_;
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;
 }
@@ -241,6 +294,7 @@ std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialG
     PhotometricFitter fitter(image, guess);
     if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
     if (!guess.print_ratios.empty()) fitter.use_print(nearest_ratio(guess.print_ratios, fitter.ratio()));
+    if (guess.shading_sigma > 0) fitter.allow_shading();
     return fitter.fit();
 }
 

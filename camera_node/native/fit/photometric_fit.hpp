@@ -19,6 +19,7 @@ struct InitialGuess {
     OcclusionMask occlusion{};               // sectors that the fit leaves out
     std::optional<Parameters> model{};       // in the image's frame, within a third of a pixel, if known
     double noise = 0;                        // noise that the fit of `model` estimated
+    double shading_sigma = 0;                // of the relative change of the light, per pixel; 0 for none
 };
 
 /// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is
@@ -30,6 +31,12 @@ inline PoseCovariance scaled(PoseCovariance covariance, double factor) {
         for (double& value : row) value *= factor;
     return covariance;
 }
+
+/// The linear change of the light across a roundel that the pixels alone show: the squared length of the
+/// relative gradient and the variance of each of its components, per square pixel.
+struct Shading {
+    double squared = 0, variance = 0;
+};
 
 /// A roundel fitted to the grey levels around its edges.
 struct RoundelFit {
@@ -46,6 +53,8 @@ struct RoundelFit {
     bool unoccluded = false;  // the fit uses the unmodified image, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
+    Shading shading{};
+    bool clipped = false;  // the paper is brighter than the camera can show
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {

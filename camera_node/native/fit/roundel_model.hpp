@@ -55,8 +55,11 @@ inline CircleImage circle_image(const Parameters& p, double r) {
 constexpr float kAbsent = 1e9f;  // a residual that does not count
 
 /// Pixels that do not count: padding (level -1), and clipped pixels whose modelled `level` is out of range.
+// Noise that lifts a pixel to the scale's end is cut off, so clipped pixels count only if the model is far
+// below.
+constexpr float kSaturated = 254.5f, kClipped = 225;
 ROUNDEL_INLINE Bits is_uninformative(const Lanes& seen, const Lanes& level) {
-    const Bits clipped = ((seen > 254.5f) & (level > 255.0f)) | ((seen < 0.5f) & (level < 0.0f));
+    const Bits clipped = ((seen > kSaturated) & (level > kClipped)) | ((seen < 0.5f) & (level < 0.0f));
     return (seen < 0.0f) | clipped;
 }
 

@@ -29,16 +29,26 @@ class Cholesky {
     }
     bool positive() const { return positive_; }
     /// Solves A x = b.
-    Vector<N> solve(Vector<N> b) const {
+    Vector<N> solve(const Vector<N>& b) const { return solve_tail<N>(halfway(b)); }
+    /// L^-1 b: the square of its norm is b^T A^-1 b.
+    Vector<N> halfway(Vector<N> b) const {
         for (int i = 0; i < N; ++i) {
             for (int k = 0; k < i; ++k) b[i] -= L_[i][k] * b[k];
             b[i] *= per_diagonal_[i];
         }
-        for (int i = N - 1; i >= 0; --i) {
-            for (int k = i + 1; k < N; ++k) b[i] -= L_[k][i] * b[k];
-            b[i] *= per_diagonal_[i];
-        }
         return b;
+    }
+    /// The last M elements of L^-T y, which depend on the last of y only.
+    template <int M>
+    Vector<M> solve_tail(const Vector<N>& y) const {
+        constexpr int first = N - M;
+        Vector<M> x;
+        for (int i = M - 1; i >= 0; --i) {
+            x[i] = y[first + i];
+            for (int k = i + 1; k < M; ++k) x[i] -= L_[first + k][first + i] * x[k];
+            x[i] *= per_diagonal_[first + i];
+        }
+        return x;
     }
     /// The last M rows and columns of the inverse of A. They depend on the last block of L only:
     /// (L_22 L_22^T)^-1.

@@ -14,7 +14,8 @@ namespace {
 
 constexpr double kTiny = 11;               // pixels: blur and ratio of smaller ones are correlated, so the
 constexpr double kMaxRatioSigma = 0.04;    // tolerance grows by two standard deviations of at most this size
-constexpr double kOverflow = 30;           // grey levels that a blurred ring's levels may be out of range
+constexpr double kUnderflow = 30;          // grey levels that a blurred ring's levels may be out of range,
+constexpr double kOverflow = 500;          // and those of clipped paper
 constexpr double kMisfit = 0.045;          // of the contrast: RMS residual on the ring's edges
 constexpr double kRaggedMisfit = 0.062;    // the same for smoothed edges
 constexpr double kMaxGrowth = 2.5;         // factor of the misfit allowed for the largest roundels, and
@@ -27,6 +28,8 @@ constexpr double kRaggedSupport = 0.8;     // share of the edges that agree with
 constexpr double kMinRagged = 16;          // pixels: smaller ragged rings may be letters
 constexpr double kSameLevel = 0.2;         // of the contrast: the ground is as bright as the card
 constexpr double kMinCard = 1.1;           // outer diameters: least diameter of a card whose edge shows
+constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
+constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
 constexpr double kMaxWrong = 0.2;          // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -95,26 +98,39 @@ std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess&
     return fit && passes(image, *fit, smoothed, tolerance) ? fit : std::nullopt;
 }
 
+/// Widens the claim on the size by what the noise does not explain of the residuals: a displacement of the
+/// whole edge that processing makes (sharpening, denoising, compression) does not show in the scatter of the
+/// pixels. The edge of clipped paper is where light that the camera cannot show begins.
+void claim_misfit(RoundelFit& fit, double noise) {
+    const double excess = std::sqrt(std::max(0.0, square(fit.edge_residual) - square(noise)));
+    const double share = std::hypot(kProcessing * excess / fit.contrast(), fit.clipped ? kClippedEdge : 0);
+    const double displacement = share * fit.blur;
+    for (const int i : {2, 4})  // Axx and Ayy
+        for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
+}
+
 }  // namespace
 
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kOverflow &&
-           fit.bright < 255 + kOverflow && fit.outer.major >= limits.min_diameter &&
-           fit.outer.major <= limits.max_diameter;
+    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
+           fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) &&
+           fit.outer.major >= limits.min_diameter && fit.outer.major <= limits.max_diameter;
 }
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.print_ratios = context.limits.inner_ratios;
+    guess.print_ratios = context.limits.inner_ratios, guess.shading_sigma = context.shading_sigma;
     auto fit = fit_photometric(image, guess);
     if (!fit) return std::nullopt;
+    const double at_edges = std::max(context.noise, context.edge_noise);
     std::optional<EdgeMisfit> misfit;
     if (!is_explained_by_noise(*fit, context.noise)) misfit.emplace(image, fit->p);
     const bool elliptic = !misfit || has_elliptic_edges(*misfit, *fit, context.noise);
     const bool accepted = elliptic && passes(image, *fit, context, {kMisfit, kMaxGrowth});
-    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, context.noise));
+    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, at_edges));
+    claim_misfit(*fit, context.noise);
     if (fit->unoccluded || guess.model) return fit->unoccluded ? fit : std::nullopt;
-    const auto rest = fit_occluded(image, {guess, *fit, misfit, context.noise, known || accepted});
+    const auto rest = fit_occluded(image, {guess, *fit, misfit, at_edges, known || accepted});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(*fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;

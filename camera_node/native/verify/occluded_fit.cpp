@@ -21,8 +21,8 @@ constexpr double kSlacks[] = {0.48, 0.12,
                               0.03};  // of masked sectors, in turn: a biased fit spreads its misfit
 
 constexpr int kMaxMasked = 26, kMaxMaskedOfBoth = 44;  // sectors of 32, of one edge and of both
-constexpr double kMaxRatioError = 0.01;                // from the nearest print: shows a bias of the rest
-constexpr double kMinKnown = 12, kMinNew = 16;         // pixels: smaller ones contain too little information
+constexpr double kMaxRatioError = 0.01;  // from the nearest print, beside its uncertainty: shows a bias
+constexpr double kMinKnown = 12, kMinNew = 16;  // pixels: smaller ones contain too little information
 
 // Levels in units of the contrast, from ink (0) to paper (1):
 constexpr double kForeign = 0.05, kForeignSigmas = 3.5;  // difference of a level that is neither of them
@@ -117,7 +117,8 @@ bool masks_too_much(const OcclusionMask& mask) {
 /// Whether the ratio is that of a print. Of a new roundel nothing else is known in advance. An occlusion that
 /// the residuals do not show biases the ratio as well as the position.
 bool has_print_ratio(const RoundelFit& fit, std::span<const double> ratios) {
-    return ratios.empty() || std::abs(nearest_ratio(ratios, fit.ratio) - fit.ratio) < kMaxRatioError;
+    return ratios.empty() || std::abs(nearest_ratio(ratios, fit.ratio) - fit.ratio) <
+                                 std::hypot(kMaxRatioError, 2 * fit.ratio_sigma);
 }
 
 }  // namespace
@@ -140,7 +141,13 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
         const OcclusionMask mask = misfit->occlusion(input.noise, slack * fit.contrast());
         if (masks_too_much(mask)) return std::nullopt;
         if (mask == guess.occlusion) continue;
-        guess = {fit.outer, fit.ratio, fit.dark, fit.bright, guess.print_ratios, mask};
+        guess = {.outer = fit.outer,
+                 .ratio = fit.ratio,
+                 .dark = fit.dark,
+                 .bright = fit.bright,
+                 .print_ratios = guess.print_ratios,
+                 .occlusion = mask,
+                 .shading_sigma = guess.shading_sigma};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;
         fit = *rest, misfit.reset();

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
-from tests.benchmarks.detector import accuracy, motion, negatives, pose, recall, speed
+from tests.benchmarks.detector import accuracy, cameras, motion, negatives, pose, recall, speed
 from tests.benchmarks.detector.table import Run, print_verdicts
 
 PARTS = {
@@ -21,6 +21,7 @@ PARTS = {
     "motion": motion.measure,
     "false_positives": negatives.measure,
     "pose": pose.measure,
+    "cameras": cameras.measure,
 }
 
 
@@ -29,7 +30,9 @@ class Benchmark:
     """Measure detectors against their goals. All random numbers are seeded; times depend on the machine."""
 
     parts: Annotated[
-        tuple[Literal["speed", "accuracy", "recall", "motion", "false_positives", "pose", "all"], ...],
+        tuple[
+            Literal["speed", "accuracy", "recall", "motion", "false_positives", "pose", "cameras", "all"], ...
+        ],
         tyro.conf.Positional,
     ] = ("all",)
     """The parts to measure."""

@@ -60,7 +60,7 @@ def paste(
     h, w = image.shape
     out = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), float)
     for card in cards:
-        sight = _sight(card, (w, h), focal)
+        sight = sight_of(card, (w, h), focal)
         box = _bound(sight, blur)
         light, cover = _layers(replace(sight, blur=blur, dark=dark, bright=bright), box)
         part = out[box[1] : box[3], box[0] : box[2]]
@@ -68,7 +68,7 @@ def paste(
     return out
 
 
-def _sight(card: Card, size: tuple[int, int], focal: float) -> Sight:
+def sight_of(card: Card, size: tuple[int, int], focal: float = F) -> Sight:
     """A card in an image of size (w, h)."""
     w, h = size
     lens = Lens(width=w, height=h, fx=focal, fy=focal, cx=(w - 1) / 2, cy=(h - 1) / 2)

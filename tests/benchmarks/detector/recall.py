@@ -78,13 +78,14 @@ def occluded(share: float, from_rim: bool) -> Picture:
         shown = show(lambda: float(rng.uniform(20, 44)), float(rng.uniform(0, 40)), 30, rng)
         image = paste(ground("clutter", rng), shown)
         for card in shown:
-            _occlude(image, card, share, 1.0 if from_rim else rng.uniform(-1, 1), rng)
+            occlude(image, card, share, 1.0 if from_rim else rng.uniform(-1, 1), rng)
         return expose(image, NOISE, rng), shown
 
     return picture
 
 
-def _occlude(image: Array, card: Card, share: float, place: float, rng: np.random.Generator) -> None:
+def occlude(image: Array, card: Card, share: float, place: float, rng: np.random.Generator) -> None:
+    """Draw a bar of random level and direction across a card; `place` from -1 to 1 is its position."""
     turn, level = rng.uniform(0, np.pi), float(rng.uniform(0, 255))
     reach = int(0.8 * card.diameter)
     x0, y0 = (int(c) - reach for c in card.uv)

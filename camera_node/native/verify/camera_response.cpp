@@ -1,0 +1,141 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "verify/camera_response.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+namespace roundel {
+
+namespace {
+
+constexpr double kPrintSigma = 0.002;             // of a print's ratio
+constexpr double kMinDiameter = 12;               // pixels: ratio and blur of smaller roundels are correlated
+constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
+constexpr double kMaxCurvature = 1.4;             // of a tone curve between ink and paper
+constexpr double kMaxLogExponent = 1.2;           // 3.3
+constexpr int kHalvings = 16;                     // of the interval of exponents
+constexpr double kMinTone = 0.1;                  // logarithm of an exponent: smaller ones count as linear
+constexpr double kMaxLinear = 0.1;      // logarithm, up to which a measurement is exact to a hundredth
+constexpr double kMinChange = 0.02;     // of the logarithm
+constexpr double kMaxSigma = 0.15;      // of the logarithm, from which it is used
+constexpr double kFirstShading = 2e-4;  // per pixel: a tenth across half of a picture
+constexpr double kLeastShading = 2e-5;
+constexpr double kMaxShadingSigma = 2e-3;  // of one measurement
+constexpr size_t kMaxMeasured = 8;         // roundels of a frame
+constexpr double kMemory = 0.2;            // weight of a new frame
+
+/// Edge displacement in blurs for each unit of curvature: with s = Phi(x), the least squares fit of the shift
+/// of an edge to s (1 - s), which is the integral of s (1 - s) ds over that of phi(x)^2 dx.
+const double kShift = (1 / 6.0) / (0.5 / std::sqrt(std::numbers::pi));
+
+/// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
+/// mean of both; levels of 255.
+double log_exponent_of(double dark, double bright, double middle) {
+    const double d = std::log(std::max(dark, kDarkest) / 255), b = std::log(bright / 255),
+                 m = std::log((dark + middle * (bright - dark)) / 255);
+    double low = -kMaxLogExponent, high = kMaxLogExponent;
+    for (int k = 0; k < kHalvings; ++k) {
+        const double log_g = (low + high) / 2, g = std::exp(log_g);
+        const bool too_bright = 2 * std::exp(g * m) > std::exp(g * d) + std::exp(g * b);
+        (too_bright ? low : high) = log_g;
+    }
+    return (low + high) / 2;
+}
+
+template <typename T, typename Key>
+T& median_by(std::vector<T>& values, const Key& key) {
+    const auto middle = values.begin() + ptrdiff_t(values.size() / 2);
+    std::nth_element(values.begin(), middle, values.end(),
+                     [&](const T& a, const T& b) { return key(a) < key(b); });
+    return *middle;
+}
+
+}  // namespace
+
+CameraResponse::CameraResponse() : shading_(square(kFirstShading)) { set_exponent(0); }
+
+double CameraResponse::exponent() const { return std::exp(log_exponent_); }
+
+ImageView CameraResponse::linearize(const ImageView& image) {
+    if (log_exponent_ == 0) return image;
+    buffer_.resize(size_t(image.width) * size_t(image.height));
+    uint8_t* to = buffer_.data();
+    for (int y = 0; y < image.height; ++y, to += image.width)
+        std::transform(image.row(y), image.row(y) + image.width, to,
+                       [&](uint8_t level) { return linear_[level]; });
+    return {buffer_.data(), image.width, image.height, image.width};
+}
+
+bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits) {
+    learn_edge_noise(fits), learn_shading(fits);
+    std::vector<ToneEstimate> measured;
+    const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
+    for (size_t k = 0; k < fits.size(); k += step)
+        if (const auto estimate = measure(*fits[k], limits)) measured.push_back(*estimate);
+    return !measured.empty() && learn_tone(std::move(measured));
+}
+
+/// What the difference between the measured ratio and the print's says about the tone curve. A curve that
+/// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
+std::optional<CameraResponse::ToneEstimate> CameraResponse::measure(const RoundelFit& fit,
+                                                                    const RoundelLimits& limits) const {
+    if (fit.outer.major < kMinDiameter || fit.dark < kDarkest || fit.bright > kBrightest) return std::nullopt;
+    const double print = nearest_ratio(limits.inner_ratios, fit.ratio);
+    const double radius = std::sqrt(fit.outer.major * fit.outer.minor) / 2;
+    const double by_ratio = radius / ((1 + print) * fit.blur * kShift);
+    const double curvature = (fit.ratio - print) * by_ratio;
+    const double sigma = std::hypot(fit.ratio_sigma, kPrintSigma) * by_ratio;
+    if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
+    const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
+    const double here = exponent(curvature);
+    return ToneEstimate{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)};
+}
+
+void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
+    if (fits.empty()) return;
+    std::vector<double> residuals;
+    for (const RoundelFit* fit : fits) residuals.push_back(fit->edge_residual);
+    const double median = median_by(residuals, [](double residual) { return residual; });
+    edge_noise_ = edge_noise_ > 0 ? edge_noise_ + kMemory * (median - edge_noise_) : median;
+}
+
+/// The measured gradients contain the noise of their measurement. The squared length of a gradient with
+/// independent components has the median 2 ln 2 variances.
+void CameraResponse::learn_shading(const std::vector<const RoundelFit*>& fits) {
+    std::vector<double> excess;
+    for (const RoundelFit* fit : fits)
+        if (fit->shading.variance > 0 && fit->shading.variance < square(kMaxShadingSigma))
+            excess.push_back(fit->shading.squared / (2 * std::numbers::ln2) - fit->shading.variance);
+    if (excess.empty()) return;
+    const double variance = median_by(excess, [](double value) { return value; });
+    const double gain = knows_shading_ ? kMemory : 1;
+    shading_ += gain * (std::max(variance, square(kLeastShading)) - shading_), knows_shading_ = true;
+}
+
+/// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
+/// are as certain as the best roundel.
+bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
+    const double middle =
+        median_by(measured, [](const ToneEstimate& e) { return e.log_exponent; }).log_exponent;
+    const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
+                             return a.sigma < b.sigma;
+                         })->sigma;
+    const double gain = sigma_ == 0 ? 1 : kMemory;
+    mean_ += gain * (middle - mean_), sigma_ += gain * (sigma - sigma_);
+    const double change = std::abs(mean_ - log_exponent_);
+    const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
+    if (sigma_ > kMaxSigma || change < enough) return false;
+    edge_noise_ = 0;
+    if (change > kMaxLinear) sigma_ = 0;  // the next frame measures the rest: this one was not linear
+    set_exponent(std::abs(mean_) < kMinTone / 2 ? 0 : std::clamp(mean_, -kMaxLogExponent, kMaxLogExponent));
+    return true;
+}
+
+void CameraResponse::set_exponent(double log_exponent) {
+    log_exponent_ = log_exponent;
+    for (int level = 0; level < 256; ++level)
+        linear_[size_t(level)] = uint8_t(std::lround(255 * std::pow(level / 255.0, exponent())));
+}
+
+}  // namespace roundel

@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "fit/photometric_fit.hpp"
+#include "fit/roundel_limits.hpp"
+#include "numeric/image.hpp"
+
+namespace roundel {
+
+/// A camera's response, learned from the roundels that it sees: its tone curve, as the exponent that makes
+/// levels proportional to light, and the residuals that its processing leaves at edges
+/// (docs/detector_model.md, section 3).
+class CameraResponse {
+  public:
+    CameraResponse();
+    /// The image with levels in proportion to light: itself if the curve counts as linear, otherwise a copy
+    /// that is valid until the next call.
+    ImageView linearize(const ImageView& image);
+    /// Learns from fits without occlusion to a linearized image. The caller must discard models of earlier
+    /// frames if this returns true: the tone curve changed.
+    bool learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
+    /// 1 for a linear camera, 2.2 for a usual tone curve.
+    double exponent() const;
+    /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
+    double edge_noise() const { return edge_noise_; }
+    /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
+    double shading_sigma() const { return std::sqrt(shading_); }
+
+  private:
+    /// The logarithm of an exponent and its standard deviation.
+    struct ToneEstimate {
+        double log_exponent, sigma;
+    };
+    std::optional<ToneEstimate> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
+    void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
+    void learn_shading(const std::vector<const RoundelFit*>& fits);
+    bool learn_tone(std::vector<ToneEstimate> measured);
+    void set_exponent(double log_exponent);
+
+    double log_exponent_ = 0;  // in use
+    double mean_ = 0;          // of the measured ones
+    double sigma_ = 0;         // of the mean; 0 before the first measurement
+    double edge_noise_ = 0;
+    double shading_;  // variance
+    bool knows_shading_ = false;
+    std::array<uint8_t, 256> linear_;
+    std::vector<uint8_t> buffer_;
+};
+
+}  // namespace roundel
