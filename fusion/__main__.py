@@ -15,6 +15,8 @@ COMMANDS = (
     "replay",
     "record",
     "repair",
+    "health",
+    "doctor",
     "define",
     "robots",
     "undo",

@@ -25,6 +25,8 @@ LIVE_FILES = (
     "test_lab.py",
     "test_services.py",
     "test_faults.py",
+    "test_exact_replay.py",
+    "test_health.py",
     "test_record.py",
     "test_publish.py",
 )

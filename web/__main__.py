@@ -27,8 +27,10 @@ class Options:
         connect: Zenoh endpoints of the server.
         arena: Name of the arena, as in the server's configuration.
         zenoh: A Zenoh configuration (JSON5) for TLS, access control or scouting.
-        host: Address of the page; 0.0.0.0 makes it available to the whole network.
+        host: Address of the page; 0.0.0.0 makes it available to the whole network, with tokens in its addresses.
         port: Port of the page.
+        tokens: A file with the page's tokens, created if it does not exist; without it they change at each start.
+        origin: Origins of reverse proxies in front of the page, such as https://lab.example.org.
         headless: Print one line per second instead of serving a page.
         seconds: End after this time; in the demo, this long after the calibration.
         demo: Run a simulated arena: calibrate it with a wand, track its robots and show it.
@@ -44,6 +46,8 @@ class Options:
     zenoh: Path | None = None
     host: str = "127.0.0.1"
     port: int = 8080
+    tokens: Path | None = None
+    origin: tuple[str, ...] = ()
     headless: bool = False
     seconds: float | None = None
     demo: bool = False
@@ -85,6 +89,7 @@ def _show(
         return
     from web.controls import LiveControls, ReplayControls
     from web.marker_picker import MarkerPicker
+    from web.page_access import PageAccess
     from web.view import View
     from web.wand_calibration import CalibrationFiles, WandSessionPanel
 
@@ -92,7 +97,8 @@ def _show(
     if files is not None:
         files.check()
     with contextlib.ExitStack() as stack:
-        view = View(feed, options.host, options.port)
+        access = PageAccess.create(options.host, options.port, options.tokens, options.origin)
+        view = View(feed, access)
         stack.callback(view.close)
         if isinstance(source, RecordingPlayer):
             view.add(ReplayControls(view.server, source))
@@ -101,7 +107,7 @@ def _show(
                 stack.callback(WandSessionPanel(view.server, source, files).close)
             view.add(LiveControls(view.server, source))
             view.add(MarkerPicker(view.server, source))
-        print(f"open {view.url} in a browser; Ctrl-C ends", flush=True)
+        print(*access.instructions(options.tokens), sep="\n", flush=True)
         view.run(stop)
 
 

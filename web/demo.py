@@ -28,6 +28,7 @@ from web.demo_progress import (
 )
 from web.demo_server import RunningServer, start_server
 from web.feed import Feed
+from web.page_access import PageAccess, is_loopback
 from web.processes import Processes, ProgramFailed, interrupt_on_signals
 from web.score import PoseScore, summarize
 from web.subscription import Subscription
@@ -131,8 +132,7 @@ class Demo:
             epoch = ["--epoch-ns", str(self.clock.epoch_ns)]
             start(name, "camera_node", [*source, "--name", name, *epoch, *connect])
         if page is not None:
-            start("web", "web", [*connect, "--host", page[0], "--port", str(page[1])])
-            print(f"open http://{page[0]}:{page[1]} in a browser to watch; Ctrl-C ends", flush=True)
+            self._start_page(*page, connect)
         print(f"Zenoh endpoint of arena '{ARENA}': {self.endpoint}", flush=True)
         intrinsics = {name: Camera(**entry) for name, entry in self.scene.rig_entries().items()}
         save_rig(Rig(cameras=intrinsics), folder / "intrinsics.yaml")
@@ -140,6 +140,14 @@ class Demo:
         duration = ["--seconds", str(self.delay_s + self.scene.wave_s)]
         rigs = ["--rig", str(folder / "intrinsics.yaml"), "--out", str(folder / "rig.yaml")]
         start("calib", "calib", [*wand, *duration, *rigs, *connect])
+
+    def _start_page(self, host: str, port: int, connect: list[str]) -> None:
+        """Start the viewer, with tokens that this process can print if other machines may open the page."""
+        tokens = None if is_loopback(host) else self.processes.folder / "page_tokens.yaml"
+        access = PageAccess.create(host, port, tokens)
+        options = ["--tokens", str(tokens)] if tokens else []
+        self.processes.start("web", "web", [*connect, "--host", host, "--port", str(port), *options])
+        print(*access.instructions(), sep="\n", flush=True)
 
     def _wait_for_calibration(self) -> None:
         """Report the wand session until `calib` has calibrated the cameras."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.rig.camera import Camera
 from camera_node.geometry.pose import wxyz_from_rotation
-from web.feed import MAX_DISTANCE_M, ArenaState
+from web.feed import ArenaState
 from web.tables import robot_state
 from web.trails import Trails, fade
 
@@ -75,11 +75,10 @@ class MarkerCloud:
         timed = state.markers
         recent = timed is not None and state.age_s(timed) < MARKERS_S
         points = timed.message.positions() if timed is not None and recent else np.empty((0, 3))
-        valid = (np.abs(points) < MAX_DISTANCE_M).all(axis=1)  # false for NaN
-        self._cloud.visible = bool(valid.any())
-        if timed is not None and valid.any():
-            labeled = timed.message.robot_index()[valid] >= 0
-            self._cloud.points = points[valid].astype(np.float32)
+        self._cloud.visible = len(points) > 0
+        if timed is not None and len(points):
+            labeled = timed.message.robot_index() >= 0
+            self._cloud.points = points.astype(np.float32)
             self._cloud.colors = np.where(labeled[:, None], LABELED, UNLABELED).astype(np.uint8)
 
 

@@ -20,7 +20,6 @@ from web.messages import DemoProgress, progress_key
 
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
-MAX_DISTANCE_M = 1e5  # the feed rejects positions beyond it, and the page does not draw them
 
 
 @dataclass(frozen=True)
@@ -129,8 +128,6 @@ class Feed:
         return lambda message, key: setattr(self._state, name, TimedMessage(message, self._clock()))
 
     def _store_pose(self, pose: RobotPose, key: str) -> None:
-        if max(map(abs, pose.position)) > MAX_DISTANCE_M:
-            raise MessageError("a position outside of any arena")
         self._store_named(self._state.poses, pose.robot, pose, key)
         if self._on_pose is not None:
             self._on_pose(pose)

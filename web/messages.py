@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The Zenoh message of the demo: its progress and the true positions of what it simulates."""
 
-import math
-
 import msgspec
 
 from camera_node.protocol.messages import VERSION, MessageError
+from fusion.protocol.messages import MAX_NUMBER
 
 Vector = tuple[float, float, float]
 
@@ -24,10 +23,10 @@ class DemoProgress(msgspec.Struct, frozen=True, kw_only=True):
     true_points: dict[str, tuple[Vector, ...]] = {}
 
     def check(self) -> None:
-        """Raise MessageError unless `share` is within 0 to 1 and all coordinates are finite."""
+        """Raise MessageError unless `share` is within 0 to 1 and all coordinates are in range."""
         coordinates = (x for points in self.true_points.values() for point in points for x in point)
-        if not (0.0 <= self.share <= 1.0 and all(map(math.isfinite, coordinates))):
-            raise MessageError("a share outside 0 to 1, or a true position that is not finite")
+        if not (0.0 <= self.share <= 1.0 and all(abs(x) <= MAX_NUMBER for x in coordinates)):
+            raise MessageError("a share outside 0 to 1, or a true position out of range")
 
 
 def progress_key(arena: str) -> str:

@@ -16,6 +16,7 @@ from camera_node.service import ServiceManager
 from web.drawing import MarkerCloud, RobotDrawing, TruePoints, add_lights, draw_camera
 from web.errors import PortError, WebError
 from web.feed import ArenaState, Feed
+from web.page_access import PageAccess, current_role, guarding
 from web.panel import Panel
 
 PERIOD_S = 1 / 30
@@ -25,6 +26,7 @@ FIELD_OF_VIEW = math.radians(42)
 DISTANCE = 2.3  # of the initial viewpoint, in radii of the rig
 MIN_RADIUS_M = 1.5
 DIRECTION = np.array([-0.45, 0.78, -0.43])  # in which the initial view looks
+READ_ONLY = "**Read only**: the controls have no effect. Open the operator's address to change anything."
 PANEL_SHIFT = 0.11  # of the initial view to the right, in distances: the panel covers the right of the page
 
 
@@ -38,15 +40,19 @@ class PanelSection(Protocol):
 class View:
     """The page that browsers show. `update` draws once; `run` draws until it is stopped."""
 
-    def __init__(self, feed: Feed, host: str = "127.0.0.1", port: int = 8080) -> None:
-        """Serve the page.
+    def __init__(self, feed: Feed, access: PageAccess) -> None:
+        """Serve the page at the address of `access`, to the visitors whom it admits.
 
         Raises:
             WebError: the port is not available.
         """
-        check_port(host, port)
-        self.feed = feed
-        self.server = viser.ViserServer(host=host, port=port, label="Roundel", verbose=False)
+        check_port(access.host, access.port)
+        self.feed, self.access = feed, access
+        with guarding(access):
+            self.server = viser.ViserServer(
+                host=access.host, port=access.port, label="Roundel", verbose=False
+            )
+        self.server.on_client_connect(_describe_role)
         self.server.gui.configure_theme(
             dark_mode=True, control_width="large", show_logo=False, show_share_button=False
         )
@@ -62,16 +68,11 @@ class View:
         self.server.initial_camera.fov = FIELD_OF_VIEW
         self.reset_view()
 
-    @property
-    def url(self) -> str:
-        """The page's address."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
     def run(self, stop: threading.Event) -> None:
         """Draw until `stop` is set; late drawings are skipped. Each drawing is progress of the service."""
         with ServiceManager() as service:
             service.ready()
-            service.report(f"the page is at {self.url}")
+            service.report(f"the page is at {self.access.address}")
             self._draw_until(stop, service)
 
     def _draw_until(self, stop: threading.Event, service: ServiceManager) -> None:
@@ -123,6 +124,12 @@ class View:
             self._cameras += draw_camera(self.server.scene, name, camera)
         if first:
             self.reset_view()
+
+
+async def _describe_role(client: viser.ClientHandle) -> None:
+    """Show a viewer why the controls do nothing. Viser runs it in the context of the browser's connection."""
+    if current_role.get() == "viewer":
+        client.gui.add_markdown(READ_ONLY, order=-1)
 
 
 def _add_floor(scene: viser.SceneApi) -> None:

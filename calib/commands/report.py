@@ -9,7 +9,7 @@ from rich.text import Text
 
 from calib.live.wand_session import SessionProgress
 from calib.wand.quality.grade import RigQuality
-from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes, find_misfit
+from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
 from calib.wand.result import WandCalibration, WandReport
 from camera_node.terminal import console, say
@@ -23,13 +23,11 @@ def print_report(result: WandCalibration, quality: RigQuality) -> None:
     """Print a table of the cameras, then remarks and advice; the grade comes last."""
     console().print(camera_table(result, quality))
     lenses = describe_lens_changes(find_lens_changes(result.names, result.adjusted))
-    misfit = find_misfit(result.names, result.adjusted, result.observations)
     for line in [
         *_remarks(result.report),
         *_drifts(result),
         *([f"warning: camera {result.jump.camera}: {result.jump.sentence()}"] if result.jump else []),
         *lenses,
-        *([misfit.sentence()] if misfit else []),
         *(quality.expected.lines() if quality.expected else []),
         *(f"{camera.name}: {camera.wave_next}" for camera in quality.cameras if camera.wave_next),
         *quality.lens_warnings(),

@@ -13,11 +13,10 @@ from camera_node.geometry.pose import Pose, invert, skew
 AnyLens = TypeVar("AnyLens", bound=Lens)
 
 # The parameters of one camera, by their columns in every Jacobian and covariance: rotation and translation in the
-# camera's own frame, time offset, clock drift, and log focal length, cx, cy, k1 of the lens.
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), (8, 9, 10, 11)
-PER_CAMERA = 12
-# The shape of the lens is never adjusted, only tested: log fx / fy, and the three distortion coefficients after k1.
-SHAPE = (12, 13, 14, 15)
+# camera's own frame, time offset, clock drift, and of the lens: log focal length (mean of fx and fy), cx, cy, k1,
+# log fx / fy, and the three distortion coefficients after k1.
+POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), tuple(range(8, 16))
+PER_CAMERA = 16
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -78,8 +77,7 @@ def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array,
         J_point: (N, 2, 3) by the point, in the camera's frame.
         J_pose: (N, 2, 6) by a rotation w and a translation t of the camera in its own frame, which move points in
             that frame by p x w - t.
-        J_lens: (N, 2, 8) by log focal length, cx, cy and k1 (`LENS`), then by log fx / fy and the three distortion
-            coefficients after k1 (`SHAPE`).
+        J_lens: (N, 2, 8) by the parameters of the lens (`LENS`).
         All are NaN for points that are not in front of the camera.
     """
     lens, points = with_distortion(lens), np.asarray(points, float).reshape(-1, 3)
@@ -93,3 +91,10 @@ def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array,
 def with_distortion(lens: AnyLens) -> AnyLens:
     """The same lens with explicit distortion coefficients: four zeros where it has none."""
     return lens if lens.distortion else lens.with_parameters([*lens.parameters, 0.0, 0.0, 0.0, 0.0])
+
+
+def lens_parameters(lens: Lens) -> Array:
+    """(8,) the parameters of a lens that `LENS` numbers."""
+    distortion = with_distortion(lens).distortion
+    focal, ratio = np.log(lens.fx * lens.fy) / 2, np.log(lens.fx / lens.fy)
+    return np.array([focal, lens.cx, lens.cy, distortion[0], ratio, *distortion[1:4]])

@@ -7,6 +7,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from calib.wand.conclusion import Placement, conclude
 from calib.wand.detections import count_frames
 from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
 from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
-from calib.wand.initialization.two_view import MIN_FRAME_SETS, TwoViewGeometry
+from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO, TwoViewGeometry
 from calib.wand.labeling import WandRecording
 from calib.wand.quality.checks import check_motion
 from calib.wand.result import NOT_RECORDED, WandCalibration
@@ -49,7 +50,7 @@ def calibrate(
         the rig with poses and time offsets of all cameras that could be placed, and the report.
 
     Raises:
-        CalibrationError: the recording or the wand does not place two cameras, or no majority of the cameras agrees.
+        CalibrationError: the recording or the wand does not place two cameras, or most cameras contradict each other.
     """
     check_recording(rig, messages)
     if distance is not None:
@@ -119,8 +120,9 @@ def _solve_majority(
         except CameraFault as fault:
             excluded.add(fault)
             if len(start.placed) - len(fault.reasons) <= len(excluded.reasons):
-                message = f"no majority of the cameras agrees: {CameraFault(excluded.reasons)}"
-                raise CalibrationError(message) from None
+                raise CalibrationError(
+                    explain_disagreement(recording.names, pairs, excluded.reasons)
+                ) from None
 
 
 def _place(
@@ -153,6 +155,20 @@ def _place(
         metric=start.metric,
         scaled_by=distance if by_distance else None,
         compared_with=None if by_distance else distance,
+    )
+
+
+def explain_disagreement(names: Sequence[str], pairs: TwoViewGeometry, reasons: dict[str, str]) -> str:
+    """State which pairs of cameras agree by themselves, and what would reconcile the others."""
+    agreeing = []
+    for a, b in combinations(range(len(names)), 2):
+        pair = pairs.relate(a, b)
+        if pair is not None and pair.inlier_ratio >= MIN_INLIER_RATIO:
+            agreeing.append(f"'{names[a]}' and '{names[b]}' ({pair.inlier_ratio:.0%} of their detections)")
+    which = ", ".join(agreeing) if agreeing else "none"
+    return (
+        f"half of the cameras or more contradict each other: {CameraFault(reasons)}. Pairs that agree "
+        f"by themselves: {which}. Record again with cameras and clocks that nothing moves, or leave cameras out"
     )
 
 

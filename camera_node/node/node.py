@@ -26,6 +26,7 @@ from camera_node.protocol.requests import (
     parse_request,
     payload_of,
     respond,
+    sender_of,
 )
 from camera_node.protocol.session import ServerWatch
 from camera_node.service import ServiceManager
@@ -197,4 +198,9 @@ class Node:
             if payload:
                 wanted = parse_request(payload, Settings)
                 self._detector = apply_settings(wanted, self._source, self._detector)
+                log.info(
+                    "settings changed by a session that claims to be %s: %s",
+                    sender_of(query) or "nobody",
+                    wanted,
+                )
             return encode_reply(payload, read_settings(self._source, self._detector))

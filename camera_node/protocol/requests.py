@@ -2,6 +2,7 @@
 """Parses the requests in Zenoh queries and sends the replies. An invalid request gets an error reply of one line."""
 
 import logging
+import re
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -22,6 +23,17 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 class RequestError(RoundelError):
     """An invalid request; the message goes to its sender."""
+
+
+def sender(session: zenoh.Session) -> bytes:
+    """The attachment of a request: the id of the session that sends it, for the receiver's audit."""
+    return str(session.info.zid()).encode()
+
+
+def sender_of(query: zenoh.Query) -> str:
+    """The id of the session that a request claims to come from; empty where it claims none."""
+    attachment = query.attachment.to_bytes() if query.attachment else b""
+    return attachment.decode() if re.fullmatch(rb"[0-9a-f]{1,32}", attachment) else ""
 
 
 def payload_of(query: zenoh.Query) -> bytes:

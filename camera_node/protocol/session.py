@@ -18,9 +18,16 @@ REPORT_S = 5.0  # timeout of the query for a router's endpoints
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
+OVER = b"Timeout"  # Zenoh's own error reply
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
+ALWAYS = {
+    "mode": "router",
+    "transport/link/tx/lease": LEASE_MS,
+    # It maps 16 MB for each program that sends, bypasses access rights of the network, and a killed program leaves it.
+    "transport/shared_memory/enabled": False,
+}
 SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
 
 
@@ -113,10 +120,13 @@ def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:
 def reply_of_server(session: zenoh.Session, replies: Iterable[zenoh.Reply]) -> zenoh.Reply | None:
     """The first reply of a router that this session is connected to; if there is none, the first reply.
 
+    Zenoh's error reply when the time is over is no reply.
     The query needs `consolidation=zenoh.ConsolidationMode.NONE`: otherwise Zenoh drops all replies but one.
     """
     first = None
     for reply in replies:
+        if reply.err is not None and reply.err.payload.to_bytes() == OVER:
+            continue
         if is_from_router(session, reply):
             return reply
         first = first or reply
@@ -134,7 +144,7 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
             config.insert_json5(key, "false")
     if config.get_json("scouting/delay") == "null":
         config.insert_json5("scouting/delay", "0")  # otherwise opening waits for scouting
-    for key, value in {"mode": "router", "transport/link/tx/lease": LEASE_MS, **options}.items():
+    for key, value in {**ALWAYS, **options}.items():
         config.insert_json5(key, json.dumps(value))
     return config
 

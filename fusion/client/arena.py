@@ -22,7 +22,7 @@ import zenoh
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
-from camera_node.protocol.messages import Keys, MessageError, decode
+from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, RobotsRequest
@@ -242,6 +242,10 @@ class Arena:
     def status(self, timeout_s: float | None = TIMEOUT_S) -> Stream[FusionStatus]:
         """The server's status, once a second."""
         return self._stream(self.keys.fusion_status, FusionStatus, "status", timeout_s)
+
+    def camera_statuses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[CameraStatus]:
+        """The status of each camera, once a second."""
+        return self._stream(self.keys.camera_status(), CameraStatus, "camera status", timeout_s)
 
     def rig(self, timeout_s: float = TIMEOUT_S) -> Rig | None:
         """The active calibration, or None if the server has none.

@@ -4,10 +4,12 @@
 from pathlib import Path
 
 from camera_node.terminal import say, track
+from fusion.model.limits import Limits
+from fusion.recordings.frame_sets import recorded_frame_sets
 from fusion.recordings.record import read_recording
 from fusion.recordings.replay import cameras_of, robots_of, write_recording
 from fusion.recordings.report import Summary, write_poses
-from fusion.recordings.run import OfflineArena, fuse_recording
+from fusion.recordings.run import OfflineArena, fuse_frame_sets, fuse_recording
 
 
 def replay(
@@ -20,7 +22,9 @@ def replay(
     rate_hz: float | None = None,
     smooth: bool = False,
 ) -> int:
-    """Fuse a recording (MCAP) again, by the code that runs live, each message at its time of arrival.
+    """Fuse a recording (MCAP) again, by the code that runs live: the poses are those of the server, byte for byte.
+
+    With another rig or rate, and in recordings without a server, frame sets are formed anew from the times of arrival.
 
     Args:
         recording: the MCAP file.
@@ -32,9 +36,14 @@ def replay(
     """
     recorded = read_recording(recording)
     cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
-    arena = OfflineArena(cameras, declared, rate_hz, smooth=smooth)
+    arena = OfflineArena(cameras, declared, rate_hz, recorded.limits or Limits(), smooth)
     summary = Summary(faults=recorded.faults)
-    fused = track(fuse_recording(recorded.detections, arena, summary), "fusing")
+    is_as_live = recorded.frame_sets and rig is None and rate_hz is None
+    if is_as_live:
+        results = fuse_frame_sets(recorded_frame_sets(recorded, cameras, summary.faults), arena, summary)
+    else:
+        results = fuse_recording(recorded.detections, arena, summary)
+    fused = track(results, "fusing")
     if out.suffix == ".mcap":
         write_recording(recording, out, fused)
     else:

@@ -13,9 +13,10 @@ from camera_node.config import write_atomically
 class Serve:
     """Fuse what an arena's cameras publish into robot poses, until stopped; this is the arena's Zenoh router.
 
-    Other commands, python -m fusion NAME --help: run, record and replay are for recordings; define measures a
-    new robot in the arena; robots lists, renames, removes and saves them; undo undoes the recalibration of a
-    moved camera; ros2 publishes the robots to ROS 2.
+    Other commands, python -m fusion NAME --help: health and doctor report on a running arena and say what to do;
+    run, record, replay and repair are for recordings; define measures a new robot in the arena; robots lists,
+    renames, removes and saves them; undo undoes the recalibration of a moved camera; ros2 publishes the robots to
+    ROS 2.
     """
 
     config: Path | None = None

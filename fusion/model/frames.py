@@ -20,8 +20,10 @@ class CalibratedFrame:
         t_ns: capture time including the calibrated offset of the camera.
         xy: (2, N) undistorted centres; NaN where the lens has no inverse.
         scale: (2, 2, N) Jacobians of raw pixels with respect to `xy`.
+        stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
         exposure_us, detect_us: durations; 0 where unknown.
+        clock_sigma_s: standard deviation of `t_ns` by the clock.
     """
 
     camera: str
@@ -29,10 +31,12 @@ class CalibratedFrame:
     roundels: Roundels
     xy: Array
     scale: Array
+    stamp_ns: int = 0
     sent_ns: int = 0
     received_ns: int = 0
     exposure_us: float = 0.0
     detect_us: float = 0.0
+    clock_sigma_s: float = 0.0
 
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
@@ -42,6 +46,7 @@ class CalibratedFrame:
             message.t_ns + round(camera.time_offset_ms * 1e6),
             message.unpack(),
             camera,
+            stamp_ns=message.t_ns,
             sent_ns=message.sent_ns,
             received_ns=received_ns,
             exposure_us=message.exposure_us,

@@ -1,14 +1,134 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What an arena's status means for an operator: one line, and what needs attention."""
 
-from fusion.protocol.messages import FusionStatus
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+
+from calib.rig.rig import Rig
+from fusion.protocol.messages import CameraHealth, FusionStatus
+
+MAX_CALIBRATION_DAYS = 90
+POOR_GRADES = "CD"
+
+
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of the calibration in force; None where it does not say."""
+
+    placed: int  # cameras with a pose
+    grade: str | None = None
+    age_days: float | None = None
+
+
+class ArenaHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of an arena. `problems` has one line for each thing that needs attention; without any it is healthy."""
+
+    cameras: dict[str, bool]  # whether each sends frames
+    robots: dict[str, str]  # the state of each
+    poses_per_s: float
+    faults: int  # skipped messages and frame sets since the server's start
+    calibration: Calibration
+    problems: tuple[str, ...]
+
+    @property
+    def line(self) -> str:
+        """Cameras, robots, faults and calibration in one line, and the first problem."""
+        tracked = sum(state == "tracked" for state in self.robots.values())
+        parts = [
+            f"{sum(self.cameras.values())} of {len(self.cameras)} cameras",
+            f"{tracked} of {len(self.robots)} robots tracked",
+            f"{self.poses_per_s:.0f} poses/s",
+            f"{self.faults} faults since the start",
+            describe_calibration(self.calibration),
+        ]
+        for problem in self.problems:
+            more = f" (and {len(self.problems) - 1} more)" if len(self.problems) > 1 else ""
+            return f"attention: {problem}{more} | {', '.join(parts)}"
+        return f"healthy: {', '.join(parts)}"
+
+
+def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> ArenaHealth:
+    """The health of an arena by its server's status and the rig in force."""
+    calibration = assess_calibration(rig, now)
+    problems = [
+        f"camera {name}: {p}" for name, health in status.cameras.items() for p in camera_problems(health)
+    ]
+    placed = rig.placed() if rig else {}
+    problems += [f"camera {name}: never sent a frame" for name in placed if name not in status.cameras]
+    problems += [f"robot {name} is {state}" for name, state in status.robots.items() if state != "tracked"]
+    problems += [
+        f"robot {name}: its markers are not where robots.yaml has them ({residual:.1f} px)"
+        for name, residual in status.geometry_residuals_px.items()
+    ]
+    problems += calibration_problems(calibration)
+    return ArenaHealth(
+        cameras={name: False for name in placed} | {name: c.fps > 0 for name, c in status.cameras.items()},
+        robots=dict(status.robots),
+        poses_per_s=status.frame_sets_per_s,
+        faults=sum(status.faults.values()),
+        calibration=calibration,
+        problems=tuple(problems),
+    )
+
+
+def camera_problems(health: CameraHealth) -> list[str]:
+    """What needs attention at one camera."""
+    states = {
+        "sends no frames": health.fps == 0,
+        "is not calibrated": not health.calibrated,
+        "was moved and is excluded": health.excluded,
+        "two nodes use its name": health.duplicate_publisher,
+    }
+    return [problem for problem, holds in states.items() if holds]
+
+
+def assess_calibration(rig: Rig | None, now: datetime) -> Calibration:
+    """The grade and the age that a rig states of itself."""
+    if rig is None:
+        return Calibration(placed=0)
+    grade = rig.calibration.get("grade")
+    return Calibration(
+        placed=len(rig.placed()),
+        grade=grade if isinstance(grade, str) and grade in "ABCD" else None,
+        age_days=_age_days(rig.calibration.get("date"), now),
+    )
+
+
+def describe_calibration(calibration: Calibration) -> str:
+    """Such as "calibration of grade B, 12 days old"."""
+    if not calibration.placed:
+        return "not calibrated"
+    grade = f" of grade {calibration.grade}" if calibration.grade else ""
+    age = "no date recorded" if calibration.age_days is None else f"{calibration.age_days:.0f} days old"
+    return f"calibration{grade}, {age}"
+
+
+def calibration_problems(calibration: Calibration) -> list[str]:
+    """What needs attention at the calibration."""
+    if not calibration.placed:
+        return ["no camera has a pose; run python -m calib wand --live"]
+    problems = []
+    if calibration.grade and calibration.grade in POOR_GRADES:
+        problems.append(f"the calibration has grade {calibration.grade}; repeat it as its report advises")
+    if (calibration.age_days or 0.0) > MAX_CALIBRATION_DAYS:
+        problems.append(f"the calibration is {calibration.age_days:.0f} days old; repeat it")
+    return problems
 
 
 def describe_status(status: FusionStatus) -> str:
-    """The server's cameras, robots and rate in one line."""
+    """The server's cameras, robots and rate in one line, for `systemctl status`."""
     live = sum(camera.fps > 0 for camera in status.cameras.values())
     tracked = sum(state == "tracked" for state in status.robots.values())
     return (
         f"{live} of {len(status.cameras)} cameras, {tracked} of {len(status.robots)} robots tracked, "
         f"{status.frame_sets_per_s:.0f} poses/s, {sum(status.faults.values())} faults"
     )
+
+
+def _age_days(date: Any, now: datetime) -> float | None:
+    try:
+        then = datetime.fromisoformat(str(date))
+    except ValueError:
+        return None
+    return (now - then.replace(tzinfo=then.tzinfo or UTC)).total_seconds() / 86400

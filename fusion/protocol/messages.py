@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index
 from camera_node.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
+from fusion.model.frames import FrameSet
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 
 Vector = tuple[float, float, float]
+MAX_NUMBER = 1e5  # of a coordinate or velocity, in metres, m/s or rad/s
 QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
 
@@ -54,14 +57,14 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     latency: Latency | None = None  # None offline
 
     def check(self) -> None:
-        """Raise MessageError unless numbers are finite, the quaternion has length 1 and the covariance is 12 x 12."""
+        """Raise MessageError unless numbers are in range, the quaternion has length 1 and the covariance is 12 x 12."""
         if not is_name(self.robot):
             raise MessageError("an invalid robot name")
         numbers = (*self.position, *self.quaternion_wxyz, *self.velocity, *self.angular_velocity)
         if not abs(math.hypot(*self.quaternion_wxyz) - 1.0) < QUATERNION_SLACK:
             raise MessageError("the pose's quaternion is not of length 1")
-        if len(self.covariance) != 576 or not all(map(math.isfinite, numbers)):
-            raise MessageError("the pose is not finite, or its covariance is not 12 x 12")
+        if len(self.covariance) != 576 or not all(abs(x) <= MAX_NUMBER for x in numbers):
+            raise MessageError("the pose is out of range, or its covariance is not 12 x 12")
 
     @property
     def covariance_matrix(self) -> Array:
@@ -84,15 +87,14 @@ class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
     covariance: bytes
 
     def check(self) -> None:
-        """Raise MessageError unless the columns' sizes agree, the numbers are finite and quaternions of length 1."""
+        """Raise MessageError unless the columns' sizes agree, the numbers are in range and quaternions of length 1."""
         n = len(self.robots)
         if (len(self.states), len(self.motion), len(self.covariance)) != (n, 104 * n, 576 * n):
             raise MessageError(f"the columns have other sizes than those of {n} robots")
         motion, covariance = self.motions(), np.frombuffer(self.covariance, "<f4")
-        if not (np.isfinite(motion).all() and np.isfinite(covariance).all()):
-            raise MessageError("the poses are not finite")
-        norms = np.linalg.norm(motion[:, 3:7].clip(-2.0, 2.0), axis=1)  # the limits avoid an overflow
-        if not (np.abs(norms - 1.0) < QUATERNION_SLACK).all():
+        if not ((np.abs(motion) <= MAX_NUMBER).all() and np.isfinite(covariance).all()):
+            raise MessageError("the poses are out of range")
+        if not (np.abs(np.linalg.norm(motion[:, 3:7], axis=1) - 1.0) < QUATERNION_SLACK).all():
             raise MessageError("a quaternion is not of length 1")
 
     def motions(self) -> Array:
@@ -131,7 +133,7 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         return len(self.position) // 24
 
     def check(self) -> None:
-        """Raise MessageError unless the columns' sizes agree."""
+        """Raise MessageError unless the columns' sizes agree, and positions and robots are in range."""
         n = len(self)
         sizes = {"position": 24, "covariance": 36, "normal": 12, "robot": 4, "marker": 4, "cameras": 8}
         for name, size in sizes.items():
@@ -140,6 +142,10 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         for name, size in {"velocity": 12, "candidates": 24}.items():
             if len(getattr(self, name)) not in (0, size * n):
                 raise MessageError(f"column {name} has {len(getattr(self, name))} bytes for {n} markers")
+        if not (np.abs(self.positions()) <= MAX_NUMBER).all():  # False for NaN
+            raise MessageError("a position is out of range")
+        if not (self.robot_index() < len(self.robots)).all():
+            raise MessageError("a marker of a robot that the message does not name")
 
     def positions(self) -> Array:
         """(M, 3) positions, world."""
@@ -173,6 +179,45 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         return np.frombuffer(self.cameras, "<u8")
 
 
+class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
+    """The frames of a frame set, so that a replay fuses the same frames as the server did.
+
+    Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
+    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds.
+    """
+
+    version: int = VERSION
+    t_ns: int
+    cameras: tuple[str, ...]
+    stamps: bytes
+    times: bytes
+    clock_sigmas: bytes
+
+    @classmethod
+    def of(cls, frame_set: FrameSet) -> "FusedFrames":
+        """The message of a frame set."""
+        frames = frame_set.frames
+        return cls(
+            t_ns=frame_set.t_ns,
+            cameras=tuple(frame.camera for frame in frames),
+            stamps=np.array([frame.stamp_ns for frame in frames], "<i8").tobytes(),
+            times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
+            clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
+        )
+
+    def check(self) -> None:
+        """Raise MessageError unless the columns' sizes agree."""
+        n = 8 * len(self.cameras)
+        if not len(self.stamps) == len(self.times) == len(self.clock_sigmas) == n:
+            raise MessageError(f"the columns have other sizes than those of {len(self.cameras)} frames")
+
+    def rows(self) -> list[tuple[str, int, int, float]]:
+        """Camera, stamp, capture time (ns) and standard deviation of the clock (s) of each frame."""
+        columns = np.frombuffer(self.stamps, "<i8"), np.frombuffer(self.times, "<i8")
+        sigmas = np.frombuffer(self.clock_sigmas, "<f8").tolist()
+        return list(zip(self.cameras, *(column.tolist() for column in columns), sigmas, strict=True))
+
+
 class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     """The server's figures of one camera over the last second."""
 
@@ -200,6 +245,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     cameras: dict[str, CameraHealth]
     robots: dict[str, TrackingState]
     faults: dict[str, int]
+    limits: Limits | None = None  # with which the server tracks, for a replay
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
     not_acquired: dict[str, str] = {}  # why, by robot
     unsaved_robots: tuple[str, ...] = ()  # names whose changes a restart would undo
@@ -216,6 +262,11 @@ def set_robots_key(arena: str) -> str:
     A key of its own, because access rights cannot tell a query with a payload from one without.
     """
     return f"{arena}/robots/set"
+
+
+def frames_key(arena: str) -> str:
+    """The key on which the server publishes `FusedFrames` for every frame set."""
+    return f"{arena}/fusion/frames"
 
 
 def shard_key(arena: str, index: int | str) -> str:

@@ -9,6 +9,7 @@ from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
+from camera_node.protocol.requests import sender
 from camera_node.protocol.session import reply_of_server
 from fusion.errors import FusionError
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key, undo_key
@@ -68,7 +69,10 @@ def undo_correction(session: zenoh.Session, arena: str, timeout_s: float = REQUE
 def _request(session: zenoh.Session, arena: str, key: str, payload: bytes, timeout_s: float) -> bytes:
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
-        replies = session.get(key, payload=payload, consolidation=zenoh.ConsolidationMode.NONE, timeout=left)
+        every = zenoh.ConsolidationMode.NONE
+        replies = session.get(
+            key, payload=payload, attachment=sender(session), consolidation=every, timeout=left
+        )
         if reply := reply_of_server(session, replies):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()

@@ -21,8 +21,9 @@ from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose, Robots, robots_key
+from fusion.protocol.messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
 from fusion.recordings.rotation import RotatingWriter
 
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
@@ -39,10 +40,12 @@ FIRST_PAUSE_S = 0.1  # the first request may precede the route to the server
 
 @dataclass
 class ArenaRecording:
-    """The content of a recording: detections and when they arrived (ns), published poses, rig and robots."""
+    """The content of a recording: what cameras and server published, and when the detections arrived (ns)."""
 
     detections: list[tuple[int, Detections]] = field(default_factory=list)
     poses: list[RobotPose] = field(default_factory=list)
+    frame_sets: list[FusedFrames] = field(default_factory=list)  # as the server formed them
+    limits: Limits | None = None  # of the server
     rig: Rig | None = None  # the first one
     robots: dict[str, Robot] = field(default_factory=dict)
     faults: Counter[str] = field(default_factory=Counter)
@@ -54,6 +57,10 @@ class ArenaRecording:
                 self.detections.append((received_ns, decode(data, Detections)))
             elif key.endswith("/pose"):
                 self.poses.append(decode(data, RobotPose))
+            elif key.endswith("/fusion/frames"):
+                self.frame_sets.append(decode(data, FusedFrames))
+            elif key.endswith("/fusion/status"):
+                self.limits = decode(data, FusionStatus).limits
             elif key.endswith("/rig") and self.rig is None:
                 self.rig = decode(data, RigMessage).rig()
             elif key.endswith("/robots"):

@@ -58,8 +58,22 @@ def fuse_recording(
     """
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
+    yield from _fuse(_synchronize(messages, arena, summary.faults), tracker, arena, summary)
+
+
+def fuse_frame_sets(
+    frame_sets: Iterable[FrameSet], arena: OfflineArena, summary: Summary | None = None
+) -> Iterator[TrackingResult]:
+    """Fuse frame sets, as those that the server formed; see `fuse_recording`."""
+    tracker = Tracker(arena.cameras, arena.robots, arena.limits)
+    yield from _fuse(frame_sets, tracker, arena, Summary() if summary is None else summary)
+
+
+def _fuse(
+    frame_sets: Iterable[FrameSet], tracker: Tracker, arena: OfflineArena, summary: Summary
+) -> Iterator[TrackingResult]:
     smoother = Smoother(tracker.table.names) if arena.smooth else None
-    for frame_set in _synchronize(messages, arena, summary.faults):
+    for frame_set in frame_sets:
         fused = tracker.track(frame_set)
         summary.add(fused)
         if smoother is None:

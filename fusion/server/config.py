@@ -22,6 +22,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             restart the newer of this file and `rig` is used. Nothing is saved unless given.
         robots: robots.yaml.
         saved_robots: the same for robots that were defined, renamed or removed while the server ran.
+        audit: the file to which a line is appended for every change of rig and robots over the network.
         rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
         shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
@@ -34,6 +35,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     saved_rig: str | None = None
     robots: str = "robots.yaml"
     saved_robots: str | None = None
+    audit: str | None = None
     rate_hz: float | None = None
     limits: Limits = Limits()
     shard: str = "1/1"
@@ -56,7 +58,7 @@ def load_arena(path: Path) -> ArenaConfig:
     config = load_yaml(path, ArenaConfig)
     paths = {
         name: str(path.parent / value)
-        for name in ("rig", "saved_rig", "robots", "saved_robots", "zenoh")
+        for name in ("rig", "saved_rig", "robots", "saved_robots", "audit", "zenoh")
         if (value := getattr(config, name))
     }
     return override(config, **paths)

@@ -74,12 +74,9 @@ class Ingest:
             return self._refuse("wrong image size", name)
         if not self._is_new(message):
             return self._refuse("duplicate frame", name)
-        frame = CalibratedFrame.of(message, camera, received_ns)
-        frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
-        if len(frame.roundels) > MAX_DETECTIONS:
+        if len(message) > MAX_DETECTIONS:
             self._statistics.count_fault("frames with too many roundels", name)
-            return _with_strongest(frame)
-        return frame
+        return sanitized(CalibratedFrame.of(message, camera, received_ns))
 
     def _decode(self, data: bytes, key: str, received_ns: int) -> Detections | None:
         """The message, if its content, its camera and its time are possible."""
@@ -121,6 +118,12 @@ class Ingest:
         has_two_publishers = sum(history.steps_back) >= MIN_STEPS_BACK
         self._statistics.note_publishers(message.camera, has_two_publishers)
         return True
+
+
+def sanitized(frame: CalibratedFrame) -> CalibratedFrame:
+    """The frame with the parts that are used: plausible outlines, and at most `MAX_DETECTIONS` detections."""
+    frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+    return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
 
 
 def _with_plausible_outlines(roundels: Roundels) -> Roundels:

@@ -7,7 +7,17 @@ import msgspec
 
 from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys
-from fusion.protocol.messages import FusionStatus, Latency, Markers, RobotPose, ShardPoses, shard_key
+from fusion.model.frames import FrameSet
+from fusion.protocol.messages import (
+    FusedFrames,
+    FusionStatus,
+    Latency,
+    Markers,
+    RobotPose,
+    ShardPoses,
+    frames_key,
+    shard_key,
+)
 from fusion.protocol.shards import Shard
 from fusion.server.transport import Transport
 
@@ -36,6 +46,11 @@ class ArenaPublisher:
     def publish_shard(self, poses: ShardPoses) -> None:
         """Publish this shard's robots for the other shards."""
         self._transport.publish(self._shard_key, poses)
+
+    def publish_frames(self, frame_set: FrameSet) -> None:
+        """Publish which frames were fused in a frame set."""
+        if self._shard.leads:
+            self._transport.publish(frames_key(self._keys.arena), FusedFrames.of(frame_set))
 
     def publish_markers(self, markers: Markers) -> None:
         """Publish all markers of a frame set."""

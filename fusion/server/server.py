@@ -34,6 +34,7 @@ from fusion.protocol.messages import (
     undo_key,
 )
 from fusion.protocol.shards import Shard
+from fusion.server.audit import AuditLog
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
@@ -121,15 +122,20 @@ class Server:
         transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
         transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
-        transport.answer_on_server_thread(set_robots_key(keys.arena), self._change_robots)
         transport.watch_token(keys.wand, self.pipeline.pause_acquisition)
+        audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
+        transport.answer_on_server_thread(
+            set_robots_key(keys.arena), audit.audited("change of robots", self._change_robots)
+        )
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
         if isinstance(self.clock, ServerClock):
             transport.answer(keys.clock, partial(self._answer_clock, self.clock))
         if self.shard.leads:
             transport.answer(keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
-            transport.answer_on_server_thread(undo_key(keys.arena), self._undo_correction)
+            transport.answer_on_server_thread(
+                undo_key(keys.arena), audit.audited("undo of the rig", self._undo_correction)
+            )
             transport.declare_alive(keys.fusion_alive)
 
     @contextlib.contextmanager
@@ -184,6 +190,7 @@ class Server:
         published = {pose.robot for pose in update.poses.values()}
         self._publisher.publish_poses([p for p in result.poses if p.robot not in published], latency)
         self._publisher.publish_markers(result.markers)
+        self._publisher.publish_frames(frame_set)
         for correction in tracker.check_extrinsics(frame_set, result):
             self._report_correction(correction)
         states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
@@ -206,6 +213,7 @@ class Server:
         if not self.statistics.is_due(now_ns):
             return None
         pipeline = PipelineStatus(
+            limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion.model.limits import Limits
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
@@ -25,6 +26,7 @@ class PipelineStatus:
     """The pipeline's part of the status.
 
     Attributes:
+        limits: with which the server tracks.
         calibrated: cameras with a pose in the active rig.
         excluded: cameras that were moved, whose detections are excluded.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
@@ -32,6 +34,7 @@ class PipelineStatus:
         unsaved_robots: names of the robots whose changes a restart would undo.
     """
 
+    limits: Limits | None = None
     calibrated: frozenset[str] = frozenset()
     excluded: frozenset[str] = frozenset()
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
@@ -147,6 +150,7 @@ class ServerStatistics:
             },
             robots=dict(self._robots),
             faults=faults,
+            limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
             not_acquired=pipeline.not_acquired,
             unsaved_robots=pipeline.unsaved_robots,

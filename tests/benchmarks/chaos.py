@@ -25,6 +25,7 @@ from tests.benchmarks.fuzz import EXTRA, MAX_MB_PER_MIN
 PAUSE_S = 0.5, 3.0  # between two faults
 SETTLE_S = 3.0  # after a fault, in which a gap is explained by it and its report counts
 STEP_S = 0.05  # between two looks at logs and status
+WAITS_S = 0.2  # between two looks at how long threads waited for a processor
 CLOCK_S = 0.1  # after a step of a camera's clock, in which poses may be wrong
 
 
@@ -45,8 +46,9 @@ class Episode:
         return during and self.fault.robots in (None, (gap.robot,)) and gap.seconds <= self.fault.gap_s
 
     def excuses(self, pose: WrongPose) -> bool:
-        """Whether a camera's clock was stepped just now."""
-        return self.kind == "clock stepped" and 0 <= pose.received_s - self.begun_s < CLOCK_S
+        """Whether a camera's clock was stepped, or stepped back, just now."""
+        since_s = (pose.received_s - self.begun_s, pose.received_s - self.ended_s)
+        return self.kind == "clock stepped" and any(0 <= s < CLOCK_S for s in since_s)
 
 
 @dataclass
@@ -55,8 +57,8 @@ class ChaosResult:
 
     Attributes:
         episodes: all faults.
-        gaps: in the poses of visible robots, above `SHORT_S`; `waits_s` is for how long the machine let the busiest
-            program wait for a processor meanwhile.
+        gaps: in the poses of visible robots, above `SHORT_S`; `waits_s` is for how long the machine let some
+            thread wait for a processor meanwhile.
         wrong: poses that are not excused.
         slopes_mb_per_min: of the resident memory of long-lived processes.
     """
@@ -100,7 +102,7 @@ class ChaosResult:
             *(f"not reported: {e.kind} of {e.fault.target}" for e in self.unreported()),
             *(self._describe(gap, "unexplained gap") for gap in self.unexplained()),
             *(self._describe(gap, "long gap") for gap in self.longest()),
-            *(self._describe_pose(pose) for pose in self.wrong),
+            *self._describe_wrong(),
             *(f"{name} grows by {mb:.2f} MB a minute" for name, mb in slopes.items()),
         ]
 
@@ -110,18 +112,22 @@ class ChaosResult:
             f"{what} of {gap.robot}: {gap.seconds:.2f} s (waited {waited:.2f} s), {self._context(gap.from_s)}"
         )
 
-    def _describe_pose(self, pose: WrongPose) -> str:
-        error = f"{pose.robot} was {pose.error_m * 1e3:.0f} mm off ({pose.sigmas:.0f} sigma)"
-        return f"{error}, {self._context(pose.received_s)}"
+    def _describe_wrong(self) -> Iterator[str]:
+        """One line for the wrong poses after each fault."""
+        groups: dict[str, list[WrongPose]] = defaultdict(list)
+        for pose in self.wrong:
+            groups[self._context(pose.received_s).partition(" after ")[2]].append(pose)
+        for context, poses in groups.items():
+            error_mm = 1e3 * max(pose.error_m for pose in poses)
+            seconds = poses[-1].received_s - poses[0].received_s
+            yield f"{len(poses)} poses up to {error_mm:.0f} mm off within {seconds:.1f} s after {context}"
 
     def _context(self, at_s: float) -> str:
         """The last fault before a moment."""
         before = [e for e in self.episodes if e.begun_s <= at_s]
-        return (
-            f"{at_s - before[-1].begun_s:.1f} s after {before[-1].kind} of {before[-1].fault.target}"
-            if before
-            else "before any fault"
-        )
+        if not before:
+            return "0 s after the start"
+        return f"{at_s - before[-1].begun_s:.1f} s after {before[-1].kind} of {before[-1].fault.target}"
 
 
 class Chaos:
@@ -170,7 +176,7 @@ class Chaos:
 
     def _look(self, current: tuple[Episode, Evidence] | None, seconds: float) -> None:
         """Follow logs and status for a time."""
-        end_s, next_s = time.monotonic() + seconds, 0.0
+        end_s, next_s, waits_s = time.monotonic() + seconds, 0.0, 0.0
         while time.monotonic() < end_s:
             self.arena.wait(STEP_S)
             lines = [f"{program}: {line}" for program, line in self.arena.programs.new_lines()]
@@ -179,7 +185,9 @@ class Chaos:
                 evidence.lines += lines
                 if report := current[0].fault.report(evidence):
                     episode.reported_s, episode.report = time.monotonic(), report
-            self._waits.append((time.monotonic(), self.arena.programs.waited_s()))
+            if time.monotonic() > waits_s:
+                self._waits.append((time.monotonic(), self.arena.programs.waited_s()))
+                waits_s = time.monotonic() + WAITS_S
             self.arena.programs.check()
             if time.monotonic() > next_s:
                 self.arena.programs.sample_memory()
@@ -192,13 +200,12 @@ class Chaos:
         for gap in gaps:
             self.result.gaps.append(gap)
             self.result.waits_s[gap] = self._waited_s(gap)
-        del self._waits[:-600]
+        del self._waits[:-200]
 
     def _waited_s(self, gap: Gap) -> float:
-        """For how long the program that waited longest for a processor did so in a gap."""
-        inside = [
-            waits for at_s, waits in self._waits if gap.from_s - 2 * STEP_S < at_s < gap.until_s + 2 * STEP_S
-        ]
+        """For how long the thread that waited longest for a processor did so around a gap."""
+        around = 2 * WAITS_S
+        inside = [w for at_s, w in self._waits if gap.from_s - around < at_s < gap.until_s + around]
         if len(inside) < 2:
             return 0.0
         names = inside[0].keys() & inside[-1].keys()
@@ -253,7 +260,8 @@ def report(result: ChaosResult) -> None:
     table = Table("fault", "n", "reported", "after s", "by", "longest gap s")
     for kind, episodes in rows.items():
         delays = [e.reported_s - e.begun_s for e in episodes if e.reported_s is not None]
-        by = next((e.report for e in episodes if e.report), "who starts the programs")
+        silent = "nothing" if episodes[0].fault.report else "who starts the programs"
+        by = next((e.report for e in episodes if e.report), silent)
         gaps = [
             g.seconds for g in result.gaps for e in episodes if e.begun_s < g.until_s and g.from_s < e.ended_s
         ]

@@ -2,6 +2,7 @@
 """Runs every command of docs/security.md, with shorter times and a port of the operating system's choice."""
 
 import contextlib
+import http.client
 import re
 import shlex
 import shutil
@@ -13,9 +14,11 @@ import pytest
 import tyro
 
 import camera_node.__main__ as camera_program
-from tests.conftest import ROOT
+from camera_node.config import load_yaml
+from tests.conftest import ROOT, free_port
 from tests.security.lab import KEYS, Lab
-from tests.waiting import wait_for
+from tests.waiting import wait_for, wait_for_port
+from web.page_access import Tokens
 
 TEXT = (ROOT / "docs" / "security.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE))
@@ -49,6 +52,7 @@ def checkout(tmp_path: Path) -> Path:
 def test_every_command_has_a_test():
     """A command that is added to the page needs a test here."""
     tested = ("sh configs/", "cp configs/", "sed -i ", "python -m fusion", "python -m camera_node --source")
+    tested += ("python -m web --host",)
     assert [c for section in SECTIONS for c in commands(section) if not c.startswith(tested)] == []
 
 
@@ -70,6 +74,29 @@ def test_the_folders_work_as_the_page_says(checkout: Path):
         recording = keys / "viewer" / "arena.mcap"
         wait_for(recording.exists)
         assert any(reply.ok for reply in wait_for(lambda: list(north.get(KEYS.clock, timeout=1.0))))
+
+
+def status(port: int, path: str) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    with contextlib.closing(connection):
+        connection.request("GET", path)
+        return connection.getresponse().status
+
+
+def test_the_page_requires_a_token_of_the_file(tmp_path: Path):
+    (command,) = commands("The page")
+    port = free_port()
+    page = subprocess.Popen(
+        [sys.executable, *shlex.split(command)[1:], "--port", str(port)],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+    )
+    with contextlib.ExitStack() as closing:
+        closing.callback(page.wait, 30)
+        closing.callback(page.terminate)
+        wait_for_port(port)
+        tokens = load_yaml(tmp_path / "page_tokens.yaml", Tokens)
+        assert [status(port, path) for path in ("/", f"/?token={tokens.viewer}")] == [401, 303]
 
 
 @pytest.mark.parametrize("section", ["Renewal", "Revocation"])

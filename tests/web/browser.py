@@ -9,6 +9,8 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
+from tests.conftest import free_port
+from web.page_access import PageAccess
 from web.view import View
 
 CHROMIUM = shutil.which("chromium")
@@ -22,6 +24,11 @@ FLAGS = [
     "--disable-component-update",
     "--no-first-run",
 ]
+
+
+def loopback() -> PageAccess:
+    """A page on a reserved port of this machine, without tokens."""
+    return PageAccess.create("127.0.0.1", free_port())
 
 
 @contextmanager
@@ -39,8 +46,8 @@ def drawing(view: View) -> Iterator[None]:
 
 
 @contextmanager
-def browsing(view: View) -> Iterator[Page]:
-    """Open the page of a view; an error on its console fails the test. Skips without Chromium."""
+def browsing(view: View, url: str = "") -> Iterator[Page]:
+    """Open the page of a view, or another address; an error on its console fails the test. Skips without Chromium."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed; apt-get install chromium")
     errors: list[str] = []
@@ -54,7 +61,7 @@ def browsing(view: View) -> Iterator[Page]:
         page = browser.new_page(viewport={"width": 1000, "height": 700})
         page.on("console", record)
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(view.url)
+        page.goto(url or view.access.address)
         yield page
         browser.close()
     assert not errors

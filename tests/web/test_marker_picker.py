@@ -12,11 +12,10 @@ from playwright.sync_api import Page, TimeoutError
 
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
-from tests.conftest import free_port
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot
 from tests.fusion.synthetic import WIDE
 from tests.waiting import wait_for
-from tests.web.browser import browsing, drawing
+from tests.web.browser import browsing, drawing, loopback
 from web.feed import Feed
 from web.marker_picker import MarkerPicker
 from web.subscription import Subscription
@@ -33,7 +32,7 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     monkeypatch.setattr("web.view.PANEL_INTERVAL", 2)
     with serving_an_unknown_robot(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
         subscription = Subscription(session, Feed("test"))
-        view = View(subscription.feed, port=free_port())
+        view = View(subscription.feed, loopback())
         picker = MarkerPicker(view.server, subscription)
         view.add(picker)
         with drawing(view):

@@ -10,9 +10,9 @@ import pytest
 
 from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
-from tests.conftest import free_port
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
+from tests.web.browser import loopback
 from web.__main__ import Options, show_recording
 from web.controls import ReplayControls
 from web.feed import Feed
@@ -151,7 +151,7 @@ def test_an_invalid_recording_is_an_error(tmp_path: Path):
 def test_the_controls_follow_the_recording(recording: Path):
     """The slider shows the position, the button its action."""
     with playing(recording) as (player, feed):
-        view = View(feed, port=free_port())
+        view = View(feed, loopback())
         controls = ReplayControls(view.server, player)
         view.add(controls)
         player.play(False)

@@ -13,10 +13,9 @@ import pytest
 from playwright.sync_api import Page
 
 from camera_node.protocol.messages import encode
-from tests.conftest import free_port
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import browsing, drawing
+from tests.web.browser import browsing, drawing, loopback
 from web.controls import LiveControls, decode_jpeg
 from web.drawing import cylinder_mesh
 from web.errors import WebError
@@ -29,7 +28,7 @@ from web.view import View, check_port, default_viewpoint
 @pytest.fixture
 def view(subscription: Subscription) -> Iterator[View]:
     """A view that draws."""
-    view = View(subscription.feed, port=free_port())
+    view = View(subscription.feed, loopback())
     view.add(LiveControls(view.server, subscription))
     with drawing(view):
         yield view
@@ -105,14 +104,14 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
 
 def test_drawing_follows_a_changing_arena(arena: LiveArena, feed: Feed):
     """Robots, markers and the rig appear and disappear without a fault."""
-    view = View(feed, port=free_port())
+    view = View(feed, loopback())
     queryable = arena.serve_rig(four_cameras())
     token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
     for count in (3, 1, 5):
         send_state(arena)
         arena.markers([(float(k), 0.0, 0.0) for k in range(count)])
-        arena.pose(f"robot {count}", (0.0, 0.0, 0.0), "lost")
-        wait_for(lambda count=count: f"robot {count}" in feed.state().poses)
+        arena.pose(f"robot_{count}", (0.0, 0.0, 0.0), "lost")
+        wait_for(lambda count=count: f"robot_{count}" in feed.state().poses)
         view.update()
     wait_for(lambda: feed.state().rig, arena.status)
     view.update()
@@ -127,7 +126,7 @@ def test_drawing_follows_a_changing_arena(arena: LiveArena, feed: Feed):
 
 def test_true_positions_appear_and_disappear(arena: LiveArena, feed: Feed):
     """The scene shows the simulated wand as long as the demo reports its position."""
-    view = View(feed, port=free_port())
+    view = View(feed, loopback())
     for points in ({"wand": ((0.0, 0.0, 1.0), (0.2, 0.0, 1.0))}, {}):
         progress = DemoProgress(t_ns=0, text="*wand* <b>", share=0.5, true_points=points)
         arena.put(progress_key("test"), encode(progress))
@@ -139,7 +138,7 @@ def test_true_positions_appear_and_disappear(arena: LiveArena, feed: Feed):
 
 def test_a_drawing_that_fails_is_counted(feed: Feed, monkeypatch: pytest.MonkeyPatch):
     """The view continues after an exception, and counts it."""
-    view, stop = View(feed, port=free_port()), threading.Event()
+    view, stop = View(feed, loopback()), threading.Event()
 
     def fail() -> None:
         raise ValueError("odd")

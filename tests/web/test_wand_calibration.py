@@ -15,10 +15,9 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from tests.calib.synthetic import assert_near, record, ring
-from tests.conftest import free_port
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, drawing
+from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
 from web.subscription import Subscription
 from web.view import View
@@ -39,7 +38,7 @@ def files(tmp_path: Path) -> CalibrationFiles:
 @pytest.fixture
 def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
     """A view that draws, with the button."""
-    view = View(subscription.feed, port=free_port())
+    view = View(subscription.feed, loopback())
     with drawing(view), closing(WandSessionPanel(view.server, subscription, files)):
         yield view
 

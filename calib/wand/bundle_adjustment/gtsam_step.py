@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from calib.rig.camera import PER_CAMERA
+from calib.rig.camera import LENS, PER_CAMERA
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Index
@@ -14,7 +14,7 @@ from camera_node.arrays import Array, Index
 GROUP_SIZE = 24  # scalars in one variable, at least: few large factors are faster, though mostly zero
 
 # Information that fixes the gauge at the first camera and its clock: about the information of the observations.
-ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * 4)
+ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * len(LENS))
 # Damping of a knot's position and velocity, of the information in the best observed direction of each: GTSAM takes
 # pivots that are 2^12 apart for singular.
 MIN_RELATIVE_INFORMATION = 2.0**-22

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig.camera import PER_CAMERA, SHAPE, pixel_jacobians
+from calib.rig.camera import PER_CAMERA, pixel_jacobians
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import (
     LENGTH_SIGMA_M,
@@ -96,7 +96,7 @@ def reprojection_jacobians(
     points, velocity = motion.points, motion.velocity(problem.knot_s)
     since = observations.t_s - problem.middle_s
     error, J_point = np.zeros((len(observations), 2)), np.zeros((len(observations), 2, 3))
-    J_camera = np.zeros((len(observations), 2, PER_CAMERA + len(SHAPE)))
+    J_camera = np.zeros((len(observations), 2, PER_CAMERA))
     for c, given in enumerate(problem.lenses):
         rows, T, lens = np.flatnonzero(observations.camera == c), state.cameras[c], state.lens(c, given)
         local = (points[rows] - T[:3, 3]) @ T[:3, :3]

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import PER_CAMERA, POSE, SHAPE, with_distortion
+from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
 from calib.wand.trajectory import AffineWand
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
-# Prior standard deviations: of the pose, the time offset (s), and the shape of the lens.
-POSE_SIGMA, OFFSET_SIGMA, SHAPE_SIGMA = [np.inf] * 6, [0.5], [0.02, 0.3, 0.02, 0.02]
+# Prior standard deviations: of the pose, and of the time offset (s).
+POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]
 # And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
 SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
@@ -60,7 +60,7 @@ class State:
     Attributes:
         cameras: (C, 4, 4) T_world_cam.
         clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
-        lenses: (C, 4) corrections of log focal length, cx, cy and k1.
+        lenses: (C, 8) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
         motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
     """
 
@@ -73,25 +73,27 @@ class State:
     def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
         """The state with these cameras, time offsets and motion; no drift, and no correction of the lenses."""
         clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
-        return cls(cameras, clocks, np.zeros((len(cameras), 4)), motion)
+        return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion)
 
     def retract(self, camera_step: Array, motion_step: Array) -> "State":
-        """Add a step: (C, 12) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
+        """Add a step: (C, 16) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        clocks, lenses = self.clocks + camera_step[:, 6:8], self.lenses + camera_step[:, 8:12]
+        clocks, lenses = self.clocks + camera_step[:, 6:8], self.lenses + camera_step[:, 8:]
         return State(cameras, clocks, lenses, self.motion + motion_step.reshape(self.motion.shape))
 
     def lens(self, camera: int, lens: Lens) -> Lens:
         """The given lens of a camera with this state's correction."""
-        scale, cx, cy, k1 = self.lenses[camera].tolist()
-        if not any((scale, cx, cy, k1)):
+        change = self.lenses[camera]
+        if not change.any():
             return lens
+        scale, ratio = change[0], change[4]
         parameters = with_distortion(lens).parameters
-        parameters[:2] *= np.exp(scale)
-        parameters[2:5] += cx, cy, k1
+        parameters[:2] *= np.exp([scale + ratio / 2, scale - ratio / 2])
+        parameters[2:5] += change[1:4]
+        parameters[5:8] += change[5:]
         return lens.with_parameters(parameters)
 
 
@@ -106,11 +108,11 @@ class Problem:
         gap_s: longest interval between knots over which the motion prior holds.
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: stamp at which time offsets are defined.
-        lens_sigma: (C, 4) prior standard deviations of log focal length, cx, cy and k1 in the estimate.
+        lens_sigma: (C, 8) prior standard deviations of the lenses' parameters in the estimate.
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
         estimated: cameras that are estimated, the others are fixed; None for all.
-        covariance_lens_sigma: (C, 4) prior standard deviations for the covariance; `lens_sigma` if None.
+        covariance_lens_sigma: (C, 8) prior standard deviations for the covariance; `lens_sigma` if None.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
     """
 
@@ -139,8 +141,7 @@ class Problem:
 
     def _prior_sigma(self, lens_sigma: Array) -> Array:
         others = np.tile(POSE_SIGMA + OFFSET_SIGMA + [self.drift_sigma], (len(self.lenses), 1))
-        shapes = np.tile(SHAPE_SIGMA, (len(self.lenses), 1))
-        return np.concatenate([others, lens_sigma, shapes], axis=1)[:, self.free]
+        return np.concatenate([others, lens_sigma], axis=1)[:, self.free]
 
     def estimated_cameras(self) -> tuple[int, ...]:
         """Indices of the S cameras that are estimated."""
@@ -198,7 +199,7 @@ class Estimate:
 def gauge_directions(state: State, free: tuple[int, ...]) -> Array:
     """(C d, g) changes of the free camera parameters that no observation depends on: rotation and translation of the
     world, and offset and drift that all clocks share."""
-    columns = np.zeros((len(state.cameras), PER_CAMERA + len(SHAPE), 8))
+    columns = np.zeros((len(state.cameras), PER_CAMERA, 8))
     for T, rows in zip(state.cameras, columns, strict=True):
         rows[:6, :6] = adjoint(invert(T))
         rows[6, 6] = rows[7, 7] = 1.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rig.camera import POSE, SHAPE
+from calib.rig.camera import POSE
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.trajectory import (
     SplineLocation,
@@ -171,7 +171,7 @@ class CameraPrior:
 def camera_priors(problem: Problem, state: State) -> list[CameraPrior]:
     """The priors of all cameras' free parameters, and of the distance that fixes the scale, at a state."""
     free, poses = list(problem.free), np.zeros((len(state.cameras), len(POSE)))
-    values = np.column_stack([poses, state.clocks, state.lenses, poses[:, : len(SHAPE)]])[:, free]
+    values = np.column_stack([poses, state.clocks, state.lenses])[:, free]
     priors = [
         CameraPrior((c,), (np.diag(1 / sigma),), -value / sigma)
         for c, (value, sigma) in enumerate(zip(values, problem.prior_sigma(), strict=True))

@@ -28,8 +28,8 @@ class CameraPoses:
         names: of the cameras.
         cameras: (C, 4, 4) T_world_cam.
         covariance: (6C, 6C) of all poses, each in its camera's frame, rotation then translation; without `lenses`.
-        lenses: by camera, the derivative (6C, 4) of all poses by its lens (log f, cx, cy, k1), and the standard
-            deviations (4,) of these in the file.
+        lenses: by camera, the derivative (6C, 8) of all poses by its lens (`LENS`), and the standard
+            deviations (8,) of these in the file.
         metric: whether the scale is known; otherwise only the shape is compared.
     """
 
@@ -56,11 +56,11 @@ class CameraPoses:
         pose, lens = [free.index(p) for p in POSE], [free.index(p) for p in LENS]
         by_prior = camera_covariance(adjusted).by_prior.reshape(count, len(free), count, len(free))
         by_prior = by_prior[:, pose][:, :, :, lens]
-        by_lens = by_prior.reshape(6 * count, 4 * count)
+        by_lens = by_prior.reshape(6 * count, len(LENS) * count)
         rest = result.covariance - by_lens @ by_lens.T
         sigma = adjusted.problem.covariance_prior_sigma()[:, lens]
         lenses = {
-            name: (by_prior[:, :, k].reshape(6 * count, 4) / sigma[k], sigma[k])
+            name: (by_prior[:, :, k].reshape(6 * count, len(LENS)) / sigma[k], sigma[k])
             for k, name in enumerate(result.names)
         }
         scaled_by = result.report.scaled_by
@@ -88,7 +88,7 @@ class CameraPoses:
     def difference_covariance(self, other: "CameraPoses") -> Array:
         """Return (6C, 6C) covariance of the difference from the same cameras in another calibration."""
         total = self.covariance + other.covariance
-        unknown = np.zeros((6 * len(self.names), 4)), np.full(4, np.inf)
+        unknown = np.zeros((6 * len(self.names), len(LENS))), np.full(len(LENS), np.inf)
         for name in {*self.lenses, *other.lenses}:
             (mine, sigma), (theirs, other_sigma) = (p.lenses.get(name, unknown) for p in (self, other))
             difference = (mine - theirs) * np.minimum(sigma, other_sigma)

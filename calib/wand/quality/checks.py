@@ -7,9 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
-from calib.rig.camera import LENS
+from calib.rig.camera import LENS, lens_parameters
 from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.bundle_adjustment.lens_prior import usual_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
@@ -24,7 +23,6 @@ MAX_SIZE_ERROR = 0.04  # of the distance: the median error of roundel sizes is b
 MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
-WRONG_LENS = 3.0  # usual standard deviations of a lens without figures
 WRONG_CLOCK_S = (
     1.0  # offset: synchronized clocks differ by milliseconds, unsynchronized ones by more than a second
 )
@@ -32,7 +30,7 @@ SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another
 
 
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
-    """Raise CameraFault where lenses are swapped between two cameras, or far from the given ones."""
+    """Raise CameraFault where the lenses of two cameras are swapped."""
     lenses, cov = adjusted.problem.lenses, camera_covariance(adjusted).of(LENS)
     found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
     for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
@@ -43,24 +41,11 @@ def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
                 "its detections fit the intrinsics of '{}', and vice versa; swap the two in the rig file"
             )
             raise CameraFault({names[a]: swapped.format(names[b]), names[b]: swapped.format(names[a])})
-    reasons = {}
-    for name, given, lens in zip(names, lenses, found, strict=True):
-        off = np.array([np.log(lens.fx / given.fx), lens.cx - given.cx, lens.cy - given.cy])
-        if (np.abs(off) > WRONG_LENS * usual_sigma(given)[:3]).any():
-            reasons[name] = (
-                f"wrong intrinsics: its detections fit f = {lens.fx:.0f} px and a centre at "
-                f"({lens.cx:.0f}, {lens.cy:.0f}), its file has {given.fx:.0f} px and "
-                f"({given.cx:.0f}, {given.cy:.0f}); check its name, or run python -m calib intrinsics --camera {name}"
-            )
-    if reasons:
-        raise CameraFault(reasons)
 
 
 def _distance(found: Lens, given: Lens, cov: Array) -> float:
     """Distance of two lenses in sigmas, root mean square of the adjusted parameters."""
-    k1 = [lens.distortion[0] if lens.distortion else 0.0 for lens in (found, given)]
-    focal = np.log(found.fx * found.fy / (given.fx * given.fy)) / 2
-    off = np.array([focal, found.cx - given.cx, found.cy - given.cy, k1[0] - k1[1]])
+    off = lens_parameters(found) - lens_parameters(given)
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
 
 

@@ -153,8 +153,7 @@ class LiveArena:
     def _camera(self, name: str) -> list[str]:
         load = msgspec.json.encode(self.load).decode()
         place = ("--connect", self.endpoint, "--arena", ARENA, "--epoch-ns", self.world.epoch_ns)
-        options = ("--load", load, "--zenoh", self.folder / "zenoh.json5")
-        return python("tests.benchmarks.faults.camera", "--name", name, *place, *options)
+        return python("tests.benchmarks.faults.camera", "--name", name, *place, "--load", load)
 
     def _viewer(self) -> list[str]:
         return python("web", "--headless", "--connect", self.endpoint, "--arena", ARENA)
@@ -189,7 +188,6 @@ class LiveArena:
         files = {"rig": "rig.yaml", "saved_rig": "saved_rig.yaml", "robots": "robots.yaml"}
         files |= {"saved_robots": "saved_robots.yaml"}
         write(folder / "arena.yaml", {"arena": ARENA, "listen": [self.endpoint], **files})
-        (folder / "zenoh.json5").write_text(self.network.zenoh_config)
         demo = ROOT / "configs" / "demo"
         scene = msgspec.yaml.decode((demo / "scene.yaml").read_bytes())
         scene["cameras"][RENDERED]["fps"] = RENDERED_FPS

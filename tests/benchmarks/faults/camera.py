@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -142,7 +141,7 @@ def obey(camera: SceneCamera, world: World) -> None:
             camera.place(command.fault)
 
 
-def main(name: str, connect: str, arena: str, epoch_ns: int, load: str, zenoh: Path) -> None:
+def main(name: str, connect: str, arena: str, epoch_ns: int, load: str) -> None:
     """Publish until SIGTERM.
 
     Args:
@@ -151,14 +150,13 @@ def main(name: str, connect: str, arena: str, epoch_ns: int, load: str, zenoh: P
         arena: its name.
         epoch_ns: Unix time of the load's time 0.
         load: the `Load` as JSON.
-        zenoh: a Zenoh configuration.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     world = World(msgspec.json.decode(load, type=Load), epoch_ns)
     detector = SceneDetector()
     camera = SceneCamera(world, name, detector)
     threading.Thread(target=obey, args=(camera, world), daemon=True).start()
-    with contextlib.suppress(KeyboardInterrupt), open_client([connect], zenoh) as session:
+    with contextlib.suppress(KeyboardInterrupt), open_client([connect]) as session:
         Node(name, camera, detector, session, arena).run()
 
 

@@ -11,7 +11,7 @@ from fusion.model.states import POSITION
 from fusion.protocol.messages import RobotPose
 from tests.benchmarks.faults.world import World
 
-MAX_ERROR_M = 0.010  # and MAX_SIGMAS: a tracked pose is wrong if its error is above both
+MAX_ERROR_M = 0.010  # a tracked pose is wrong if its error is above this and above MAX_SIGMAS
 MAX_SIGMAS = 5.0
 LONGEST = 100_000  # gaps and wrong poses that are kept
 
@@ -45,11 +45,13 @@ class PoseJudge:
 
     Attributes:
         min_gap_s: gaps that are longer are kept.
+        max_error_m: smaller errors are right.
         count, rms_m, largest_m: of tracked poses: their number, and their errors.
     """
 
     world: World
     min_gap_s: float = 0.1
+    max_error_m: float = MAX_ERROR_M
     gaps: list[Gap] = field(default_factory=list)
     wrong: list[WrongPose] = field(default_factory=list)
     count: int = 0
@@ -116,7 +118,7 @@ class PoseJudge:
         self.count += 1
         self.squared_m2 += error_m**2
         self.largest_m = max(self.largest_m, error_m)
-        if error_m <= MAX_ERROR_M:
+        if error_m <= self.max_error_m:
             return
         covariance = pose.covariance_matrix[POSITION, POSITION]
         sigmas = float(np.sqrt(error @ np.linalg.solve(covariance, error)))

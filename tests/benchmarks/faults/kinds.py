@@ -310,8 +310,14 @@ def fuzz_burst(arena: LiveArena, rng: random.Random) -> Fault:
 
 
 def gone(camera: str) -> Callable[[Evidence], str]:
-    """The server says that a camera is gone."""
-    return lambda seen: seen.logged("server:", camera, "gone")
+    """The server's log says that a camera is gone, or its status that no frames arrive."""
+
+    def report(seen: Evidence) -> str:
+        health = seen.health(camera)
+        silent = "status: 0 frames/s" if health and health.fps == 0 else ""
+        return seen.logged("server:", camera, "gone") or silent
+
+    return report
 
 
 def advised(camera: str, word: str) -> Callable[[Evidence], str]:

@@ -14,7 +14,6 @@ class Loopback:
     """All programs on this machine's loopback address."""
 
     host = "127.0.0.1"
-    zenoh_config = "{}"
 
     def command(self, name: str, command: list[str]) -> list[str]:
         """The command line that runs a program at its place."""
@@ -29,7 +28,6 @@ class Namespaces(Loopback):
     """
 
     host = f"{SUBNET}.1"
-    zenoh_config = "{transport: {shared_memory: {enabled: false}}}"  # it would pass by the links
 
     def __init__(self, cameras: Sequence[str]) -> None:
         self._prefix = f"rdl{os.getpid()}"

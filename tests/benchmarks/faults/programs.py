@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Starts real programs, ends and pauses them by signals, and reads their logs and their memory."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -134,14 +135,12 @@ class Programs:
         return memory[-1][1] if memory else 0.0
 
     def waited_s(self) -> dict[str, float]:
-        """For how long each program has waited for a processor since its start, by the kernel's account."""
+        """For how long each thread of the programs has waited for a processor so far, by the kernel's account."""
         waits = {}
-        for name, program in tuple(self._running.items()):
-            try:
-                text = Path(f"/proc/{program.process.pid}/schedstat").read_text()
-                waits[name] = int(text.split()[1]) * 1e-9
-            except (OSError, ValueError, IndexError):
-                continue
+        for program in tuple(self._running.values()):
+            for path in Path(f"/proc/{program.process.pid}/task").glob("*/schedstat"):
+                with contextlib.suppress(OSError, IndexError):
+                    waits[str(path)] = int(path.read_text().split()[1]) * 1e-9
         return waits
 
     def new_lines(self) -> list[tuple[str, str]]:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Wand calibration: exact without noise, honest about its covariance, and explicit about faults."""
 
+import re
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
-from calib.wand.calibrate import calibrate
+from calib.wand.calibrate import calibrate, explain_disagreement
+from calib.wand.initialization.two_view import TwoViewGeometry
+from calib.wand.labeling import label_recording
 from calib.wand.result import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -133,3 +137,16 @@ def test_errors_name_the_fault():
     longer = Body(diameter_m=0.12, markers=tuple((4 * x, y, z) for x, y, z in WAND.markers))
     with pytest.raises(CalibrationError, match="wand"):
         calibrate(arena.intrinsics, longer, messages)
+
+
+def test_a_disagreement_is_explained_by_the_pairs_that_agree():
+    arena = ring()
+    messages = record(arena, sigma_px=0.1, numbered=True, sized=False)
+    recording = label_recording(arena.intrinsics, arena.wand, messages)
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, arena.wand, recording.timing)
+    sentence = explain_disagreement(recording.names, pairs, {"cam1": "it moved"})
+    assert "camera 'cam1': it moved" in sentence
+    assert re.search(
+        r"Pairs that agree by themselves: .*'cam0' and 'cam\d' \(\d+% of their detections\)", sentence
+    )
+    assert "\n" not in sentence

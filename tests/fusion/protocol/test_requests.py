@@ -8,15 +8,19 @@ import sys
 
 import msgspec
 import pytest
+import zenoh
 
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
+from camera_node.errors import NetworkError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.session import open_client, open_router
 from fusion.client.define import LOST_AT_RESTART
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
+from fusion.protocol.requests import change_robots
 from fusion.server.active_rig import ActiveRig
 from fusion.server.persistence import PersistedFile
 from fusion.tracking.tracker import PAUSED
@@ -52,6 +56,18 @@ def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
         reply, _ = request_reply(client, change, json.dumps({"remove": ["wide"]}).encode())
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == ["rover"]
+
+
+def test_a_server_that_hangs_does_not_refuse(endpoint):
+    """Zenoh ends a query whose answer does not come by an error reply of its own, "Timeout"."""
+    held: list[zenoh.Query] = []
+    with open_router([endpoint]) as router, open_client([endpoint]) as client:
+        queryable = router.declare_queryable(set_robots_key("test"), held.append)
+        with pytest.raises(NetworkError, match="no server of arena 'test' answers within 1 s"):
+            change_robots(client, "test", RobotsRequest(), timeout_s=1.0)
+        assert held
+        held.clear()  # before the session closes
+        queryable.undeclare()
 
 
 def test_an_invalid_change_of_robots_changes_nothing(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
+from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.disc_centres import displacement
@@ -28,7 +28,7 @@ from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import altered, repack
 from tests.calib.recordings import SimulatedRecording, WandScenario
 from tests.calib.recordings import record as record_wave
-from tests.calib.synthetic import camera_errors, outlines, record, ring
+from tests.calib.synthetic import camera_errors, joint_error, outlines, record, ring
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,10 @@ def test_jacobians_are_those_of_the_residuals():
     seen, state = result.observations, result.adjusted.state
     along = np.zeros((len(state.motion), state.motion[0].size))
     J = reprojection_jacobians(problem, seen, state, predict_markers(problem, seen, state))[1]
-    for parameter, step in enumerate([1e-6] * 6 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-5]):
-        by = np.zeros((len(state.cameras), 12))
+    for parameter, step in enumerate(
+        [1e-6] * 6 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-5, 1e-6, 1e-5, 1e-5, 1e-5]
+    ):
+        by = np.zeros((len(state.cameras), PER_CAMERA))
         by[:, parameter] = step
         there, here = (
             reprojection_errors(problem, seen, state.retract(sign * by, along)) for sign in (1, -1)
@@ -60,7 +62,7 @@ def test_gauge_directions_change_no_residual():
     arena = ring(3)
     result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
     problem, seen, state = result.adjusted.problem, result.observations, result.adjusted.state
-    by = np.zeros((len(state.cameras), 12))
+    by = np.zeros((len(state.cameras), PER_CAMERA))
     for column, twist in zip(gauge_directions(state, POSE).T, np.eye(6), strict=True):
         by[:, :6] = 1e-5 * column.reshape(-1, 6)
         along = state.motion @ skew(1e-5 * twist[:3]).T
@@ -149,7 +151,6 @@ def test_cameras_that_the_recording_contradicts_are_named_and_left_out(recorded:
     swapped = {**rig.cameras, "cam00": rig.cameras["cam03"], "cam03": rig.cameras["cam00"]}
     mirrored = [mirror(m) if m.camera == "cam01" else m for m in recorded.messages]
     cases = [
-        (scale_focal(recorded, "cam02", 1.1), recorded.messages, {"cam02": "wrong intrinsics"}),
         (Rig(cameras=swapped), recorded.messages, {"cam00": "of 'cam03'", "cam03": "of 'cam00'"}),
         (rig, mirrored, {"cam01": "consistent ones are needed"}),
     ]
@@ -160,14 +161,15 @@ def test_cameras_that_the_recording_contradicts_are_named_and_left_out(recorded:
         assert camera_errors(result.rig, recorded.truth)[0].max() < 2e-3
 
 
-def test_no_majority_is_one_line(recorded: SimulatedRecording):
-    rig = recorded.intrinsics
-    wrong = dict(rig.cameras)
+def test_half_of_the_lenses_may_be_wrong(recorded: SimulatedRecording):
+    """Three of six focal lengths are 15 % to 20 % off: all cameras are placed, within the reported covariance."""
+    wrong = dict(recorded.intrinsics.cameras)
     for name, factor in {"cam00": 1.15, "cam02": 0.85, "cam04": 1.2}.items():
         wrong[name] = scale_focal(recorded, name, factor).cameras[name]
-    with pytest.raises(CalibrationError, match="no majority of the cameras agrees: camera 'cam0") as fault:
-        calibrate(Rig(cameras=wrong), WandScenario().wand, recorded.messages)
-    assert "\n" not in str(fault.value)
+    result = calibrate(Rig(cameras=wrong), WandScenario().wand, recorded.messages)
+    assert len(result.names) == 6
+    squared, degrees = joint_error(result, recorded.truth)
+    assert squared < chi2.ppf(0.999, degrees)
 
 
 def mirror(message: Detections) -> Detections:

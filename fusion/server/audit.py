@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Notes who changed the rig and the robots: a line in the log, and in a file that is only appended to."""
+
+import logging
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+import zenoh
+
+from camera_node.errors import RoundelError
+from camera_node.protocol.requests import payload_of, sender_of
+
+log = logging.getLogger("fusion.audit")
+Answer = Callable[[zenoh.Query], bytes]
+MAX_ENTRIES = 32  # of each list or map in a request that a line quotes
+MAX_TEXT = 64
+DEPTH = 2  # of a request that a line quotes
+
+
+class AuditLog:
+    """Notes every request for a change: what, when, from whom, and whether it was done.
+
+    Proven is what Zenoh knows of a connection: its address, and with TLS the name in the client's certificate. Claimed
+    is what a request says of itself: the session that sent it and its `source`. Without access rights anybody can claim
+    anything; with them only sessions with the right to change have requests that arrive here.
+
+    Args:
+        path: the file to append to, one JSON object a line; None for the log only.
+        session: the server's, whose connections are known.
+    """
+
+    def __init__(self, path: str | None, session: zenoh.Session) -> None:
+        self._path, self._session = path, session
+
+    def audited(self, change: str, answer: Answer) -> Answer:
+        """An answer to requests that notes each of them as `change`."""
+
+        def answer_and_note(query: zenoh.Query) -> bytes:
+            try:
+                reply = answer(query)
+            except RoundelError as error:
+                self._note(change, query, f"refused: {error}")
+                raise
+            self._note(change, query, "done")
+            return reply
+
+        return answer_and_note
+
+    def _note(self, change: str, query: zenoh.Query, outcome: str) -> None:
+        sender, request = sender_of(query), quote(payload_of(query))
+        link = next((link for link in self._session.info.links() if str(link.zid) == sender), None)
+        source = request.pop("source", None) if isinstance(request, dict) else None
+        entry = {
+            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "change": change,
+            "outcome": outcome[:500],
+            "request": request,
+            "certificate": link.auth_identifier if link else None,
+            "address": str(link.dst) if link else None,
+            "claimed_session": sender or None,
+            "claimed_source": source,
+        }
+        proven = entry["certificate"] or entry["address"] or "an unknown session"
+        log.info("%s by %s (claims to be %s): %s", change, proven, source or sender or "nobody", outcome)
+        self._append(msgspec.json.encode(entry))
+
+    def _append(self, line: bytes) -> None:
+        """Append a line and force it to the disk. A fault of the disk is logged; the change stays."""
+        if self._path is None:
+            return
+        try:
+            handle = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+            try:
+                os.write(handle, line + b"\n")
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            log.warning("the audit file %s can't be written: %s", self._path, error.strerror)
+
+
+def quote(payload: bytes) -> Any:
+    """The outline of a request in MessagePack or JSON: names and short values, without columns of numbers."""
+    try:
+        is_json = payload.lstrip()[:1] == b"{"
+        return _outline(
+            msgspec.json.decode(payload) if is_json else msgspec.msgpack.decode(payload or b"\x80"), DEPTH
+        )
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return f"{len(payload)} bytes that are no request"
+
+
+def _outline(value: Any, depth: int) -> Any:
+    if isinstance(value, dict) and depth:
+        return {str(k)[:MAX_TEXT]: _outline(v, depth - 1) for k, v in list(value.items())[:MAX_ENTRIES]}
+    if isinstance(value, dict | list):
+        return [str(entry)[:MAX_TEXT] for entry in list(value)[:MAX_ENTRIES]]
+    return value[:MAX_TEXT] if isinstance(value, str) else value if isinstance(value, int | float) else None

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Each change over the network leaves a line that says what is proven and what is claimed of its sender."""
+
+import contextlib
+import json
+import shutil
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from camera_node.errors import RoundelError
+from fusion.protocol.messages import RobotsRequest
+from fusion.protocol.requests import change_robots
+from fusion.server.audit import quote
+from tests.conftest import ROOT
+from tests.fusion.serving import config, serving
+from tests.fusion.synthetic import WIDE
+from tests.security.lab import ARENA, Lab, certificates
+from tests.waiting import wait_for
+
+
+def lines(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_changes_and_refusals_are_noted_with_the_certificate(tmp_path: Path):
+    """The name in the certificate is proven by TLS; a viewer's request never arrives."""
+    done = certificates(tmp_path, "localhost", "operator.ann", "viewer")
+    assert done.returncode == 0, done.stderr
+    home, audit = tmp_path / "server", tmp_path / "server" / "audit.jsonl"
+    shutil.copy(ROOT / "configs" / "robots.yaml", home)
+    (home / "arena.yaml").write_text(
+        "listen: [tls/127.0.0.1:0]\nzenoh: zenoh/server.json5\nrobots: robots.yaml\naudit: audit.jsonl\n"
+    )
+    with contextlib.ExitStack() as closing:
+        lab = Lab(tmp_path, closing)
+        operator, viewer = lab.session("operator.ann"), lab.session("viewer")
+        change_robots(operator, ARENA, RobotsRequest(remove=("robot_b",)))
+        with pytest.raises(RoundelError, match="robot_b"):
+            change_robots(operator, ARENA, RobotsRequest(remove=("robot_b",)))
+        with pytest.raises(RoundelError):
+            change_robots(viewer, ARENA, RobotsRequest(remove=("robot_a",)), timeout_s=0.5)
+        wait_for(lambda: audit.exists() and len(lines(audit)) == 2)
+        first, second = lines(audit)
+    assert first["change"] == "change of robots"
+    assert first["outcome"] == "done"
+    assert first["request"]["remove"] == ["robot_b"]
+    assert first["certificate"] == second["certificate"] == "operator.ann"
+    assert first["address"].startswith("tls/127.0.0.1:")
+    assert first["claimed_session"] == str(operator.info.zid())
+    assert second["outcome"].startswith("refused: ")
+
+
+def test_without_certificates_the_address_is_known(tmp_path: Path):
+    """And a file that can't be written prevents no change."""
+    audit = tmp_path / "audit.jsonl"
+    settings = msgspec.structs.replace(config(tmp_path), audit=str(audit))
+    with serving(settings) as (_, client):
+        client.change_robots(define={"b": WIDE})
+        (line,) = lines(audit)
+        assert line["certificate"] is None
+        assert line["address"].startswith("tcp/127.0.0.1:")
+        assert list(line["request"]["define"]) == ["b"]
+        audit.unlink()
+        audit.mkdir()
+        assert "b" not in client.change_robots(remove=["b"])
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"\xc1", b"{", b"[" * 50_000, b"\x81\xa1x\xc4\x04abcd", b'{"a": NaN}']
+)
+def test_any_request_can_be_quoted(payload: bytes):
+    assert len(msgspec.json.encode(quote(payload))) < 200
