@@ -15,7 +15,7 @@ class Serve:
 
     Other commands, python -m fusion NAME --help: health and doctor report on a running arena and say what to do;
     run, record, replay and repair are for recordings; define measures a new robot in the arena; robots lists,
-    renames, removes and saves them; undo undoes the recalibration of a moved camera; ros2 publishes the robots to
+    renames, removes and saves them; undo and redo step through the changes of the rig; ros2 publishes the robots to
     ROS 2.
     """
 

@@ -32,6 +32,7 @@ class PipelineStatus:
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         not_acquired: why robots were not acquired, by name.
         unsaved_robots: names of the robots whose changes a restart would undo.
+        rig_t_ns: since when the active rig is in force.
     """
 
     limits: Limits | None = None
@@ -40,6 +41,7 @@ class PipelineStatus:
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
     unsaved_robots: tuple[str, ...] = ()
+    rig_t_ns: int | None = None
 
 
 @dataclass
@@ -154,6 +156,7 @@ class ServerStatistics:
             geometry_residuals_px=pipeline.geometry_residuals_px,
             not_acquired=pipeline.not_acquired,
             unsaved_robots=pipeline.unsaved_robots,
+            rig_t_ns=pipeline.rig_t_ns,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()
