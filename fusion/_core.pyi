@@ -18,8 +18,8 @@ class BodyStates:
 class CameraExposures:
     """The camera poses of F frames."""
 
-    def __init__(self, R_cam_world: Array, centres: Array, tau: Array, /) -> None:
-        """R_cam_world (F, 3, 3), centres (F, 3); tau (F,) seconds after the time of the body states."""
+    def __init__(self, R_cam_world: Array, centres: Array, tau: Array, tau_sigma: Array, /) -> None:
+        """R_cam_world (F, 3, 3), centres (F, 3); tau (F,) seconds after the time of the body states, its sigma (F,)."""
 
 class DiscColumns:
     """N discs, each in one frame and on one body."""

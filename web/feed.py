@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Stores the latest message of each kind that an arena publishes, for the page and the status line."""
 
+import logging
 import math
 import threading
 import time
@@ -14,10 +15,12 @@ import msgspec
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
+from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
+log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
@@ -101,7 +104,10 @@ class Feed:
                 store(message, key)
                 self._state.message_counts[kind.__name__] += 1
         except MessageError as error:
-            self.count_fault(f"{kind.__name__}: {error}"[:120])
+            self.count_fault(f"{kind.__name__}: {printable(error, 100)}")
+        except Exception as error:  # of a bug that this message shows: the next one is another
+            log.exception("a %s could not be stored", kind.__name__)
+            self.count_fault(f"{kind.__name__}: {printable(repr(error), 100)}")
 
     def state(self) -> ArenaState:
         """Return a copy of the state, which later messages do not change."""

@@ -10,7 +10,9 @@ import zenoh
 from calib.live.rig_requests import redo_rig, undo_rig
 from calib.rig.messages import RigMessage
 from camera_node.errors import RoundelError
+from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import MessageError, decode
+from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
@@ -18,6 +20,7 @@ from fusion.protocol.requests import change_robots
 from web.feed import Feed
 
 REQUEST_TIMEOUT_S = 2.0
+RIG_REQUESTS_HZ = 1.0  # however many status messages arrive
 RIG_TIMEOUT_S = 5.0
 
 
@@ -27,12 +30,15 @@ class Subscription:
     def __init__(self, session: zenoh.Session, feed: Feed) -> None:
         self.session, self.feed = session, feed
         keys = feed.keys
+        self._rig_requests = RateLimit(RIG_REQUESTS_HZ, 2.0)
         self._entities: list[Any] = [self._subscribe(key_expr) for key_expr in feed.key_exprs]
         self._entities += [
             # The liveliness token may arrive before the rig's queryable exists, and a published rig may be dropped
             # under congestion: each status of another rig asks again.
-            session.declare_subscriber(keys.fusion_status, self._request_new_rig),
-            session.liveliness().declare_subscriber(keys.fusion_alive, self._server_changed, history=True),
+            session.declare_subscriber(keys.fusion_status, guarded("a status", self._request_new_rig)),
+            session.liveliness().declare_subscriber(
+                keys.fusion_alive, guarded("the server's token", self._server_changed), history=True
+            ),
         ]
 
     def close(self) -> None:
@@ -78,7 +84,7 @@ class Subscription:
         def receive(sample: zenoh.Sample) -> None:
             self.feed.receive(key_expr, str(sample.key_expr), sample.payload.to_bytes())
 
-        return self.session.declare_subscriber(key_expr, receive)
+        return self.session.declare_subscriber(key_expr, guarded("a message", receive))
 
     def _server_changed(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
@@ -94,9 +100,11 @@ class Subscription:
 
     def _request_rig(self) -> None:
         key = self.feed.keys.rig
+        if not self._rig_requests.passes():
+            return
 
         def receive(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 self.feed.receive(key, key, reply.ok.payload.to_bytes())
 
-        self.session.get(key, receive, timeout=RIG_TIMEOUT_S)
+        self.session.get(key, guarded("a rig", receive), timeout=RIG_TIMEOUT_S)

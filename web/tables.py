@@ -152,6 +152,10 @@ def _advise(state: ArenaState, timed: TimedMessage | None, health: CameraHealth 
         return "not calibrated"
     if health is not None and health.excluded:
         return "moved: excluded until it is recalibrated"
+    if health is not None and health.clock == "excluded":
+        return "its stamps jumped: excluded until they are corrected"
+    if health is not None and health.clock == "corrected":
+        return f"its stamps are corrected by {health.clock_correction_ms:.1f} ms: check its clock"
     if health is not None and health.duplicate_publisher:
         return "two nodes use this name"
     return timed.message.advice

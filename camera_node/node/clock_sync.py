@@ -78,7 +78,12 @@ class ClockSync:
     def _run(self) -> None:
         pause_s = FIRST_PERIOD_S
         while not self._closed.is_set():
-            pause_s = min(2 * pause_s, PERIOD_S) if self._refresh() else FIRST_PERIOD_S
+            try:
+                has_answer = self._refresh()
+            except Exception:  # whatever a reply can cause: the next one is another
+                log.exception("the server's time could not be processed")
+                has_answer = True  # no fast retry
+            pause_s = min(2 * pause_s, PERIOD_S) if has_answer else FIRST_PERIOD_S
             self._closed.wait(pause_s)
 
     def _refresh(self) -> bool:

@@ -16,7 +16,9 @@ from camera_node.detection.overlay import draw_roundels
 from camera_node.node.clock_sync import ClockSync
 from camera_node.node.settings import apply_settings, read_settings
 from camera_node.node.status import DetectedFrame, NodeStatistics
-from camera_node.protocol.messages import Detections, Keys, Settings, encode
+from camera_node.protocol.callbacks import guarded
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, Settings, encode
+from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import (
     RequestError,
     encode_jpeg,
@@ -35,6 +37,8 @@ from camera_node.sources.frame import Frame, Source
 log = logging.getLogger("camera_node")
 
 STATUS_S = 1.0
+SNAPSHOTS_HZ = 10.0  # a snapshot costs as much as the detection of several frames
+CHANGES_HZ = 10.0  # of settings: one can build a new detector
 LISTENER_S = 5.0  # longest time that a recording waits for a subscriber
 ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the route to it is ready
 
@@ -68,6 +72,8 @@ class Node:
         self._statistics = NodeStatistics(name)
         self._keep_stamps = keep_stamps
         self._changing = threading.Lock()  # of the detector, by requests
+        self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
+        self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
 
     def run(self) -> None:
@@ -135,7 +141,7 @@ class Node:
             (keys.snapshot(name), self._answer_snapshot),
             (keys.settings(name), self._answer_settings),
         ):
-            queryable = session.declare_queryable(key, partial(self._answer, answer))
+            queryable = session.declare_queryable(key, guarded(key, partial(self._answer, answer)))
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
         watch = ServerWatch(session, keys.fusion_alive)
@@ -170,16 +176,20 @@ class Node:
     def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
         while not self._closed.wait(STATUS_S):
-            watch.report_absence()
-            status = self._statistics.summarize(
-                self._clock.to_server(time.time_ns()),
-                self._clock.estimate(),
-                self._source,
-                self._detector.threshold,
-            )
-            publisher.put(encode(status))
-            service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
+            try:
+                watch.report_absence()
+                status = self._summarize()
+                publisher.put(encode(status))
+                service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
+            except Exception:  # the next status is another
+                log.exception("the status could not be published")
         publisher.undeclare()
+
+    def _summarize(self) -> CameraStatus:
+        now_ns = self._clock.to_server(time.time_ns())
+        return self._statistics.summarize(
+            now_ns, self._clock.estimate(), self._source, self._detector.threshold
+        )
 
     def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:
         if not respond(query, answer):
@@ -187,6 +197,8 @@ class Node:
 
     def _answer_snapshot(self, query: zenoh.Query) -> bytes:
         latest = self._statistics.latest
+        if not self._snapshots.passes():
+            raise RequestError(f"more than {SNAPSHOTS_HZ:g} snapshots a second; ask again later")
         if latest is None:
             raise RequestError("no frame yet; ask again when the camera delivers")
         image = latest.frame.image
@@ -197,6 +209,8 @@ class Node:
     def _answer_settings(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
         with self._changing:
+            if payload and not self._changes.passes():
+                raise RequestError(f"more than {CHANGES_HZ:g} changes of settings a second; try again later")
             if payload:
                 wanted = parse_request(payload, Settings)
                 self._detector = apply_settings(wanted, self._source, self._detector)

@@ -15,7 +15,7 @@ def guarded(
     """The callback, whose exceptions are logged and counted.
 
     Args:
-        purpose: the word for it in the log, such as "detections".
+        purpose: the subject of the log line, such as "a callback for poses".
         callback: takes what Zenoh received.
         count_fault: is called after an exception.
     """
@@ -25,6 +25,6 @@ def guarded(
             callback(received)
         except Exception:  # whatever a network can cause
             count_fault()
-            log.exception("%s could not be processed: %s", purpose, getattr(received, "key_expr", ""))
+            log.exception("%s failed %s", purpose, getattr(received, "key_expr", ""))
 
     return call

@@ -136,6 +136,10 @@ def respond(query: zenoh.Query, answer: Callable[[zenoh.Query], bytes]) -> bool:
             return False
         except zenoh.ZError as error:
             log.debug("the reply could not be sent: %s", error)
+        except Exception as error:  # of a bug that this request shows: its sender learns of it at once
+            log.exception("a request on %s failed", query.key_expr)
+            query.reply_err(f"this request causes an internal error ({type(error).__name__}); see the log")
+            return False
     return True
 
 

@@ -23,6 +23,7 @@ from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
+from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from camera_node.protocol.requests import RETRY_S
 from camera_node.protocol.session import open_client
@@ -68,12 +69,16 @@ class Stream(Generic[T]):
         raise NetworkError(f"the arena was closed while waiting for {self._content}")
 
     def on_message(self, callback: Callable[[T], object]) -> Callable[[], None]:
-        """Call `callback` with every message, on Zenoh's thread: it must be fast. Returns its removal."""
-        self._callbacks.append(callback)
+        """Call `callback` with every message, on Zenoh's thread: it must be fast. Returns its removal.
+
+        An exception of the callback is logged; the other callbacks and later messages are not affected.
+        """
+        call = guarded(f"a callback for {self._content}", callback)
+        self._callbacks.append(call)
 
         def remove() -> None:
             with contextlib.suppress(ValueError):
-                self._callbacks.remove(callback)
+                self._callbacks.remove(call)
 
         return remove
 
@@ -151,7 +156,7 @@ class Arena:
         self._streams: dict[str, Stream] = {}
         self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
         self._known: set[str] = set()
-        poses = session.declare_subscriber(self.keys.robot_pose(), self._take_pose)
+        poses = session.declare_subscriber(self.keys.robot_pose(), guarded("a pose", self._take_pose))
         self._subscribers: list[Any] = [poses]
 
     @classmethod
@@ -290,7 +295,7 @@ class Arena:
     def _stream(self, key: str, kind: type, content: str, timeout_s: float | None) -> Stream:
         if key not in self._streams:
             stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s)
-            take = self._taker(kind, stream._put)
+            take = guarded(content, self._taker(kind, stream._put))
             self._subscribers.append(self._session.declare_subscriber(key, take))
         self._streams[key].timeout_s = timeout_s
         return self._streams[key]

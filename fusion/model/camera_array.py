@@ -21,10 +21,22 @@ from fusion.model.undistortion import table_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposures:
-    """F frames: the index of the camera (F,), and the capture time minus the time of the states (F,), seconds."""
+    """F frames.
+
+    Attributes:
+        camera: (F,) index of the camera.
+        tau: (F,) capture time minus the time of the states, seconds.
+        tau_sigma: (F,) its standard deviation by the clock, seconds.
+    """
 
     camera: Index
     tau: Array
+    tau_sigma: Array
+
+    @classmethod
+    def exact(cls, camera: Index, tau: Array) -> "Exposures":
+        """Frames of exactly known time."""
+        return cls(camera, tau, np.zeros(len(tau)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +134,9 @@ class CameraArray:
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
         """The poses of all bodies at the capture times of all frames."""
         k = exposures.camera
-        cameras = _core.CameraExposures(self.R_cam_world[k], self.centres[k], exposures.tau)
+        cameras = _core.CameraExposures(
+            self.R_cam_world[k], self.centres[k], exposures.tau, exposures.tau_sigma
+        )
         return _core.FramePoses(states.bodies, cameras)
 
     def views(self, states: States, exposures: Exposures, discs: Discs) -> Views:

@@ -11,6 +11,8 @@ from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 from fusion.model.undistortion import undistort
 
+MAX_CLOCK_ERROR_S = 0.1  # a stamp with a larger bound has this one; NaN is an unknown bound
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedFrame:
@@ -51,6 +53,7 @@ class CalibratedFrame:
             received_ns=received_ns,
             exposure_us=message.exposure_us,
             detect_us=message.detect_us,
+            clock_sigma_s=clock_sigma_s(message.clock_error_us),
         )
 
     @classmethod
@@ -59,6 +62,12 @@ class CalibratedFrame:
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
         return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **timing)
+
+
+def clock_sigma_s(error_us: float) -> float:
+    """The standard deviation of a stamp with this bound of its error, s; the largest one where none is known."""
+    bound_s = error_us * 1e-6 if 0 <= error_us < MAX_CLOCK_ERROR_S * 1e6 else MAX_CLOCK_ERROR_S
+    return bound_s / 3**0.5  # of a uniform distribution
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -65,6 +65,7 @@ class DetectionTable:
         exposures = Exposures(
             np.array([cameras.index[frame.camera] for frame in frames], np.intp),
             np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
+            np.array([frame.clock_sigma_s for frame in frames]),
         )
         row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
         cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))

@@ -6,7 +6,9 @@ reflected labeling turns the printed sides away from the cameras.
 """
 
 import math
-from itertools import combinations, permutations
+from collections import Counter
+from collections.abc import Collection
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +29,7 @@ DISTINCT_M = (
 SIZES_DIFFER = 1.25  # smallest ratio of diameters that apparent size distinguishes
 APART_M = 0.6  # between the starts of identical robots: several sigma of manual placement
 MAX_MARKERS = 7  # limits the comparison of labelings at load, and the live acquisition, to milliseconds
+MAX_ROBOTS, MAX_ALL_MARKERS = 256, 1024  # of one arena: more than one process follows, or two
 MANOEUVRE_S = 0.1  # duration of an acceleration; converts accelerations to densities of white noise
 
 
@@ -118,11 +121,27 @@ def save_robots(robots: dict[str, Robot], path: Path) -> None:
     write_atomically(path, dump_yaml(_Robots(robots)))
 
 
-def require_trackable(robots: dict[str, Robot], where: str) -> None:
-    """Raise ConfigError for an invalid name; raise FusionError like `require_distinct`."""
+def require_trackable(robots: dict[str, Robot], where: str, known: Collection[str] = ()) -> None:
+    """Check robots; those of the `known` names were checked with each other before.
+
+    Raises:
+        ConfigError: a name is invalid, or there are too many robots or markers.
+        FusionError: a constellation is symmetric, or two robots look alike.
+    """
+    _require_few(robots, where)
     if bad := [name for name in robots if not is_name(name)]:
         raise ConfigError(f"{where}: '{printable(bad[0], 80)}' can't name a robot; {NAME_RULE}")
-    require_distinct(robots, where)
+    require_distinct(robots, where, known)
+
+
+def _require_few(robots: dict[str, Robot], where: str) -> None:
+    """Raise ConfigError for more robots or markers than can be tracked; before any work that grows with them."""
+    n_markers = sum(len(robot.markers) for robot in robots.values())
+    if len(robots) > MAX_ROBOTS or n_markers > MAX_ALL_MARKERS:
+        raise ConfigError(
+            f"{where}: {len(robots)} robots with {n_markers} markers; an arena has at most {MAX_ROBOTS} robots "
+            f"with {MAX_ALL_MARKERS} markers; use another arena for the others"
+        )
 
 
 def changed(
@@ -138,29 +157,39 @@ def changed(
         ConfigError: a name is invalid, unknown, or already in use; with `replace`, a defined robot may exist.
         FusionError: a constellation is symmetric, or two robots look alike.
     """
-    if unknown := [name for name in (*rename, *remove) if name not in robots]:
-        raise ConfigError(f"there is no robot '{unknown[0]}'; there are {', '.join(robots) or 'none'}")
+    _require_few(define, "the request")
+    if unknown := next((name for name in (*rename, *remove) if name not in robots), None):
+        names = ", ".join(robots) or "none"
+        raise ConfigError(f"there is no robot '{printable(unknown, 80)}'; there are {printable(names)}")
     renamed = [rename.get(name, name) for name in robots]
-    if taken := [name for name in renamed if renamed.count(name) > 1]:
-        raise ConfigError(f"another robot has the name '{taken[0]}'; use a new name")
+    if taken := [name for name, count in Counter(renamed).items() if count > 1]:
+        raise ConfigError(f"another robot has the name '{printable(taken[0], 80)}'; use a new name")
+    removed = set(remove)
     remaining = {
-        new: robot for new, (old, robot) in zip(renamed, robots.items(), strict=True) if old not in remove
+        new: robot for new, (old, robot) in zip(renamed, robots.items(), strict=True) if old not in removed
     }
     existing = [name for name, robot in define.items() if remaining.get(name, robot) != robot]
     if existing and not replace:
         raise ConfigError(
             f"there is another robot '{existing[0]}': use another name, or confirm that it is replaced (--replace)"
         )
-    require_trackable(remaining | define, "robots")
-    return remaining | define
+    all_robots = remaining | define
+    unchanged = {name for name, robot in remaining.items() if all_robots[name] == robot}
+    require_trackable(all_robots, "robots", unchanged)
+    return all_robots
 
 
-def require_distinct(robots: dict[str, Robot], where: str = "robots") -> None:
-    """Raise FusionError if a robot has a rotational symmetry, or if two robots look alike."""
-    for name, robot in robots.items():
+def require_distinct(robots: dict[str, Robot], where: str = "robots", known: Collection[str] = ()) -> None:
+    """Raise FusionError if a robot has a rotational symmetry, or if two robots look alike.
+
+    Robots of the `known` names are not compared with each other.
+    """
+    new = {name: robot for name, robot in robots.items() if name not in known}
+    for name, robot in new.items():
         if fault := _likeness(robot, robot):
             raise FusionError(f"{where}: robot '{name}' is symmetric under rotation: {fault}")
-    for (name_a, a), (name_b, b) in combinations(robots.items(), 2):
+    old = ((name, robots[name]) for name in robots if name in known)
+    for (name_a, a), (name_b, b) in chain(combinations(new.items(), 2), product(old, new.items())):
         if fault := _confusion(a, b):
             raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are {fault}")
 
@@ -200,14 +229,35 @@ def align(a: Array, b: Array) -> tuple[Array, Array]:
 def _likeness(small: Robot, large: Robot) -> str | None:
     """How the markers of `small` match some of `large`; for the same robot, in another order. None if they don't."""
     D, E = distances(small.points), distances(large.points)
-    orders = np.array(list(permutations(range(len(large.markers)), len(small.markers))))
+    orders = _labelings(D, E)
     if small is large:
-        orders = orders[1:]  # the first is the identity
+        orders = orders[(orders != np.arange(len(D))).any(1)]
     worst = np.abs(D - E[orders[:, :, None], orders[:, None]])  # (labelings, M, M)
-    for k in np.flatnonzero(worst.max((1, 2)) < DISTINCT_M):
+    for k in range(len(orders)):
         if align(small.points, large.points[orders[k]])[0][2, 2] > 0:
             return _explain(D, E, orders[k], worst[k])
     return None
+
+
+def _labelings(D: Array, E: Array) -> Index:
+    """(L, M) the labelings of M markers as some of N under which no distance differs by `DISTINCT_M` or more.
+
+    Marker by marker, so that a labeling ends at its first distance that differs.
+
+    Args:
+        D: (M, M) distances between the markers.
+        E: (N, N) distances between those that they may be.
+    """
+    every = np.arange(len(E))
+    orders = every[:, None]
+    for m in range(1, len(D)):
+        fits = (np.abs(E[orders] - D[m, :m, None]) < DISTINCT_M).all(
+            1
+        )  # (labelings, N) of the first m markers
+        fits &= (orders[:, :, None] != every).all(1)
+        row, added = np.nonzero(fits)
+        orders = np.column_stack([orders[row], added])
+    return orders
 
 
 def _explain(D: Array, E: Array, order: Index, worst: Array) -> str:

@@ -9,6 +9,7 @@ Each camera is compared in turn, just often enough to find a move within a secon
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,7 +97,11 @@ class ExtrinsicsMonitor:
         self._turns: dict[str, int] = {}  # of each camera at its last comparison
 
     def check(
-        self, frame_set: FrameSet, scene: TrackedScene, recalibrates: bool
+        self,
+        frame_set: FrameSet,
+        scene: TrackedScene,
+        recalibrates: bool,
+        is_clock: Callable[[str], bool] = lambda name: False,
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Compare the frames that are due; returns the cameras to exclude, and those to recalibrate.
 
@@ -104,13 +109,16 @@ class ExtrinsicsMonitor:
             frame_set: including the frames of excluded cameras.
             scene: after the update with this frame set.
             recalibrates: False for a shard that waits for the poses from another.
+            is_clock: whether a wrong clock explains the disagreement of a camera.
         """
         n_markers = int(scene.tracked[scene.marker_table.robot].sum())
         for frame in frame_set.frames:
             if self._is_due(frame, scene.cameras, n_markers):
                 self._compare(frame, frame_set.t_ns, scene)
         corrections = []
-        if (name := self._find_moved()) is not None:
+        if (name := self._find_moved()) is not None and is_clock(name):
+            self.readmit(name)
+        elif name is not None:
             self.excluded.add(name)
             corrections.append(ExtrinsicsCorrection(name, None))
         for name in sorted(self.excluded) if recalibrates else ():
@@ -194,7 +202,7 @@ class ExtrinsicsMonitor:
 def _expected_points(scene: TrackedScene, name: str, tau: float, markers: Index) -> Array:
     """(3, N) points, world frame, that project to the outlines' centres of markers that the camera should see."""
     camera, lens = scene.cameras.index[name], scene.cameras[name]
-    exposures = Exposures(np.array([camera]), np.array([tau]))
+    exposures = Exposures.exact(np.array([camera]), np.array([tau]))
     discs = scene.marker_table.discs(markers, np.zeros(len(markers), np.intp))
     views = scene.cameras.views(scene.states, exposures, discs)
     points = scene.cameras.R_cam_world[camera].T @ views.q + scene.cameras.centres[camera][:, None]

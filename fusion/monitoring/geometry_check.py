@@ -11,6 +11,7 @@ import numpy as np
 from camera_node.arrays import Array, Mask
 
 MISFIT_PX = 1.0  # RMS residual; a good calibration has 0.1 to 0.5
+MAX_PX = 3.0  # larger residuals count as this: a few frame sets with a wrong clock blame no robot
 MEMORY = 60  # frame sets of the running mean
 log = logging.getLogger("fusion")
 
@@ -33,7 +34,8 @@ class GeometryCheck:
         seen = np.isfinite(residual_px) & ~self._single
         self._count[seen] += 1
         share = 1 / np.minimum(self._count[seen], MEMORY)
-        self._mean_px2[seen] += share * (residual_px[seen] ** 2 - self._mean_px2[seen])
+        squared_px2 = np.minimum(residual_px[seen], MAX_PX) ** 2
+        self._mean_px2[seen] += share * (squared_px2 - self._mean_px2[seen])
 
     def misfits(self) -> dict[str, float]:
         """RMS residuals, pixels, of the robots above `MISFIT_PX`; logs each robot when it first appears."""

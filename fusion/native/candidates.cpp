@@ -102,9 +102,13 @@ ExpectedView expect(const ExpectedMarker& marker, const BodyInCamera& body, cons
     const Matrix C = marker.covariance(exposure.tau), &R = exposure.R_cam_world;
     const Vector gx = (1 / at.centre.z) * (R.r0 - at.x * R.r2), gy = (1 / at.centre.z) * (R.r1 - at.y * R.r2);
     const double depth_variance = dot(R.r2 * C, R.r2) / square(at.centre.z);
+    const Vector velocity = body.v_cam + cross(body.omega_cam, at.centre - body.t_cam);
+    const double shift =
+        exposure.tau_sigma / at.centre.z;  // the image of the motion in one standard deviation
+    const double sx = shift * (velocity.x - at.x * velocity.z), sy = shift * (velocity.y - at.y * velocity.z);
     return {at,
             marker.radius,
-            {dot(gx * C, gx), dot(gx * C, gy), dot(gy * C, gy)},
+            {dot(gx * C, gx) + sx * sx, dot(gx * C, gy) + sx * sy, dot(gy * C, gy) + sy * sy},
             square(kSizeSigma) + depth_variance};
 }
 

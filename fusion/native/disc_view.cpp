@@ -6,7 +6,8 @@ namespace roundel::fusion {
 BodyInCamera transform(const Body& body, const Exposure& exposure) {
     const Matrix R_world = rotation_from_vector(exposure.tau * body.omega) * body.R;
     const Vector from_camera = body.p + exposure.tau * body.v - exposure.centre;
-    return {exposure.R_cam_world * R_world, R_world, exposure.R_cam_world * from_camera};
+    const Matrix& R = exposure.R_cam_world;
+    return {R * R_world, R_world, R * from_camera, R * body.omega, R * body.v};
 }
 
 DiscView view_disc(const BodyInCamera& body, const Vector& position, double radius) {

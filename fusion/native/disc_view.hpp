@@ -18,8 +18,9 @@ constexpr double kNearM = 1e-3;  // discs with a smaller depth are not visible
 /// The pose of a camera at one capture time.
 struct Exposure {
     Matrix R_cam_world;
-    Vector centre;  // of projection, world frame
-    double tau;     // capture time minus the time of the body states, seconds
+    Vector centre;     // of projection, world frame
+    double tau;        // capture time minus the time of the body states, seconds
+    double tau_sigma;  // standard deviation of the capture time, seconds
 };
 
 /// The state of a moving body, world frame.
@@ -32,6 +33,7 @@ struct Body {
 struct BodyInCamera {
     Matrix R_cam, R_world;
     Vector t_cam;
+    Vector omega_cam, v_cam;  // angular velocity and velocity, camera frame
 };
 BodyInCamera transform(const Body& body, const Exposure& exposure);
 

@@ -231,6 +231,9 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     excluded: bool = False  # the camera was moved: its detections are excluded until it is recalibrated
     duplicate_publisher: bool = False  # two nodes publish under its name
     faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason
+    clock: str = "correct"  # or "excluded" while its stamps are wrong by an unknown time, or "corrected"
+    clock_correction_ms: float = 0.0  # added to its stamps
+    clock_sigma_ms: float = 0.0  # standard deviation of the correction
 
 
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,6 +13,7 @@ from camera_node.sources.observations import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.recordings.report import Summary
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import TrackingResult
@@ -58,7 +59,7 @@ def fuse_recording(
     """
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
-    yield from _fuse(_synchronize(messages, arena, summary.faults), tracker, arena, summary)
+    yield from _fuse(_synchronize(messages, tracker.clocks, arena, summary.faults), tracker, arena, summary)
 
 
 def fuse_frame_sets(
@@ -106,7 +107,10 @@ def read_detections(
 
 
 def _synchronize(
-    messages: Iterable[tuple[int, Detections]], arena: OfflineArena, faults: Counter[str]
+    messages: Iterable[tuple[int, Detections]],
+    clocks: CameraClocks,
+    arena: OfflineArena,
+    faults: Counter[str],
 ) -> Iterator[FrameSet]:
     synchronizer = FrameSynchronizer.at_rate(arena.rate_hz, arena.limits.lateness_ms)
     for received_ns, message in messages:
@@ -116,7 +120,12 @@ def _synchronize(
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            synchronizer.add(CalibratedFrame.of(message, camera))
+            frame = clocks.admit(CalibratedFrame.of(message, camera, received_ns))
+            if frame is not None:
+                synchronizer.add(frame)
+            else:
+                synchronizer.ignore(message.camera)
+                faults[f"frames of camera '{message.camera}', whose clock was wrong"] += 1
             yield from synchronizer.take(received_ns)
     for name, late in synchronizer.late.items():
         if late:

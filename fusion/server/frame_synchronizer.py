@@ -87,6 +87,11 @@ class FrameSynchronizer:
         self._newest_ns = max(self._newest_ns, frame.t_ns)
         return True
 
+    def ignore(self, name: str) -> None:
+        """Wait no longer for the frames of a camera, until one is added again."""
+        if name in self._cameras:
+            self._cameras[name].times.clear()
+
     def take(self, now_ns: int) -> list[FrameSet]:
         """The frame sets that are closed at `now_ns`: a server's time, or offline the newest capture time."""
         if self._end_ns is None and not self._try_start(now_ns):

@@ -16,7 +16,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.server.status import ServerStatistics
 
 MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
-MAX_AHEAD_NS = 200_000_000  # as is one in the future: clocks are aligned to milliseconds
+MAX_AHEAD_NS = 2_000_000_000  # as is one so far in the future; `CameraClocks` corrects or refuses the others
 MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a fault of the publisher
 MAX_BYTES = 1 << 19  # of a message; one with the most roundels has 240 kB
 MAX_DETECTIONS = (

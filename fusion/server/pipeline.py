@@ -12,7 +12,9 @@ from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
 from fusion.model.corrections import corrected_camera
+from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
+from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
@@ -189,6 +191,18 @@ class TrackingPipeline:
         frame_set, n_missing = self.synchronizer.open()
         if self.tracker is not None and frame_set is not None:
             self.early = self.tracker.associate_early(frame_set, n_missing, self.early)
+
+    def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
+        """A frame in corrected time; None while the clock of its camera is unknown, or if it is in the future."""
+        return self.tracker.clocks.admit(frame) if self.tracker else frame
+
+    def clocks(self) -> dict[str, ClockHealth]:
+        """The clocks of the cameras."""
+        return self.tracker.clocks.health() if self.tracker else {}
+
+    def excluded_clocks(self) -> set[str]:
+        """Cameras whose clocks are wrong by an unknown time."""
+        return self.tracker.clocks.excluded if self.tracker else set()
 
     def excluded_cameras(self) -> set[str]:
         """Cameras that were moved, whose detections are excluded."""

@@ -237,6 +237,7 @@ class Server:
             limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            clocks=self.pipeline.clocks(),
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
             not_acquired=self.pipeline.not_acquired(),
@@ -257,9 +258,15 @@ class Server:
         frame = self._ingest.receive(data, key, received_ns, self.pipeline.cameras)
         if frame is None:
             return
+        frame, name = self.pipeline.admit(frame), frame.camera
+        if frame is None:
+            self.pipeline.synchronizer.ignore(name)
+            if name not in self.pipeline.excluded_clocks():
+                self.statistics.count_fault("implausible time", name)
+            return
         age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns
         is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)
-        self.statistics.note_lateness(frame.camera, is_on_time, age_ns * 1e-6)
+        self.statistics.note_lateness(name, is_on_time, age_ns * 1e-6)
 
     def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
         """Use the rig of the leading shard."""

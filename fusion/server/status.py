@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fusion.model.limits import Limits
+from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
@@ -29,6 +30,7 @@ class PipelineStatus:
         limits: with which the server tracks.
         calibrated: cameras with a pose in the active rig.
         excluded: cameras that were moved, whose detections are excluded.
+        clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         not_acquired: why robots were not acquired, by name.
         unsaved_robots: names of the robots whose changes a restart would undo.
@@ -38,6 +40,7 @@ class PipelineStatus:
     limits: Limits | None = None
     calibrated: frozenset[str] = frozenset()
     excluded: frozenset[str] = frozenset()
+    clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
     unsaved_robots: tuple[str, ...] = ()
@@ -198,6 +201,7 @@ def memory_mb() -> float:
 def _camera_health(
     name: str, camera: _CameraCounts, seconds: float, pipeline: PipelineStatus
 ) -> CameraHealth:
+    clock = pipeline.clocks.get(name, ClockHealth())
     return CameraHealth(
         fps=len(camera.lateness_ms) / seconds,
         lateness_ms=float(np.mean(camera.lateness_ms)) if camera.lateness_ms else 0.0,
@@ -209,4 +213,7 @@ def _camera_health(
         excluded=name in pipeline.excluded,
         duplicate_publisher=camera.has_two_publishers,
         faults=dict(camera.faults),
+        clock=clock.state,
+        clock_correction_ms=clock.offset_ms,
+        clock_sigma_ms=clock.sigma_ms,
     )

@@ -14,6 +14,7 @@ from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import States
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
 from fusion.monitoring.geometry_check import GeometryCheck
 from fusion.monitoring.residual_monitor import ResidualMonitor
@@ -108,6 +109,7 @@ class Tracker:
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
+        self.clocks = CameraClocks(self.cameras, self.table.markers, self.table.single)
         self.extrinsics = ExtrinsicsMonitor()
         self.residuals = ResidualMonitor()
         self.geometry = GeometryCheck(self.table.names, self.table.single)
@@ -175,6 +177,8 @@ class Tracker:
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         update, markers = self._acquire(update)
+        table = self.table
+        self.clocks.observe(update.t_ns, table.states, table.tracked, update.detections, update.assignments)
         unlabeled = self._track_unlabeled(update, markers)
         return self._report(update, unlabeled)
 
@@ -184,7 +188,7 @@ class Tracker:
         """Compare the frames with the tracked robots; exclude moved cameras and apply recalibrated poses."""
         table, seen_by = self.table, result.summary.robot_cameras
         scene = TrackedScene(self.cameras, table.markers, table.states, table.tracked, seen_by)
-        corrections = self.extrinsics.check(frame_set, scene, self.shard.leads)
+        corrections = self.extrinsics.check(frame_set, scene, self.shard.leads, self.clocks.suspects)
         for correction in corrections:
             if correction.camera is not None:
                 self.cameras.place(correction.name, correction.camera)
@@ -192,6 +196,8 @@ class Tracker:
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
+        if camera.time_offset_ms != self.cameras[name].time_offset_ms:
+            self.clocks.reset(name)
         self.cameras.place(name, camera)
         (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)
 
@@ -203,6 +209,7 @@ class Tracker:
             renamed: old name -> new name.
         """
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
+        other.clocks.inherit(self.clocks)
         other.extrinsics, other.residuals = self.extrinsics, self.residuals
         other.acquires_none = self.acquires_none
         other.table.inherit(self.table, renamed)

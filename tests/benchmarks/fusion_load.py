@@ -160,7 +160,7 @@ class Scene:
         self, camera: int, states: States, rng: np.random.Generator, hidden: Collection[int] = ()
     ) -> Roundels:
         """The roundels in one frame of a camera; those of the robots in `hidden` are covered."""
-        exposures = Exposures(np.array([camera]), np.zeros(1))
+        exposures = Exposures.exact(np.array([camera]), np.zeros(1))
         n = len(self.marker_table)
         views = self.cameras.views(
             states, exposures, self.marker_table.discs(np.arange(n), np.zeros(n, np.intp))

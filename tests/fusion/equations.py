@@ -219,7 +219,11 @@ def candidates(
             scale = seen.scale[:, :, j]
             per_scale = np.linalg.inv(scale)
             noise = per_scale @ (seen.cov[:, :, j] + 0.7**2 * np.eye(2)) @ per_scale.T
-            C = J @ covariance[i] @ J.T + noise
+            k, f = discs.body[i], discs.frame[i]
+            R_body = rotation_from_vector(states.omega[k] * seen.exposures.tau[f]) @ states.R[k]
+            velocity = states.v[k] + np.cross(states.omega[k], R_body @ discs.position[:, i])
+            moved = J @ velocity * seen.exposures.tau_sigma[f]
+            C = J @ covariance[i] @ J.T + noise + np.outer(moved, moved)
             off = seen.xy[:, j] - views.xy[:, i]
             d2 = off @ np.linalg.solve(C, off)
             shape = outlines(views.centre[:, [i]], views.normal[:, [i]], discs.radius[[i]], scale[..., None])

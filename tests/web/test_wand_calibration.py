@@ -46,7 +46,7 @@ def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
 def test_a_wand_session_in_the_page_calibrates_the_cameras(
     arena: LiveArena, view: View, files: CalibrationFiles
 ):
-    """The rig and the recording are written, the view draws the cameras, and the page shows the grade."""
+    """The rig and the recording are written; the page shows the grade, and that no server has the rig in force."""
     sent = record(ARENA, 8.0)  # no noise
     with browsing(view) as page, open_client([arena.endpoint]) as session:
         page.get_by_role("button", name="Start wand session").click()
@@ -58,7 +58,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
             page.get_by_text(name).first.wait_for(timeout=20_000)
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
         page.get_by_role("button", name="End wand session").click()
-        page.get_by_text("; no server is running").wait_for(timeout=CALIBRATION_MS)
+        page.get_by_text("but not in force: no server answers").wait_for(timeout=CALIBRATION_MS)
         page.get_by_text("grade").first.wait_for(timeout=20_000)
         page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
     saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
@@ -66,7 +66,6 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
     assert len(saved) > len(sent) / 2
     rig = load_rig(files.rig)
     assert_near(rig, ARENA.truth, 1e-3, 1e-3)
-    wait_for(lambda: (shown := view.feed.state().rig) and shown.cameras == rig.cameras)
 
 
 def test_a_failed_calibration_names_the_recording(tmp_path: Path, files: CalibrationFiles):

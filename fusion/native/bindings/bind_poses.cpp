@@ -28,12 +28,12 @@ void make_bodies(BodyStates* self, const Rotations& R, const Positions& p, const
 }
 
 void make_exposures(CameraExposures* self, const Rotations& R_cam_world, const Positions& centres,
-                    const Numbers& tau) {
-    require_equal(tau.size(), {R_cam_world.shape(0), centres.shape(0)});
+                    const Numbers& tau, const Numbers& tau_sigma) {
+    require_equal(tau.size(), {R_cam_world.shape(0), centres.shape(0), tau_sigma.size()});
     CameraExposures exposures;
     for (size_t f = 0; f < tau.size(); ++f)
         exposures.push_back(
-            {matrix_at(R_cam_world.data() + 9 * f), vector_at(centres.data() + 3 * f), tau(f)});
+            {matrix_at(R_cam_world.data() + 9 * f), vector_at(centres.data() + 3 * f), tau(f), tau_sigma(f)});
     new (self) CameraExposures(std::move(exposures));
 }
 

@@ -67,7 +67,7 @@ FramePoses poses_of(Random& random, size_t bodies, size_t frames, double wild) {
     std::vector<Exposure> exposures;
     for (size_t f = 0; f < frames; ++f)
         exposures.push_back({rotation_from_vector(random.vector(1, wild)), random.vector(3, wild),
-                             random.number(0.01, wild)});
+                             random.number(0.01, wild), random.number(0.01, wild)});
     return {all, exposures};
 }
 

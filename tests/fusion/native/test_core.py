@@ -169,6 +169,10 @@ def test_candidates_are_the_pairs_within_the_gates():
     states, seen = scene()
     exposures, discs = seen.detections.exposures, seen.discs
     random = np.random.default_rng(3)
+    exposures = replace(
+        exposures, tau_sigma=random.uniform(0, 0.05, len(exposures.tau))
+    )  # 100 px/s: up to 5 px
+    seen = replace(seen, detections=replace(seen.detections, exposures=exposures))
     states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)
     rows = random.choice(len(discs), 100, replace=False)
     expected = _core.ExpectedMarkers(
@@ -223,7 +227,7 @@ def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
     R = rotation_from_vector(np.outer(tilt, [1.0, 0.0, 0.0])) @ up
     still = np.zeros((n, 3))
     ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
-    exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1))
+    exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     poses = _core.FramePoses(_core.BodyStates(R, ahead, still, still), exposures)
     discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04))
     scale = np.tile(800 * np.eye(2)[..., None], n)

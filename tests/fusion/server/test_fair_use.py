@@ -83,7 +83,7 @@ def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
                 stack.enter_context(PublishingCamera(server.endpoint, name, HZ, Flood(n)))
             wait_for(lambda: observer.status().cameras.get("cam3"))
             during = observer.collect(SECONDS)
-        assert_undisturbed(before, during)
+        assert latency_ms(during) < SLOWER * max(latency_ms(before), FLOOR_MS)
 
 
 @pytest.mark.parametrize(

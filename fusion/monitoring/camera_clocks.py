@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
+
+    arrival of a frame   -> `StampCheck`: its stamp jumped?             -> excluded from this frame on
+    every frame set      -> `offset_information`: one camera off?       -> excluded
+    an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
+    slow information     -> `disagreement` with image shifts: a drift?  -> corrected while in use
+
+See docs/time_offsets.md.
+"""
+
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from camera_node.arrays import Mask
+from fusion.model.camera_array import CameraArray
+from fusion.model.frames import CalibratedFrame
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.states import States
+from fusion.monitoring.stamp_check import StampCheck
+from fusion.monitoring.time_offsets import OffsetInformation, disagreement, offset_information
+from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_time_shift
+
+log = logging.getLogger("fusion")
+ClockState = Literal["correct", "excluded", "corrected"]
+
+COMPARED_NS, CHECKED_NS = 45_000_000, 500_000_000  # between comparisons, and between searches for a drift
+FAST_NS = 120_000_000  # of frame sets that show a jump
+SLOW_S = 8.0  # time constant of the information that shows a drift
+JUMP_PX, DRIFT_PX = 1.5, 0.4  # RMS image motion that an offset must explain
+MIN_DRIFT_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest correction of a drift
+MIN_SLOW_NS = 1_500_000_000  # of frame sets, for a correction of a drift
+KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
+MAX_KEPT = 200  # frames of an excluded camera
+SEARCH_NS = 100_000_000  # between searches
+MIN_EXPECTED = 16  # moving markers, for a decision
+GIVE_UP_NS = 1_500_000_000  # without an explanation by time: above `RANGE_S`, so that the history covers it
+STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the arrival decides
+ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
+PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
+MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
+MAX_MARKERS = 96  # observations of a frame set that are compared
+MIN_SPEED_M_S = 0.03  # of a robot that is compared
+UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
+MAX_SPREAD_S = 0.1  # standard deviation of all stamps meanwhile
+HELD_NS = 3_000_000_000  # after such a contradiction no camera counts as moved
+
+
+@dataclass(frozen=True, slots=True)
+class ClockHealth:
+    """A camera's clock: state, correction of its stamps in ms, and the standard deviation of the correction."""
+
+    state: ClockState = "correct"
+    offset_ms: float = 0.0
+    sigma_ms: float = 0.0
+
+
+@dataclass(slots=True)
+class _Clock:
+    """One camera.
+
+    Attributes:
+        correction_ns, sigma_s: added to its stamps, and the standard deviation.
+        frames: the last frames, with the present correction.
+        since_ns: server time of the exclusion; 0 while the camera is in use.
+        has_jumped: whether the arrival of its frames shows a jump.
+        searched_ns, trusted_ns: times of the last search, and until which no evidence of the same kind counts.
+    """
+
+    state: ClockState = "correct"
+    correction_ns: int = 0
+    sigma_s: float = 0.0
+    check: StampCheck = field(default_factory=StampCheck)
+    frames: deque[CalibratedFrame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
+    since_ns: int = 0
+    has_jumped: bool = False
+    searched_ns: int = 0
+    trusted_ns: int = 0
+
+
+class CameraClocks:
+    """The clocks of all cameras of a rig.
+
+    Frames pass `admit` before they form frame sets, and `observe` takes each frame set after the update.
+
+    Args:
+        cameras: cameras of the rig.
+        markers: of all robots.
+        single: as in `Estimator`.
+    """
+
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask) -> None:
+        self._cameras, self._markers, self._single = cameras, markers, single
+        self._clocks = {name: _Clock() for name in cameras.names}
+        self._history: deque[Snapshot] = deque()
+        self._fast: deque[tuple[int, OffsetInformation]] = deque()
+        self._slow, self._slow_since_ns = OffsetInformation.none(len(cameras.names)), 0
+        self._now_ns = self._undecided_ns = self._reported_ns = 0
+        self._compared_ns = self._checked_ns = 0
+        self._undecided_s = 0.0
+
+    @property
+    def excluded(self) -> set[str]:
+        """Names of the cameras whose frames are held back until their clocks are known."""
+        return {name for name, clock in self._clocks.items() if clock.state == "excluded"}
+
+    def health(self) -> dict[str, ClockHealth]:
+        """By camera."""
+        return {
+            name: ClockHealth(clock.state, clock.correction_ns * 1e-6, clock.sigma_s * 1e3)
+            for name, clock in self._clocks.items()
+        }
+
+    def inherit(self, old: "CameraClocks") -> None:
+        """Continue with the clocks of the same cameras; the history of other robots is dropped."""
+        self._clocks = old._clocks
+
+    def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
+        """The frame in corrected time; None while its camera is excluded, or if that time is in the future."""
+        clock = self._clocks[frame.camera]
+        has_jumped = clock.check.has_jumped(frame.t_ns, frame.received_ns)
+        sigma_s = np.sqrt(frame.clock_sigma_s**2 + clock.sigma_s**2 + self._common_sigma_s() ** 2)
+        frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=float(sigma_s))
+        if has_jumped and clock.state != "excluded" and frame.received_ns > clock.trusted_ns:
+            self._exclude(clock, frame.received_ns, 0)
+            clock.has_jumped = True
+        clock.frames.append(frame)
+        if clock.state == "excluded" or frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
+            return None
+        while clock.frames[0].t_ns < frame.t_ns - KEPT_NS:
+            clock.frames.popleft()
+        return frame
+
+    def observe(
+        self, t_ns: int, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
+    ) -> None:
+        """Compare the cameras in a frame set.
+
+        Args:
+            t_ns: time of the frame set.
+            states: after the update.
+            tracked: (R,) robots with status `tracked`.
+            detections: of the frame set.
+            assignments: of the detections.
+        """
+        self._now_ns = t_ns
+        self._history.append(Snapshot(t_ns, states, tracked))
+        while self._history[0].t_ns < t_ns - (RANGE_S + 0.5) * 1e9:
+            self._history.popleft()
+        if t_ns >= self._compared_ns + COMPARED_NS:
+            self._compare(states, tracked, detections, assignments)
+        for name in self.excluded:
+            self._search(name)
+
+    def suspects(self, name: str) -> bool:
+        """Whether time explains the last detections of a camera, which is then excluded here, or may explain them."""
+        clock = self._clocks[name]
+        if clock.state != "excluded":
+            shift = self._shift(name, clock)
+            if self._is_undecided():
+                return True
+            if shift is None or not shift.explains(MIN_EXPECTED) or shift.is_zero:
+                return False
+            self._exclude(clock, self._now_ns, KEPT_NS)
+            self._search(name)
+        return True
+
+    def reset(self, name: str) -> None:
+        """Forget the clock of a camera that has another calibration."""
+        self._clocks[name] = _Clock()
+        self._forget()
+
+    def _is_undecided(self) -> bool:
+        """Whether cameras contradicted each other lately and no majority decided."""
+        return bool(self._undecided_ns) and self._now_ns < self._undecided_ns + HELD_NS
+
+    def _common_sigma_s(self) -> float:
+        """The standard deviation of all stamps, as long as it is not known which of them are wrong."""
+        return self._undecided_s if self._is_undecided() else 0.0
+
+    # Evidence.
+
+    def _compare(
+        self, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
+    ) -> None:
+        """Compare the cameras by the robots that move."""
+        interval_s = min((self._now_ns - self._compared_ns) * 1e-9, SLOW_S)
+        self._compared_ns = self._now_ns
+        moving = np.linalg.norm(states.v, axis=1) > MIN_SPEED_M_S
+        chosen = self._choose(states, tracked & moving, detections, assignments)
+        if len(chosen):
+            observations = MatchedObservations.of(chosen, detections, self._markers)
+            info = offset_information(self._cameras, states, observations, self._single)
+            self._find_jumps(info)
+            self._find_drifts(info, interval_s)
+
+    def _choose(
+        self, states: States, robots: Mask, detections: DetectionTable, assignments: Assignments
+    ) -> Assignments:
+        """Observations of the fastest of these robots, `MAX_MARKERS` at most."""
+        robot = self._markers.robot[assignments.marker]
+        count = np.bincount(robot, minlength=len(robots))
+        order = np.argsort(-np.linalg.norm(states.v, axis=1) * robots)
+        fits = robots[order] & (np.cumsum(count[order]) <= max(MAX_MARKERS, count[order][:1].sum()))
+        return assignments.select(np.isin(robot, order[fits]))
+
+    def _offsets_s(self) -> np.ndarray:
+        """(C,) corrections in use."""
+        return np.array([self._clocks[name].correction_ns * 1e-9 for name in self._cameras.names])
+
+    def _find_jumps(self, info: OffsetInformation) -> None:
+        """Exclude the cameras that the last frame sets contradict."""
+        self._fast.append((self._now_ns, info))
+        while self._fast[0][0] < self._now_ns - FAST_NS:
+            self._fast.popleft()
+        total = OffsetInformation.none(len(self._cameras.names))
+        for _, part in self._fast:
+            total = total.plus(part)
+        found = disagreement(total, JUMP_PX)
+        if found is None:
+            return
+        if not found.cameras:
+            self._report_undecided(found.spread_s)
+            return
+        for k in found.cameras:
+            clock = self._clocks[self._cameras.names[k]]
+            if clock.state != "excluded" and self._now_ns > clock.trusted_ns:
+                self._exclude(clock, self._now_ns, FAST_NS)
+        self._forget()
+
+    def _find_drifts(self, info: OffsetInformation, interval_s: float) -> None:
+        """Correct the cameras that depart slowly from the others."""
+        n = len(self._cameras.names)
+        kept = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
+        self._slow = kept.plus(info.relative_to(-self._offsets_s()))
+        self._slow_since_ns = self._slow_since_ns or self._now_ns
+        if self._now_ns < max(self._slow_since_ns + MIN_SLOW_NS, self._checked_ns + CHECKED_NS):
+            return
+        self._checked_ns = self._now_ns
+        found = disagreement(self._slow.relative_to(self._offsets_s()), DRIFT_PX, has_shifts=True)
+        for k, offset_s, sigma_s in zip(*found.columns, strict=True) if found else ():
+            if MIN_DRIFT_S < abs(offset_s) < MAX_DRIFT_S:
+                self._correct_drift(self._cameras.names[k], offset_s, sigma_s)
+
+    # Changes.
+
+    def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
+        """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
+        clock.state, clock.since_ns, clock.has_jumped = "excluded", now_ns, False
+        while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
+            clock.frames.popleft()
+        if not back_ns:
+            clock.frames.clear()
+        clock.searched_ns = now_ns
+
+    def _shift(self, name: str, clock: _Clock) -> TimeShift | None:
+        return find_time_shift(self._cameras, name, tuple(clock.frames), tuple(self._history), self._markers)
+
+    def _search(self, name: str) -> None:
+        """Find the time of an excluded camera's frames, and use it again if this is known."""
+        clock = self._clocks[name]
+        if self._now_ns < clock.searched_ns + SEARCH_NS:
+            return
+        clock.searched_ns = self._now_ns
+        shift, waited_ns = self._shift(name, clock), self._now_ns - clock.since_ns
+        jump_ns = clock.check.jump_ns() if clock.has_jumped else None
+        if (
+            shift is not None
+            and shift.explains(MIN_EXPECTED)
+            and (jump_ns is None or shift.resolves(jump_ns * 1e-9))
+        ):
+            if shift.is_zero:
+                self._readmit(clock)
+            elif shift.is_told_apart:
+                self._correct_jump(name, shift.offset_s, shift.sigma_s)
+        elif jump_ns is not None and waited_ns > STATIC_NS:
+            self._correct_jump(name, -jump_ns * 1e-9, ARRIVAL_SIGMA_S)
+        elif waited_ns > GIVE_UP_NS:
+            self._readmit(clock)
+
+    def _readmit(self, clock: _Clock) -> None:
+        """Use a camera again whose clock is not at fault."""
+        clock.state = "corrected" if clock.correction_ns else "correct"
+        clock.trusted_ns = self._now_ns + PAUSE_NS
+        self._forget()
+
+    def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
+        clock = self._clocks[name]
+        self._set(clock, clock.correction_ns + round(offset_s * 1e9), sigma_s)
+        clock.frames.clear()
+        at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
+        message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
+        log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s)
+
+    def _correct_drift(self, name: str, offset_s: float, sigma_s: float) -> None:
+        clock = self._clocks[name]
+        self._set(clock, clock.correction_ns + round(offset_s * 1e9), sigma_s)
+        log.warning(
+            "camera %s: its clock drifts from those of the other cameras; its stamps are corrected by %.1f ms",
+            name,
+            clock.correction_ns * 1e-6,
+        )
+
+    def _set(self, clock: _Clock, correction_ns: int, sigma_s: float) -> None:
+        clock.state, clock.correction_ns, clock.sigma_s = "corrected", correction_ns, sigma_s
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop the information of frames with earlier corrections or of excluded cameras."""
+        self._fast.clear()
+        self._slow, self._slow_since_ns = OffsetInformation.none(len(self._cameras.names)), 0
+
+    def _report_undecided(self, spread_s: float) -> None:
+        self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)
+        if self._now_ns > self._reported_ns + UNDECIDED_NS:
+            self._reported_ns = self._now_ns
+            log.warning(
+                "the stamps of the cameras contradict each other, and it is not clear which of them are wrong; "
+                "check the clocks of %s",
+                ", ".join(self._cameras.names),
+            )

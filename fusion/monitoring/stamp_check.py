@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compares the stamps of a camera with the arrival of its frames: evidence of a jump in its first frame."""
+
+from collections import deque
+
+import numpy as np
+
+HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
+MIN_JUMP_NS = 4_000_000
+MIN_IRREGULAR = 0.1  # of the interval between frames
+MAX_GAP = 5  # intervals; a longer gap of a recording may be a jump
+
+
+class StampCheck:
+    """The lags between stamps and arrivals of one camera, and its usual interval.
+
+    A stamp that is too late gives a lag below all earlier ones: no frame arrives before it is sent; the interval to
+    the stamp before it is unusual, unlike those of queued frames that arrive together. A stamp that is too
+    early gives a longer lag, as a slow network does; but then the interval between the stamps is irregular. In a
+    recording without arrival times, where all lags are equal, only the interval counts.
+    """
+
+    def __init__(self) -> None:
+        self._usual_ns: float | None = None  # lag before the last jump
+        self._lags: deque[int] = deque(maxlen=HISTORY)
+        self._stamps: deque[int] = deque(maxlen=LEARNED)
+
+    def has_jumped(self, t_ns: int, received_ns: int) -> bool:
+        """Whether the stamp `t_ns` of the next frame jumped; the frames before it are forgotten then."""
+        lag, jumped = received_ns - t_ns, False
+        if len(self._lags) >= LEARNED:
+            first, usual, late, last = np.percentile(self._lags, [0, 50, 95, 100])
+            is_known = not first == last == lag
+            is_early = lag < first - MIN_JUMP_NS and not self._is_next(t_ns)
+            is_late = (lag > late + MIN_JUMP_NS or not is_known) and self._is_irregular(t_ns)
+            jumped = is_early or is_late or (not is_known and self._is_after_gap(t_ns))
+            if jumped:
+                self._usual_ns = float(usual) if is_known else None
+                self._lags.clear()
+                self._stamps.clear()
+        self._lags.append(lag)
+        self._stamps.append(t_ns)
+        return jumped
+
+    def jump_ns(self) -> float | None:
+        """By how much the stamps jumped, from the lags before and since; None if arrivals do not show it."""
+        return None if self._usual_ns is None else self._usual_ns - float(np.median(self._lags))
+
+    def _interval_ns(self) -> float:
+        return max(1.0, float(np.median(np.diff(self._stamps))))
+
+    def _is_irregular(self, t_ns: int) -> bool:
+        """Whether the time since the last stamp is no multiple of the usual interval."""
+        interval, since = self._interval_ns(), t_ns - self._stamps[-1]
+        return abs(since - max(1, round(since / interval)) * interval) > MIN_IRREGULAR * interval
+
+    def _is_next(self, t_ns: int) -> bool:
+        """Whether one usual interval passed since the last stamp; a lag that falls is then that of queued frames."""
+        interval = self._interval_ns()
+        return abs(t_ns - self._stamps[-1] - interval) <= MIN_IRREGULAR * interval
+
+    def _is_after_gap(self, t_ns: int) -> bool:
+        return t_ns - self._stamps[-1] > MAX_GAP * self._interval_ns()

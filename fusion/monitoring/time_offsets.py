@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Estimates the time offsets of all cameras together from moving robots; docs/time_offsets.md derives it.
+
+A stamp that is off by d moves a detection by d times the image velocity of its marker; a camera that was moved
+slightly shifts all detections alike. Poses and velocities of the robots are free in each frame set, so the estimate
+depends on no history: it compares the cameras of the set with each other.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from camera_node.arrays import Array, Index, Mask
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import MatchedObservations
+from fusion.model.states import POSITION, THETA, States
+
+SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detection
+FREE = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # pose and velocity of a state, which a wrong clock displaces too
+WEAK = np.repeat([1.0, 1.0, 4.0], 3)  # their prior information: 1 / rad^2, 1 / m^2, s^2 / m^2
+REWEIGHTED = 1  # times: by the residuals that offsets do not explain
+CAUCHY = 4.0  # standard deviations, as in docs/fusion_filter.md section 4
+SHIFT_PX = 2.0  # prior standard deviation of the shift of an image by calibration errors or a touch
+SIGMAS = 5.0  # by which an offset must differ from those of the majority
+EXPLAINED = 0.85  # of the contradiction, by the cameras at fault
+MAX_GROUP = 3  # cameras at fault at the same time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OffsetInformation:
+    """Least squares about the time offsets and image shifts of C cameras: M (offsets, shifts) = y.
+
+    Attributes:
+        M: (3 C, 3 C) information: offsets in s, then the shifts (u, v) of each camera in px.
+        y: (3 C,) right side.
+        motion_px2: (C,) sum of squared image speeds, px^2/s^2; with `count` (C,) detections.
+    """
+
+    M: Array
+    y: Array
+    motion_px2: Array
+    count: Array
+
+    @classmethod
+    def none(cls, n_cameras: int) -> "OffsetInformation":
+        """No information about this many cameras."""
+        zeros = np.zeros(n_cameras)
+        return cls(np.zeros((3 * n_cameras, 3 * n_cameras)), np.zeros(3 * n_cameras), zeros, zeros)
+
+    def plus(self, other: "OffsetInformation", share: float = 1.0) -> "OffsetInformation":
+        """The sum of both, the other one with a weight."""
+        return OffsetInformation(*(getattr(self, k) + share * getattr(other, k) for k in self.__slots__))
+
+    def relative_to(self, offsets: Array) -> "OffsetInformation":
+        """The same about the offsets (C,) minus these."""
+        return replace(self, y=self.y - self.M[:, : len(offsets)] @ offsets)
+
+    def without_shifts(self) -> tuple[Array, Array]:
+        """M (C, C) and y (C,) of the offsets alone, if no image is shifted."""
+        n = len(self.count)
+        return self.M[:n, :n], self.y[:n]
+
+    def with_unknown_shifts(self) -> tuple[Array, Array]:
+        """M (C, C) and y (C,) of the offsets alone, the shifts eliminated."""
+        n = len(self.count)
+        S = self.M[n:, n:] + np.eye(2 * n) / SHIFT_PX**2
+        eliminated = np.linalg.solve(S, np.column_stack([self.M[n:, :n], self.y[n:]]))
+        return self.M[:n, :n] - self.M[:n, n:] @ eliminated[:, :-1], self.y[:n] - self.M[:n, n:] @ eliminated[
+            :, -1
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Disagreement:
+    """Cameras whose clocks contradict the others.
+
+    Attributes:
+        cameras: indices of the smallest group whose offsets explain the contradiction; empty if several groups of less
+            than half of the cameras do, or none.
+        offsets_s, sigma_s: of these, by which the clocks differ from those of the others.
+        spread_s: RMS of the offsets of all cameras.
+    """
+
+    cameras: tuple[int, ...] = ()
+    offsets_s: tuple[float, ...] = ()
+    sigma_s: tuple[float, ...] = ()
+    spread_s: float = 0.0
+
+    @property
+    def columns(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+        """Cameras, offsets and standard deviations."""
+        return self.cameras, self.offsets_s, self.sigma_s
+
+
+def offset_information(
+    cameras: CameraArray, states: States, observations: MatchedObservations, single: Mask
+) -> OffsetInformation:
+    """The information of one frame set about the time offsets of the cameras; the states of robots are eliminated.
+
+    Args:
+        cameras: C cameras.
+        states: bodies at the time of the frame set.
+        observations: N detections with their discs.
+        single: as in `Estimator`.
+    """
+    n = len(cameras.names)
+    if not len(observations):
+        return OffsetInformation.none(n)
+    A, g, e = _equations(cameras, states, observations, single)
+    body = np.unique(observations.discs.body, return_inverse=True)[1]
+    camera = observations.detections.camera
+    J = _jacobian(A, np.concatenate([g[:, :, None], _whitened_shifts(observations)], 2), body, camera, n)
+    k, weights = J.shape[2] - 3 * n, np.ones(len(e))
+    states_prior = np.tile(WEAK, k // len(WEAK))
+    prior = np.concatenate([states_prior, np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
+    H, right = _normal_equations(J, e, weights)
+    for _ in range(REWEIGHTED):
+        solution = np.linalg.solve(H + np.diag(prior), right)
+        weights = 1 / (1 + np.sum((e - J @ solution) ** 2, 1) / CAUCHY**2)
+        H, right = _normal_equations(J, e, weights)
+    H[np.arange(k), np.arange(k)] += states_prior
+    by_pose = np.linalg.solve(H[:k, :k], np.column_stack([H[:k, k:], right[:k]]))
+    motion = np.sum(g**2, axis=1) * _variance_px2(observations)
+    return OffsetInformation(
+        H[k:, k:] - H[k:, :k] @ by_pose[:, :-1],
+        right[k:] - H[k:, :k] @ by_pose[:, -1],
+        np.bincount(camera, motion, n).astype(float),
+        np.bincount(camera, minlength=n).astype(float),
+    )
+
+
+def disagreement(
+    info: OffsetInformation, min_shift_px: float, has_shifts: bool = False
+) -> Disagreement | None:
+    """The cameras whose offsets differ from those of the others; None if none differs.
+
+    A common offset of all cameras is unobservable. So the smallest group of cameras is searched whose offsets, with
+    those of the others zero, explain as much as all offsets do.
+
+    Args:
+        info: of some frame sets.
+        min_shift_px: RMS image motion that an offset must explain: calibration errors explain less.
+        has_shifts: whether images may be shifted too; then offsets are known only where motions differ.
+    """
+    M, y = info.with_unknown_shifts() if has_shifts else info.without_shifts()
+    known = np.flatnonzero((info.count > 0) & (np.diag(M) > 1.0))
+    M, y = M[np.ix_(known, known)], y[known]
+    speed_px = np.sqrt(info.motion_px2[known] / info.count[known])
+    if len(known) < 2 or float(np.max(np.abs(y) / np.diag(M) * speed_px)) < min_shift_px:
+        return None
+    offsets = np.linalg.pinv(M, rcond=1e-6, hermitian=True) @ y
+    total = float(y @ offsets)
+    if total < SIGMAS**2:
+        return None
+    group = _smallest_group(M, y, EXPLAINED * total)
+    if not group:
+        return Disagreement(spread_s=float(np.std(offsets)))
+    inverse = np.linalg.inv(M[np.ix_(group, group)])
+    found, sigma = inverse @ y[list(group)], np.sqrt(np.diag(inverse))
+    shift_px = np.abs(found) * speed_px[list(group)]
+    if (np.abs(found) < SIGMAS * sigma).any() or (shift_px < min_shift_px).any():
+        return None
+    cameras = tuple(known[list(group)].tolist())
+    return Disagreement(cameras, tuple(found.tolist()), tuple(sigma.tolist()), float(np.std(offsets)))
+
+
+def _smallest_group(M: Array, y: Array, explained: float) -> tuple[int, ...]:
+    """The only smallest group of less than half of the cameras that explains so much; empty if there is none."""
+    n = len(y)
+    for size in range(1, min((n - 1) // 2, MAX_GROUP) + 1):
+        groups = np.array(list(combinations(range(n), size)))
+        right = y[groups]
+        solved = np.linalg.solve(M[groups[:, :, None], groups[:, None]], right[..., None])[..., 0]
+        good = np.flatnonzero(np.sum(right * solved, 1) >= explained)
+        if len(good):
+            return tuple(groups[good[0]].tolist()) if len(good) == 1 else ()
+    return ()
+
+
+def _equations(
+    cameras: CameraArray, states: States, observations: MatchedObservations, single: Mask
+) -> tuple[Array, Array, Array]:
+    """Whitened derivatives by `FREE` (N, 2, 9) and by the time (N, 2), and residuals (N, 2); zero if not visible."""
+    discs, seen = observations.discs, observations.detections
+    cov = seen.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
+    whiten = MatchedObservations.of_discs(replace(seen, cov=cov), discs).whiten
+    poses = cameras.frame_poses(states, seen.exposures)
+    rows = poses.linearize_centres(discs.columns, seen.xy, whiten, single)
+    spin = np.einsum("nji,nj->ni", states.R, states.omega)[discs.body]  # body frame
+    g = np.einsum("nai,ni->na", rows[:, :, THETA], spin)
+    g += np.einsum("nai,ni->na", rows[:, :, POSITION], states.v[discs.body])
+    return rows[:, :, FREE], g, rows[:, :, 12]
+
+
+def _jacobian(A: Array, by_camera: Array, body: Index, camera: Index, n_cameras: int) -> Array:
+    """(N, 2, 9 B + 3 C): the free states of B bodies, then the time offsets of C cameras, then their image shifts.
+
+    Args:
+        A: (N, 2, 9) by the free states.
+        by_camera: (N, 2, 3) by the time offset and the image shift.
+        body, camera: (N,).
+        n_cameras: C.
+    """
+    size = A.shape[2]
+    k = size * (int(body.max()) + 1)
+    J, rows = np.zeros((len(A), 2, k + 3 * n_cameras)), np.arange(len(A))[:, None]
+    J[rows, :, size * body[:, None] + np.arange(size)] = A.transpose(0, 2, 1)
+    shift = k + n_cameras + 2 * camera
+    columns = np.stack([k + camera, shift, shift + 1], 1)
+    J[rows, :, columns] = by_camera.transpose(0, 2, 1)
+    return J
+
+
+def _whitened_shifts(observations: MatchedObservations) -> Array:
+    """(N, 2, 2) whitened derivatives by a shift of the image: L^-1, where L L^T is the covariance."""
+    cov = observations.detections.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov.transpose(2, 0, 1))), float)
+
+
+def _normal_equations(J: Array, e: Array, weights: Array) -> tuple[Array, Array]:
+    flat, root = J.reshape(-1, J.shape[2]), np.repeat(np.sqrt(weights), 2)
+    weighted = flat * root[:, None]
+    return weighted.T @ weighted, weighted.T @ (e.reshape(-1) * root)
+
+
+def _variance_px2(observations: MatchedObservations) -> Array:
+    """(N,) mean variance of a whitened coordinate, px^2."""
+    cov = observations.detections.cov
+    return (cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2
