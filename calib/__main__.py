@@ -7,10 +7,11 @@ from typing import Annotated
 
 import tyro
 
+from calib.commands.apply import Apply
 from calib.commands.check import Check
 from calib.commands.intrinsics import Intrinsics
 from calib.commands.plan import PlanArena
-from calib.commands.undo import Undo
+from calib.commands.undo import Redo, Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
 from camera_node.errors import run
@@ -23,6 +24,8 @@ Command = (
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[PlanArena, tyro.conf.subcommand("plan")]
     | Annotated[Undo, tyro.conf.subcommand("undo")]
+    | Annotated[Redo, tyro.conf.subcommand("redo")]
+    | Annotated[Apply, tyro.conf.subcommand("apply")]
 )
 
 

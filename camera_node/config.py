@@ -128,6 +128,12 @@ def _represent_list(dumper: yaml.SafeDumper, data: list | tuple) -> yaml.Node:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
 
 
+def _represent_text(dumper: yaml.SafeDumper, data: str) -> yaml.Node:
+    """Text with control characters or odd line breaks is read back as it was only from double quotes."""
+    return dumper.represent_scalar("tag:yaml.org,2002:str", data, style=None if data.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _represent_text)
 _Dumper.add_representer(list, _represent_list)
 _Dumper.add_representer(tuple, _represent_list)
 _Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))

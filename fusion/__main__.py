@@ -10,18 +10,18 @@ from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
 from fusion.commands.serve import Serve
 
-# modules of fusion.commands
-COMMANDS = (
-    "run",
-    "replay",
-    "record",
-    "repair",
-    "health",
-    "doctor",
-    "define",
-    "undo",
-    "ros2",
-)  # modules of fusion.commands
+COMMANDS = {  # and their modules in fusion.commands
+    "run": "run",
+    "replay": "replay",
+    "record": "record",
+    "repair": "repair",
+    "health": "health",
+    "doctor": "doctor",
+    "define": "define",
+    "undo": "undo",
+    "redo": "undo",
+    "ros2": "ros2",
+}
 
 
 def main() -> None:
@@ -31,12 +31,12 @@ def main() -> None:
 
 
 def _program() -> int:
-    check_command(sys.argv[1:], COMMANDS)
+    check_command(sys.argv[1:], tuple(COMMANDS))
     name, *arguments = sys.argv[1:] or [""]
     if name not in COMMANDS:
         return tyro.cli(Serve, prog="fusion").run()
     # imported on demand: a robot's computer has neither GTSAM nor SciPy
-    command = getattr(import_module(f"fusion.commands.{name}"), name)
+    command = getattr(import_module(f"fusion.commands.{COMMANDS[name]}"), name)
     return tyro.cli(command, prog=f"fusion {name}", args=arguments)
 
 

@@ -18,7 +18,7 @@ SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")
 
 
 class LiveControls:
-    """Requests a camera's image, and undoes the correction of a moved camera."""
+    """Requests a camera's image, and undoes and redoes changes of the rig."""
 
     def __init__(self, server: viser.ViserServer, subscription: Subscription) -> None:
         self.server, self.subscription = server, subscription
@@ -29,9 +29,9 @@ class LiveControls:
             gui.add_button("Take a snapshot").on_click(lambda _: self.show_snapshot())
             self._answer = gui.add_markdown("")
             self._image: Any = None
-        with gui.add_folder("Moved cameras"):
-            undo = gui.add_button("Undo the last correction")
-            undo.on_click(lambda _: set_content(self._outcome, escape_markdown(self.subscription.undo())))
+        with gui.add_folder("Changes of the rig"):
+            gui.add_button("Undo the last change").on_click(lambda _: self._show(subscription.undo()))
+            gui.add_button("Redo").on_click(lambda _: self._show(subscription.redo()))
             self._outcome = gui.add_markdown("")
 
     def update(self, state: ArenaState) -> None:
@@ -39,6 +39,9 @@ class LiveControls:
         names = tuple(sorted(state.cameras)) or (NO_CAMERA,)
         if names != tuple(self._camera.options):
             self._camera.options = names
+
+    def _show(self, outcome: str) -> None:
+        set_content(self._outcome, escape_markdown(outcome))
 
     def show_snapshot(self) -> None:
         """Request the current image of the selected camera and show it."""

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import web
-from calib.live.collect import publish_rig
+from calib.live.rig_requests import set_rig
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
@@ -165,7 +165,7 @@ class Demo:
             raise ProgramFailed(f"the calibration has no pose for {', '.join(sorted(missing))}")
         positions = {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
         aligned, errors_m = align_cameras(rig, positions)
-        publish_rig(self.session, ARENA, aligned)
+        set_rig(self.session, ARENA, aligned, "web --demo")
         error = f"position errors up to {1e3 * max(errors_m.values()):.2f} mm"
         print(f"calibrated: {len(errors_m)} cameras, {error}", flush=True)
 

@@ -43,6 +43,7 @@ class ArenaState:
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
     rig: Rig | None = None
+    rig_t_ns: int | None = None  # since when it is in force, server's time
     server_alive: bool = False
     message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
@@ -148,7 +149,7 @@ class Feed:
         self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
-        self._state.rig = message.rig()
+        self._state.rig, self._state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(
         self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Connects a feed to a running arena over Zenoh, and sends requests to its programs."""
 
+import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
 
+from calib.live.rig_requests import redo_rig, undo_rig
+from calib.rig.messages import RigMessage
 from camera_node.errors import RoundelError
+from camera_node.protocol.messages import MessageError, decode
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Markers, RobotsRequest
-from fusion.protocol.requests import change_robots, undo_correction
+from fusion.protocol.messages import FusionStatus, Markers, RobotsRequest
+from fusion.protocol.requests import change_robots
 from web.feed import Feed
 
 REQUEST_TIMEOUT_S = 2.0
@@ -24,9 +29,9 @@ class Subscription:
         keys = feed.keys
         self._entities: list[Any] = [self._subscribe(key_expr) for key_expr in feed.key_exprs]
         self._entities += [
-            # The liveliness token may arrive before the rig's queryable exists: each status asks again until
-            # there is a rig.
-            session.declare_subscriber(keys.fusion_status, lambda _: self._request_missing_rig()),
+            # The liveliness token may arrive before the rig's queryable exists, and a published rig may be dropped
+            # under congestion: each status of another rig asks again.
+            session.declare_subscriber(keys.fusion_status, self._request_new_rig),
             session.liveliness().declare_subscriber(keys.fusion_alive, self._server_changed, history=True),
         ]
 
@@ -50,12 +55,19 @@ class Subscription:
         change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
-        """Have the server undo the last correction of a moved camera; return the outcome as text."""
+        """Have the server undo the last change of its rig; return the outcome as text."""
+        return self._step(undo_rig, "the previous rig is in force on the server", timeout_s)
+
+    def redo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
+        """Have the server redo the change of its rig that was undone last; return the outcome as text."""
+        return self._step(redo_rig, "the undone rig is in force on the server again", timeout_s)
+
+    def _step(self, request: Callable[..., RigMessage], outcome: str, timeout_s: float) -> str:
         try:
-            undo_correction(self.session, self.feed.keys.arena, timeout_s)
+            request(self.session, self.feed.keys.arena, "web", timeout_s)
         except RoundelError as error:
             return str(error)
-        return "the camera has its previous pose again"
+        return outcome
 
     def _subscribe(self, key_expr: str) -> zenoh.Subscriber:
         def receive(sample: zenoh.Sample) -> None:
@@ -69,9 +81,11 @@ class Subscription:
         if alive:
             self._request_rig()
 
-    def _request_missing_rig(self) -> None:
-        if self.feed.state().rig is None:
-            self._request_rig()
+    def _request_new_rig(self, sample: zenoh.Sample) -> None:
+        with contextlib.suppress(MessageError):
+            t_ns = decode(sample.payload.to_bytes(), FusionStatus).rig_t_ns
+            if t_ns is not None and t_ns != self.feed.state().rig_t_ns:
+                self._request_rig()
 
     def _request_rig(self) -> None:
         key = self.feed.keys.rig

@@ -10,7 +10,7 @@ from typing import Any
 
 import viser
 
-from calib.live.collect import publish_rig
+from calib.live.rig_requests import set_rig
 from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import load_rig
@@ -98,11 +98,12 @@ class WandSessionPanel:
         self._answer_with(f"wand session ended: {reason}; calibrating")
         calibrate_cameras(recording, files)
         rig = load_rig(files.rig)
-        publish_rig(session, arena, rig)
         outcome = describe_calibration(rig.calibration)
-        if self._subscription.feed.state().server_alive:
-            return outcome
-        return f"{outcome}; no server is running: start it with {files.rig}"
+        try:
+            set_rig(session, arena, rig, "web")
+        except RoundelError as error:
+            return f"{outcome}; {files.rig} is written, but not in force: {error}"
+        return f"{outcome}; in force on the server"
 
     def _show(self, progress: SessionProgress) -> None:
         rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]

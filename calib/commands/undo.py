@@ -1,31 +1,52 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib undo`: restores the previous rig."""
+"""`calib undo` and `calib redo`: restore the previous rig, or the one that was undone last."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.commands.connection import Connection, Server
-from calib.rig.history import undo
-from calib.rig.rig import load_rig
+from calib.rig.history import History, HistoryStep
+from calib.rig.rig import Rig, load_rig
 from camera_node.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)
-class Undo:
-    """Restore the rig from before the last calibration."""
+class RestoreOptions:
+    """The file to restore, and the server."""
 
     rig: Path
-    """The rig to restore; earlier rigs are beside it as rig.1.yaml, rig.2.yaml, ..."""
+    """The rig to restore. Beside it are earlier rigs, rig.1.yaml, rig.2.yaml, ..., and undone ones, rig.undone.1.yaml,
+    ..., newest last."""
     live: bool = False
-    """Publish it to the running server too."""
+    """Have the running server use the restored rig too."""
     server: Server = field(default_factory=Connection)
 
-    def execute(self) -> None:
-        """Swap the files, and publish the restored rig."""
-        backup, undone = undo(self.rig)
-        rig = load_rig(self.rig)
+    def conclude(self, rig: Rig, step: HistoryStep, program: str) -> None:
+        """Print what was restored, and hand it to the server."""
         date = rig.calibration.get("date")
         made = f"made at {date}" if date else "no date recorded"
-        say(f"restored {self.rig} from {backup.name} ({made}); the undone rig is saved as {undone.name}")
-        if self.live:
-            self.server.publish(rig, self.rig)
+        replaced = f"; the rig that it replaces is saved as {step.replaced.name}" if step.replaced else ""
+        say(f"restored {self.rig} from {step.restored.name} ({made}){replaced}")
+        self.server.conclude(rig, self.rig, program, live=self.live)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undo(RestoreOptions):
+    """Restore the rig from before the last calibration; `calib redo` reverts that."""
+
+    def execute(self) -> None:
+        """Swap the files, and hand the restored rig to the server."""
+        history = History(self.rig)
+        rig = load_rig(history.previous())  # a broken one is not restored
+        self.conclude(rig, history.undo(), "calib undo")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Redo(RestoreOptions):
+    """Restore the rig that was undone last."""
+
+    def execute(self) -> None:
+        """Swap the files, and hand the restored rig to the server."""
+        history = History(self.rig)
+        rig = load_rig(history.next())
+        self.conclude(rig, history.redo(), "calib redo")

@@ -28,6 +28,8 @@ from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.terminal import console, progress_console, say
 
+PROGRAM = "calib wand"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Wand(WandOptions):
@@ -38,8 +40,8 @@ class Wand(WandOptions):
     out: Path
     """The file for the rig with poses; a previous file is saved as rig.1.yaml, ..."""
     live: bool = False
-    """Collect from the running cameras, publish the result to the server, and save the wand recording beside --out
-    (rig.wave.mcap)."""
+    """Collect from the running cameras, save the wand recording beside --out (rig.wave.mcap), and have the server use
+    the result."""
     seconds: float | None = None
     """Collect for this long; by default until more frames would not improve the result, at most three minutes."""
     only: str | None = None
@@ -60,7 +62,8 @@ class Wand(WandOptions):
         if self.live:
             self._calibrate_live(rig, wand, distance)
         else:
-            self._calibrate(rig, wand, self.read_recording(rig, wand), distance)
+            placed = self._calibrate(rig, wand, self.read_recording(rig, wand), distance)
+            self.server.conclude(placed, self.out, PROGRAM, live=False)
 
     def _calibrate(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
@@ -107,7 +110,7 @@ class Wand(WandOptions):
             if recording is not None:
                 say(f"the wand recording is saved; to calibrate from it again: {self._command(recording)}")
             raise
-        self.server.publish(placed, self.out)
+        self.server.put_in_force(placed, self.out, PROGRAM)
 
     def _collect(
         self, session: Session, rig: Rig, wand: Body, distance: Distance | None

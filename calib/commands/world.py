@@ -57,7 +57,7 @@ class World:
     observations: Path | None = None
     """Or read centres from a CSV: t_ns,camera,u,v[,marker]; a marker may be the name of a point."""
     live: bool = False
-    """Or collect from the running cameras, and publish the result to the server."""
+    """Or collect from the running cameras; have the server use the result."""
     seconds: float = 3.0
     """How long to collect from running cameras."""
     server: Server = field(default_factory=Connection)
@@ -76,8 +76,7 @@ class World:
         figures = {**moved.calibration, "world": {**provenance(), "misses_mm": misses}}
         moved = msgspec.structs.replace(moved, calibration=figures)
         write_rig(moved, self.out)
-        if self.live:
-            self.server.publish(moved, self.out)
+        self.server.conclude(moved, self.out, "calib world", live=self.live)
 
     def _move(self, rig: Rig) -> tuple[Rig, dict[str, float]]:
         """The moved rig, and the distances of surveyed cameras or landmarks from their positions, metres."""

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Collects detections from running cameras, and publishes the rig."""
+"""Collects detections from running cameras."""
 
 import queue
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -14,12 +13,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
-from calib.rig.messages import RigMessage
-from calib.rig.rig import Rig
-from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.terminal import progress_console
 
-DELIVERY_S = 2.0  # for a subscriber of the rig to be discovered
 INSPECT_EVERY_S = 0.2
 SILENT_S = 2.0  # without a frame: the camera counts as silent
 
@@ -131,17 +127,3 @@ def collect_with_progress(
             return ""
 
         return collect_frames(session, arena, seconds, show)[0]
-
-
-def publish_rig(session: zenoh.Session, arena: str, rig: Rig) -> bool:
-    """Publish the rig on its key; returns whether a subscriber was there within two seconds."""
-    publisher = session.declare_publisher(Keys(arena).rig, reliability=zenoh.Reliability.RELIABLE)
-    listening = threading.Event()
-    listener = publisher.declare_matching_listener(
-        lambda status: listening.set() if status.matching else listening.clear()
-    )
-    received = publisher.matching_status or listening.wait(DELIVERY_S)
-    publisher.put(encode(RigMessage.of(rig)))
-    listener.undeclare()
-    publisher.undeclare()
-    return received

@@ -1,65 +1,133 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Backs up files before they are replaced: `rig.1.yaml`, `rig.2.yaml`, ... beside `rig.yaml`, newest last."""
+"""The numbered history of a file: older versions in `rig.1.yaml`, `rig.2.yaml`, ..., undone ones in
+`rig.undone.1.yaml`, ..., both newest last."""
 
+import contextlib
 import os
 import re
 import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import CalibrationError
 from camera_node.errors import ConfigError
 
-
-def list_backups(path: Path) -> list[Path]:
-    """The backups beside `path`, oldest first."""
-    numbered = re.compile(rf"{re.escape(path.stem)}\.([0-9]+){re.escape(path.suffix)}")
-    found = [(int(m[1]), p) for p in path.parent.iterdir() if (m := numbered.fullmatch(p.name))]
-    return [p for _, p in sorted(found)]
+MAX_OLD = 20  # versions that are kept
 
 
-def back_up(path: Path) -> Path | None:
-    """Save a file under the next number; returns the backup, or None if there is no file.
+@dataclass(frozen=True)
+class HistoryStep:
+    """An undo or a redo: the numbered file that was restored, which no longer exists, and the numbered file of the
+    version that it replaced, None if there was none."""
 
-    Raises:
-        ConfigError: the folder can't be written to.
+    restored: Path
+    replaced: Path | None
+
+
+class History:
+    """The older and the undone versions of a file, beside it.
+
+    No version is overwritten. Each step first gives the file a second name and then replaces it, both atomically, so a
+    process that is killed leaves a valid file and all versions; a copy that it leaves is removed by the next step. The
+    oldest versions beyond `MAX_OLD` are removed when a version is added.
+
+    All methods raise ConfigError if the folder does not exist or can't be written to.
     """
-    if not path.exists():
-        return None
-    try:
-        backup = _next_backup(path)
-        _link_or_copy(path, backup)
-    except OSError as error:
-        raise ConfigError(f"{path} can't be backed up: {error.strerror}") from None
-    return backup
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._older, self._undone = _Series(path, ""), _Series(path, ".undone")
+
+    def older(self) -> list[Path]:
+        """The older versions, newest last."""
+        return self._older.files()
+
+    def back_up(self) -> Path | None:
+        """Give the file a number, before it is replaced. Undone versions become older ones, which `undo` reaches.
+
+        Returns:
+            the numbered file; None if there is no file.
+        """
+        with self._reporting("backed up"):
+            if not self.path.exists():
+                return None
+            for undone in self._undone.files():
+                self._older.add(undone)
+                undone.unlink()
+            backup = self._older.add(self.path)
+            for oldest in self._older.files()[:-MAX_OLD]:
+                oldest.unlink()
+            return backup
+
+    def previous(self) -> Path:
+        """The version that `undo` restores; raises CalibrationError if there is none."""
+        return self._newest(self._older, "earlier")
+
+    def next(self) -> Path:
+        """The version that `redo` restores; raises CalibrationError if there is none."""
+        return self._newest(self._undone, "undone")
+
+    def undo(self) -> HistoryStep:
+        """Restore the previous version; raises CalibrationError if there is none."""
+        return self._restore(self.previous(), self._undone)
+
+    def redo(self) -> HistoryStep:
+        """Restore the version that was undone last; raises CalibrationError if there is none."""
+        return self._restore(self.next(), self._older)
+
+    def _newest(self, series: "_Series", word: str) -> Path:
+        with self._reporting("restored"):
+            files = series.files()
+            while files and _are_equal(files[-1], self.path):  # a copy from a step that was interrupted
+                files.pop().unlink()
+        if not files:
+            raise CalibrationError(f"there is no {word} version of {self.path}; nothing was changed")
+        return files[-1]
+
+    def _restore(self, version: Path, other: "_Series") -> HistoryStep:
+        with self._reporting("restored"):
+            replaced = other.add(self.path) if self.path.exists() else None
+            os.utime(version)  # it is in force from now on: newer than other files
+            os.replace(version, self.path)
+        return HistoryStep(version, replaced)
+
+    @contextlib.contextmanager
+    def _reporting(self, verb: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise ConfigError(f"{self.path} can't be {verb}: {error.strerror}; check its folder") from None
 
 
-def undo(path: Path) -> tuple[Path, Path]:
-    """Restore the newest backup to `path`; the file that it replaces is saved as `rig.undone.yaml`.
+class _Series:
+    """The numbered files beside `path`: `rig.yaml` with the suffix ".undone" has `rig.undone.1.yaml`, ..."""
 
-    Returns:
-        the name of the restored backup, which no longer exists, and the name of the replaced file.
+    def __init__(self, path: Path, suffix: str) -> None:
+        self._folder, self._stem, self._end = path.parent, path.stem + suffix, path.suffix
 
-    Raises:
-        CalibrationError: there is no backup.
-        ConfigError: the folder does not exist or can't be written to.
-    """
-    undone = path.with_name(f"{path.stem}.undone{path.suffix}")
-    try:
-        if not (backups := list_backups(path)):
-            raise CalibrationError(f"there is no earlier rig beside {path}; nothing was changed")
-        if path.exists():
-            undone.unlink(missing_ok=True)
-            _link_or_copy(path, undone)
-        os.replace(backups[-1], path)
-    except OSError as error:
-        raise ConfigError(f"{path} can't be restored: {error.strerror}; check its folder") from None
-    return backups[-1], undone
+    def files(self) -> list[Path]:
+        """The files by their numbers."""
+        pattern = re.compile(rf"{re.escape(self._stem)}\.([0-9]{{1,9}}){re.escape(self._end)}")
+        found = [(int(m[1]), p) for p in self._folder.iterdir() if (m := pattern.fullmatch(p.name))]
+        return [p for _, p in sorted(found)]
+
+    def add(self, path: Path) -> Path:
+        """Give a file the next number, unless the last numbered file is equal; returns the numbered file."""
+        last = self.files()[-1:]
+        if last and _are_equal(last[0], path):
+            return last[0]
+        number = int(last[0].name.removesuffix(self._end).rsplit(".", 1)[1]) + 1 if last else 1
+        target = self._folder / f"{self._stem}.{number}{self._end}"
+        _link_or_copy(path, target)
+        return target
 
 
-def _next_backup(path: Path) -> Path:
-    last = list_backups(path)[-1:]
-    number = int(last[0].name.removesuffix(path.suffix).rsplit(".", 1)[1]) + 1 if last else 1
-    return path.with_name(f"{path.stem}.{number}{path.suffix}")
+def _are_equal(a: Path, b: Path) -> bool:
+    """Whether both files exist and have the same content."""
+    if not (a.exists() and b.exists()):
+        return False
+    return a.samefile(b) or (a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes())
 
 
 def _link_or_copy(path: Path, target: Path) -> None:
@@ -69,4 +137,6 @@ def _link_or_copy(path: Path, target: Path) -> None:
     except FileExistsError:
         raise
     except OSError:
-        shutil.copy2(path, target)
+        part = target.with_name(f".{target.name}.part")
+        shutil.copy2(path, part)
+        os.replace(part, target)

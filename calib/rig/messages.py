@@ -1,34 +1,67 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The message of calibration on Zenoh, encoded as in `camera_node.protocol.messages`; its key is `Keys.rig`."""
+"""The messages of calibration on Zenoh, encoded as in `camera_node.protocol.messages`, and their keys."""
 
-import time
+from typing import ClassVar
 
 import msgspec
-import yaml
 
-from calib.rig.rig import Rig, dump_rig
+from calib.rig.rig import Rig
 from camera_node.protocol.messages import VERSION, MessageError
+from camera_node.protocol.requests import RequestSource
+
+MAX_RIG_BYTES = 1 << 20  # of a message; 256 cameras with their reports take a quarter
 
 
 class RigMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """The calibration in force, as the text of its `rig.yaml`."""
+    """The calibration in force on the server, since `t_ns` in the server's time."""
 
+    MAX_BYTES: ClassVar[int] = MAX_RIG_BYTES
     version: int = VERSION
     t_ns: int
-    yaml: str
+    rig: Rig
+    saved: bool = False  # in a file of the server, which it uses after a restart
+    source: RequestSource | None = None  # of the request that changed the rig; None for the server itself
 
-    @classmethod
-    def of(cls, rig: Rig) -> "RigMessage":
-        """The message of a rig that is in force from now on."""
-        return cls(t_ns=time.time_ns(), yaml=dump_rig(rig))
+    def check(self) -> None:
+        """Raise MessageError for a time before 1970 or beyond 64 bits."""
+        if not 0 <= self.t_ns < 2**63:
+            raise MessageError("an impossible t_ns")
 
-    def rig(self) -> Rig:
-        """Decode the rig.
 
-        Raises:
-            MessageError: the text is not a valid rig.yaml; the error is one line.
-        """
-        try:
-            return msgspec.yaml.decode(self.yaml, type=Rig)
-        except (msgspec.MsgspecError, yaml.YAMLError, ValueError, RecursionError) as error:
-            raise MessageError(f"not a valid rig.yaml: {' '.join(str(error).split())[:200]}") from None
+class RigRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Asks the server to use another rig."""
+
+    MAX_BYTES: ClassVar[int] = MAX_RIG_BYTES
+    version: int = VERSION
+    rig: Rig
+    source: RequestSource | None = None
+
+    def check(self) -> None:
+        """Raise MessageError for a rig without cameras."""
+        if not self.rig.cameras:
+            raise MessageError("the rig names no camera")
+
+
+class RigStepRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Asks the server to undo the last change of the rig, or to redo the change that was undone last."""
+
+    version: int = VERSION
+    source: RequestSource | None = None
+
+
+def set_rig_key(arena: str) -> str:
+    """The key of the queryable that takes a `RigRequest` and answers with the `RigMessage` in force.
+
+    A key of its own, because access rights cannot tell a query with a payload from one without.
+    """
+    return f"{arena}/rig/set"
+
+
+def undo_rig_key(arena: str) -> str:
+    """The key of the queryable that takes a `RigStepRequest` and restores the rig before the last change."""
+    return f"{arena}/rig/undo"
+
+
+def redo_rig_key(arena: str) -> str:
+    """The key of the queryable that takes a `RigStepRequest` and restores the rig that was undone last."""
+    return f"{arena}/rig/redo"

@@ -17,7 +17,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
-from calib.rig.history import back_up
+from calib.rig.history import History
 from calib.rig.recording_repair import repair_recording
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
@@ -139,7 +139,7 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
         with RecordingWriter(part) as writer:
             for message in messages:
                 writer.put(keys.detections(message.camera), encode(message), message.t_ns)
-        backup = back_up(path)
+        backup = History(path).back_up()
         os.replace(part, path)
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}") from None

@@ -7,9 +7,10 @@ from typing import Any, TypeVar
 import msgspec
 
 from calib.errors import CalibrationError
+from calib.rig.bounds import check_cameras, check_figures
 from calib.rig.camera import Camera
-from calib.rig.history import back_up
-from camera_node.config import dump_yaml, load_yaml, require_name, write_atomically
+from calib.rig.history import History
+from camera_node.config import dump_yaml, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 
 T = TypeVar("T")
@@ -21,6 +22,14 @@ class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     cameras: dict[str, Camera]
     calibration: dict[str, Any] = {}
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError unless all values are plausible (`calib.rig.bounds`)."""
+        check_cameras(self.cameras)
+        check_figures(self.calibration)
 
     def placed(self) -> dict[str, Camera]:
         """The cameras with a pose."""
@@ -59,8 +68,6 @@ def load_rig(path: Path) -> Rig:
     rig = _read(path, Rig)
     if not rig.cameras:
         raise ConfigError(f"{path} names no camera; run python -m calib intrinsics")
-    for name in rig.cameras:
-        require_name(name, f"a camera in {path}")
     return rig
 
 
@@ -79,14 +86,19 @@ def save_rig(rig: Rig, path: Path) -> Path | None:
         the backup of the previous file at `path`, if there was one (`calib undo` restores it).
 
     Raises:
+        CalibrationError: a value is not plausible, so that the file could not be read.
         ConfigError: the folder can't be written to.
     """
-    backup = back_up(path)
+    try:
+        rig.check()  # msgspec.structs.replace does not check in all versions of msgspec
+    except ValueError as error:
+        raise CalibrationError(f"{path} is not written: {error}") from None
+    backup = History(path).back_up()
     try:
         write_atomically(path, dump_rig(rig))
     except BaseException:
         if backup:
-            backup.unlink()
+            backup.unlink()  # equal to the file
         raise
     return backup
 

@@ -158,7 +158,9 @@ class Node:
         listener = publisher.declare_matching_listener(
             lambda status: matched.set() if status.matching else None
         )
-        if not publisher.matching_status and not matched.wait(LISTENER_S):
+        # a status, which is always true itself; zenoh's stub says bool
+        matches = publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
+        if not matches and not matched.wait(LISTENER_S):
             log.warning(
                 "no subscriber of %s after %g s; starting the recording anyway", self.name, LISTENER_S
             )

@@ -11,6 +11,7 @@ from camera_node.config import is_name, require_name
 from camera_node.detection.roundels import Roundels
 
 VERSION = 1
+MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
@@ -213,6 +214,8 @@ def decode(data: bytes, kind: type[T]) -> T:
     Raises:
         MessageError: the bytes are not a message of this kind and version, or a value is invalid.
     """
+    if len(data) > (limit := getattr(kind, "MAX_BYTES", MAX_BYTES)):
+        raise MessageError(f"{kind.__name__} of {len(data)} bytes; the limit is {limit}")
     try:
         message = msgspec.msgpack.decode(data, type=kind)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:

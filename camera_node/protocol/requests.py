@@ -1,23 +1,33 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Parses the requests in Zenoh queries and sends the replies. An invalid request gets an error reply of one line."""
+"""Sends requests as Zenoh queries; parses them and sends the replies. An invalid request gets an error reply of one
+line."""
 
+import getpass
 import logging
 import re
+import socket
+import time
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import cv2
 import msgspec
 import zenoh
 
 from camera_node.arrays import Grey
-from camera_node.errors import RoundelError
-from camera_node.protocol.messages import MessageError, decode, encode
+from camera_node.errors import NetworkError, RoundelError
+from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.session import reply_of_server
 
 log = logging.getLogger("camera_node.requests")
 
 QUALITY = 85  # JPEG quality unless the request gives one
 MAX_PAYLOAD = 1 << 20  # bytes
+REQUEST_S = 5.0  # for a program that answers to be found
+ANSWER_S = 60.0  # for its answer; a server computes tables of the lenses of a new rig
+RETRY_S = 0.1
+MAX_SOURCE = 64  # characters of each part of a request's source
+Part = Annotated[str, msgspec.Meta(max_length=MAX_SOURCE)]
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -34,6 +44,52 @@ def sender_of(query: zenoh.Query) -> str:
     """The id of the session that a request claims to come from; empty where it claims none."""
     attachment = query.attachment.to_bytes() if query.attachment else b""
     return attachment.decode() if re.fullmatch(rb"[0-9a-f]{1,32}", attachment) else ""
+
+
+class RequestSource(msgspec.Struct, frozen=True):
+    """Who sent a request, by its own account: the program, its machine and its user. Empty where unknown."""
+
+    program: Part = ""
+    host: Part = ""
+    user: Part = ""
+
+    @classmethod
+    def of(cls, program: str) -> "RequestSource":
+        """This machine and user, with a program such as `calib wand`."""
+        try:
+            user = getpass.getuser()
+        except (KeyError, OSError):  # the user's number has no name
+            user = ""
+        return cls(program[:MAX_SOURCE], socket.gethostname()[:MAX_SOURCE], user[:MAX_SOURCE])
+
+    def __str__(self) -> str:
+        return f"{self.program or 'an unnamed program'} of {self.user or 'unknown'}@{self.host or 'unknown'}"
+
+
+def send_request(
+    session: zenoh.Session, key: str, payload: bytes = b"", timeout_s: float = REQUEST_S
+) -> bytes:
+    """Send a request until a program answers it; one that takes long to answer is awaited.
+
+    Raises:
+        RequestError: the request is refused; the message is the program's.
+        NetworkError: no program answers within `timeout_s`.
+    """
+    end = time.monotonic() + timeout_s
+    while (left := end - time.monotonic()) > 0:
+        every = zenoh.ConsolidationMode.NONE
+        replies = session.get(
+            key, payload=payload, attachment=sender(session), consolidation=every, timeout=max(left, ANSWER_S)
+        )
+        if reply := reply_of_server(session, replies):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
+        time.sleep(min(RETRY_S, left))  # a session that was just opened knows no queryable yet
+    raise NetworkError(
+        f"no server answers on {key} within {timeout_s:g} s; check that python -m fusion runs there, and check "
+        "--connect and --arena"
+    )
 
 
 def payload_of(query: zenoh.Query) -> bytes:
@@ -53,7 +109,7 @@ def parse_request(payload: bytes, kind: type[T]) -> T:
         return decode(
             msgspec.msgpack.encode(msgspec.json.decode(payload)) if _is_json(payload) else payload, kind
         )
-    except (msgspec.DecodeError, MessageError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise RequestError(f"invalid {kind.__name__}: {error}") from None
 
 

@@ -19,14 +19,16 @@ from typing import Any, Generic, TypeVar
 
 import zenoh
 
+from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
+from camera_node.protocol.requests import RETRY_S
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.protocol.requests import RETRY_S, change_robots, undo_correction
+from fusion.protocol.requests import change_robots
 
 T = TypeVar("T")
 TIMEOUT_S = 10.0
@@ -210,17 +212,28 @@ class Arena:
         request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
         return change_robots(self._session, self.keys.arena, request)
 
-    def undo_correction(self) -> Rig:
-        """Undo the last recalibration of a moved camera by the server.
+    def set_rig(self, rig: Rig) -> RigMessage:
+        """Have the server use another rig.
 
         Returns:
-            The active rig after that.
+            The rig in force.
 
         Raises:
-            FusionError: there is nothing to undo; the message is the server's.
+            RequestError: the server refuses it; the message is the server's.
             NetworkError: no server answers in time.
         """
-        return undo_correction(self._session, self.keys.arena)
+        return set_rig(self._session, self.keys.arena, rig, "fusion.client")
+
+    def undo_rig(self) -> RigMessage:
+        """Have the server undo the last change of its rig: a calibration, or its recalibration of a moved camera.
+
+        Returns and raises as `set_rig`.
+        """
+        return undo_rig(self._session, self.keys.arena, "fusion.client")
+
+    def redo_rig(self) -> RigMessage:
+        """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
+        return redo_rig(self._session, self.keys.arena, "fusion.client")
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every frame set."""
@@ -256,7 +269,7 @@ class Arena:
 
     def _read_rig(self, data: bytes) -> Rig | None:
         try:
-            return decode(data, RigMessage).rig()
+            return decode(data, RigMessage).rig
         except MessageError:
             self.faults["RigMessage"] += 1
             return None

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion undo`: restores the camera that the server recalibrated last."""
+"""`fusion undo` and `fusion redo`: step through the history of the running server's rig."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+import zenoh
 
+from calib.live.rig_requests import redo_rig, request_rig, undo_rig
+from calib.rig.messages import RigMessage
+from camera_node.protocol.session import open_requester
 from camera_node.terminal import say
-from fusion.client.arena import Arena
+from fusion.model.corrections import corrected_camera
 
 
 def undo(
@@ -16,15 +21,45 @@ def undo(
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
 ) -> int:
-    """Undo the last recalibration of a moved camera by the running server, which no longer monitors that camera.
+    """Undo the last change of the running server's rig: a calibration, or its recalibration of a moved camera.
+
+    A camera whose recalibration is undone is no longer monitored.
 
     Args:
         connect: the server's Zenoh endpoints.
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    with Arena.connect(*connect, arena=arena, zenoh_config=zenoh_config) as client:
-        before, after = client.rig(), client.undo_correction()
-    changed = [name for name in after.cameras if before and after.cameras[name] != before.cameras.get(name)]
-    say(f"{', '.join(changed) or 'the camera'} has its previous pose again and is no longer monitored")
+    with open_requester(connect, zenoh_config) as session:
+        say(_step(session, arena, undo_rig, "previous"))
     return 0
+
+
+def redo(
+    *,
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
+    arena: str = "arena",
+    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+) -> int:
+    """Redo the change of the running server's rig that was undone last.
+
+    Args:
+        connect: the server's Zenoh endpoints.
+        arena: the arena's name.
+        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+    """
+    with open_requester(connect, zenoh_config) as session:
+        say(_step(session, arena, redo_rig, "undone"))
+    return 0
+
+
+def _step(session: zenoh.Session, arena: str, step: Callable[..., RigMessage], word: str) -> str:
+    """Change the server's rig; returns a sentence about the result."""
+    before = request_rig(session, arena)
+    after = step(session, arena, f"fusion {step.__name__.removesuffix('_rig')}").rig
+    old = before.cameras if before else {}
+    changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
+    text = f"the {word} rig is in force on the server; changed cameras: {', '.join(changed) or 'none'}"
+    if step is undo_rig and before and (name := corrected_camera(before, after)):
+        text += f"; {name} is no longer monitored"
+    return text

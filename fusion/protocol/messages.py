@@ -243,6 +243,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     faults: dict[str, int]
     limits: Limits | None = None  # with which the server tracks, for a replay
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
+    rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one
 
 
 def robots_key(arena: str) -> str:
@@ -266,11 +267,6 @@ def frames_key(arena: str) -> str:
 def shard_key(arena: str, index: int | str) -> str:
     """The key on which shard `index`, of several, publishes `ShardPoses` for the others in every frame set."""
     return f"{arena}/fusion/shard/{index}"
-
-
-def undo_key(arena: str) -> str:
-    """The key of the queryable that undoes the last recalibration of a moved camera."""
-    return f"{arena}/rig/undo"
 
 
 class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -62,7 +62,7 @@ class ArenaRecording:
             elif key.endswith("/fusion/status"):
                 self.limits = decode(data, FusionStatus).limits
             elif key.endswith("/rig") and self.rig is None:
-                self.rig = decode(data, RigMessage).rig()
+                self.rig = decode(data, RigMessage).rig
             elif key.endswith("/robots"):
                 self.robots = decode(data, Robots).robots
         except MessageError:

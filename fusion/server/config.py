@@ -18,7 +18,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         listen: Zenoh endpoints on which the server is the router; the operating system chooses port 0.
         zenoh: a Zenoh configuration (JSON5) for TLS, access control or scouting.
         rig: rig.yaml; without one the server waits for a calibration to be published.
-        saved_rig: the file that saves a rig that was published, or corrected after a camera was moved; after a
+        saved_rig: the file that saves a rig that was requested, or corrected after a camera was moved; after a
             restart the newer of this file and `rig` is used. Nothing is saved unless given.
         robots: robots.yaml.
         saved_robots: the same for robots that were defined, renamed or removed while the server ran.

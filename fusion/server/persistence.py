@@ -12,11 +12,16 @@ log = logging.getLogger("fusion")
 T = TypeVar("T")
 
 
+def is_newer(given: Path | None, saved: Path) -> bool:
+    """Whether the user wrote the file `given` after the server wrote the file `saved`."""
+    return given is not None and given.exists() and given.stat().st_mtime >= saved.stat().st_mtime
+
+
 class PersistedFile(Generic[T]):
     """A file that the server writes, beside the one that the user writes. Its faults are logged and never fatal.
 
     Args:
-        content: the word for the content in messages, as in "the saved rig".
+        content: the word for the content in messages, as in "the saved robots".
         path: the file; None saves nothing.
         load: reads it; raises RoundelError.
         save: writes it; raises RoundelError.
@@ -28,11 +33,11 @@ class PersistedFile(Generic[T]):
         self._content, self._path = content, Path(path) if path else None
         self._load, self._save = load, save
 
-    def load_if_newer(self, given: Path | None) -> T | None:
+    def load_if_newer(self, given: Path) -> T | None:
         """The saved content; None if there is none, if it is broken, or if the user's file `given` is newer."""
         if self._path is None or not self._path.exists():
             return None
-        if given is not None and given.exists() and given.stat().st_mtime >= self._path.stat().st_mtime:
+        if is_newer(given, self._path):
             log.info("using %s, which is newer than %s", given, self._path)
             return None
         try:

@@ -2,10 +2,16 @@
 """The active rig and robots, and the synchronizer and tracker that use them; no network."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from calib.rig.rig import Rig, load_rig, save_rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
+from camera_node.errors import RoundelError
+from camera_node.protocol.requests import RequestSource
+from fusion.errors import FusionError
+from fusion.model.corrections import corrected_camera
 from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
@@ -35,15 +41,16 @@ class TrackingPipeline:
 
     def __init__(self, config: ArenaConfig, shard: Shard) -> None:
         self._config, self._shard = config, shard
-        saved_rig = PersistedFile("rig", config.saved_rig, load_rig, save_rig)
-        self.active_rig = ActiveRig(Path(config.rig) if config.rig else None, saved_rig)
+        rig, saved_rig = (Path(file) if file else None for file in (config.rig, config.saved_rig))
+        self.active_rig = ActiveRig(rig, saved_rig)
         self._saved_robots = PersistedFile("robots", config.saved_robots, load_saved_robots, save_robots)
         saved = self._saved_robots.load_if_newer(Path(config.robots))
         self.robots = load_robots(Path(config.robots)) if saved is None else saved
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
-        self.restart()
+        self._start(self.cameras)
+        self.active_rig.load(lambda rig: self._start(rig.placed()))
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -52,38 +59,80 @@ class TrackingPipeline:
 
     def restart(self) -> None:
         """Drop all frames and tracks; the tracker acquires all robots again."""
-        cameras, limits = self.cameras, self._config.limits
+        self._start(self.cameras)
+
+    def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
+        """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
+
+        Raises:
+            FusionError, ConfigError, CalibrationError: it can't be used or saved; the old one stays in force.
+        """
+        self._use(rig, lambda: self.active_rig.save(rig))
+        self.active_rig.use(rig, now_ns, source)
+
+    def undo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
+        """Restore the rig before the last change. A camera that the server recalibrated is no longer monitored.
+
+        Raises:
+            FusionError, ConfigError, CalibrationError: there is none, or it can't be used.
+        """
+        undone, rig = self.active_rig.rig, self.active_rig.previous()
+        self._use(rig, self.active_rig.undo, corrected_camera(undone, rig) if undone else None)
+        self.active_rig.use(rig, now_ns, source)
+
+    def redo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
+        """Restore the rig that was undone last; raises as `undo_rig`."""
+        rig = self.active_rig.next()
+        self._use(rig, self.active_rig.redo)
+        self.active_rig.use(rig, now_ns, source)
+
+    def follow_rig(self, message: RigMessage) -> None:
+        """Use the rig that the leading shard published; raises FusionError if it can't be used."""
+        if self.active_rig.message is None or self.active_rig.message.t_ns != message.t_ns:
+            self._use(message.rig, lambda: None)
+            self.active_rig.message = message
+
+    def correct_rig(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
+        """Update the active rig by a camera that the tracker recalibrated."""
+        if correction.camera is not None:
+            self.active_rig.correct(correction.name, correction.camera, now_ns)
+
+    def _use(self, rig: Rig, save: Callable[[], object], pinned: str | None = None) -> None:
+        """Track with another rig, then save it; on a fault of either, track with the old one again.
+
+        Args:
+            rig: the rig.
+            save: saves the change.
+            pinned: a camera whose pose a user confirms: it is no longer monitored.
+        """
+        old, synchronizer, tracker = self.cameras, self.synchronizer, self.tracker
+        placed = rig.placed()
+        changed = [name for name in placed if placed[name] != old.get(name)]
+        in_place = tracker is not None and placed.keys() == old.keys() and len(changed) <= 1
+        try:
+            if not in_place:
+                self._start(placed)
+            elif tracker is not None:
+                for name in changed:
+                    tracker.place(name, placed[name], pinned=name == pinned)
+            save()
+        except Exception as error:  # nothing that a rig contains may end the server
+            self.tracker, self.synchronizer = tracker, synchronizer
+            if in_place and tracker is not None:
+                for name in changed:
+                    tracker.place(name, old[name])
+            if isinstance(error, RoundelError):
+                raise
+            log.exception("a rig can't be used")
+            raise FusionError(f"the rig can't be used: {type(error).__name__}: {error}") from None
+
+    def _start(self, cameras: dict[str, Camera]) -> None:
+        """Start tracking anew."""
+        limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
         self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
             log.info("active calibration: %s", ", ".join(cameras))
-
-    def replace_rig(self, rig: Rig) -> None:
-        """Activate a published rig. Robots stay tracked if the pose of a single camera differs."""
-        changed_camera = self.active_rig.replace(rig)
-        if changed_camera is None or self.tracker is None:
-            self.restart()
-            return
-        self.tracker.place(changed_camera, rig.cameras[changed_camera])
-
-    def correct_rig(self, correction: ExtrinsicsCorrection) -> None:
-        """Update the active rig by a camera that the tracker recalibrated."""
-        if correction.camera is not None:
-            self.active_rig.correct(correction.name, correction.camera)
-
-    def undo_correction(self) -> str:
-        """Restore the camera of the last correction; it is no longer monitored until another rig is published.
-
-        Returns:
-            The camera's name.
-
-        Raises:
-            FusionError: there is no correction.
-        """
-        name, camera = self.active_rig.undo()
-        if self.tracker is not None:
-            self.tracker.place(name, camera, pinned=True)
-        return name
 
     def change_robots(self, request: RobotsRequest) -> set[str]:
         """Rename, remove and define robots, all or none. Robots with unchanged markers stay tracked.

@@ -13,12 +13,26 @@ from functools import partial
 
 import zenoh
 
-from calib.rig.messages import RigMessage
+from calib.rig.messages import (
+    RigMessage,
+    RigRequest,
+    RigStepRequest,
+    redo_rig_key,
+    set_rig_key,
+    undo_rig_key,
+)
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.rate_limit import RateLimit
-from camera_node.protocol.requests import RequestError, encode_reply, parse_request, payload_of
+from camera_node.protocol.requests import (
+    RequestError,
+    RequestSource,
+    encode_reply,
+    parse_request,
+    payload_of,
+)
 from camera_node.protocol.session import listening_endpoints
 from camera_node.service import ServiceManager
+from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.health import describe_status
@@ -31,7 +45,6 @@ from fusion.protocol.messages import (
     robots_key,
     set_robots_key,
     shard_key,
-    undo_key,
 )
 from fusion.protocol.shards import Shard
 from fusion.server.audit import AuditLog
@@ -120,7 +133,6 @@ class Server:
         keys, transport = self.keys, self.transport
         self._update_quotas()
         transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
-        transport.subscribe(keys.rig, self._receive_rig)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
         audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
         transport.answer_on_server_thread(
@@ -132,10 +144,16 @@ class Server:
             transport.answer(keys.clock, partial(self._answer_clock, self.clock))
         if self.shard.leads:
             transport.answer(keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
-            transport.answer_on_server_thread(
-                undo_key(keys.arena), audit.audited("undo of the rig", self._undo_correction)
-            )
+            for key, change, answer in (
+                (set_rig_key(keys.arena), "change of the rig", self._set_rig),
+                (undo_rig_key(keys.arena), "undo of the rig", self._undo_rig),
+                (redo_rig_key(keys.arena), "redo of the rig", self._redo_rig),
+            ):
+                transport.answer_on_server_thread(key, audit.audited(change, answer))
             transport.declare_alive(keys.fusion_alive)
+        else:
+            transport.subscribe(keys.rig, self._follow_rig)
+            transport.subscribe(keys.fusion_status, self._request_new_rig)
 
     @contextlib.contextmanager
     def _guarded(self, stage: str) -> Iterator[None]:
@@ -200,12 +218,15 @@ class Server:
         if correction.camera is None:
             log.warning("camera %s was moved: excluded until robots show its new pose", correction.name)
             return
-        self.pipeline.correct_rig(correction)
-        self._publisher.publish_rig(self.pipeline.active_rig.message())
-        undo = undo_key(self.keys.arena)
+        self.pipeline.correct_rig(correction, self.clock.now_ns())
+        self._publish_rig()
         log.warning(
-            "camera %s is recalibrated and used again; a query on %s undoes that", correction.name, undo
+            "camera %s is recalibrated and used again; python -m fusion undo reverts that", correction.name
         )
+
+    def _publish_rig(self) -> None:
+        if self.pipeline.active_rig.message is not None:
+            self._publisher.publish_rig(self.pipeline.active_rig.message)
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""
@@ -215,6 +236,7 @@ class Server:
             limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
         )
         status = self.statistics.report(now_ns, pipeline)
@@ -236,15 +258,20 @@ class Server:
         is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)
         self.statistics.note_lateness(frame.camera, is_on_time, age_ns * 1e-6)
 
-    def _receive_rig(self, data: bytes, key: str, received_ns: int) -> None:
+    def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
+        """Use the rig of the leading shard."""
         try:
-            rig = decode(data, RigMessage).rig()
-        except MessageError as error:
-            self.statistics.count_fault("undecodable rig")
-            log.warning("a published rig is refused, the active one stays: %s", error)
-            return
-        if rig != self.pipeline.active_rig.rig:  # neither our own nor a duplicate
-            self.pipeline.replace_rig(rig)
+            self.pipeline.follow_rig(decode(data, RigMessage))
+        except (MessageError, FusionError) as error:
+            self.statistics.count_fault("unusable rig")
+            log.warning("the rig of the first shard is not used: %s", error)
+
+    def _request_new_rig(self, data: bytes, key: str, received_ns: int) -> None:
+        """Request the rig of the leading shard if its status tells that it is another one."""
+        with contextlib.suppress(MessageError):
+            active, t_ns = self.pipeline.active_rig.message, decode(data, FusionStatus).rig_t_ns
+            if t_ns is not None and (active is None or active.t_ns != t_ns):
+                self.transport.request(self.keys.rig, self._follow_rig)
 
     def _receive_shard(self, data: bytes, key: str, received_ns: int) -> None:
         """Receive the poses of another shard's robots."""
@@ -266,15 +293,32 @@ class Server:
         query.reply(self.keys.clock, encode(clock.reply()))
 
     def _answer_rig(self, query: zenoh.Query) -> None:
-        if self.pipeline.active_rig.rig is not None:
-            query.reply(self.keys.rig, encode(self.pipeline.active_rig.message()))
+        if (message := self.pipeline.active_rig.message) is not None:
+            query.reply(self.keys.rig, encode(message))
 
-    def _undo_correction(self, _: zenoh.Query) -> bytes:
-        name = self.pipeline.undo_correction()
-        log.warning("camera %s has its previous pose again, as requested; it is no longer monitored", name)
-        message = self.pipeline.active_rig.message()
-        self._publisher.publish_rig(message)
-        return encode(message)
+    def _set_rig(self, query: zenoh.Query) -> bytes:
+        request = parse_request(payload_of(query), RigRequest)
+        self.pipeline.replace_rig(request.rig, self.clock.now_ns(), request.source)
+        return self._announce_rig(query, "changed", request.source)
+
+    def _undo_rig(self, query: zenoh.Query) -> bytes:
+        request = _parse_step(query)
+        self.pipeline.undo_rig(self.clock.now_ns(), request.source)
+        return self._announce_rig(query, "set back to the previous one", request.source)
+
+    def _redo_rig(self, query: zenoh.Query) -> bytes:
+        request = _parse_step(query)
+        self.pipeline.redo_rig(self.clock.now_ns(), request.source)
+        return self._announce_rig(query, "set to the one that was undone", request.source)
+
+    def _announce_rig(self, query: zenoh.Query, change: str, source: RequestSource | None) -> bytes:
+        """Publish and log the rig in force; returns the reply to the request that changed it."""
+        message = self.pipeline.active_rig.message
+        assert message is not None
+        log.warning("the rig was %s by %s", change, source or "an unnamed program")
+        self._update_quotas()
+        self._publish_rig()
+        return encode_reply(payload_of(query), message)
 
     def _answer_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
@@ -287,6 +331,11 @@ class Server:
         request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self.pipeline.change_robots(request))
         return encode_reply(payload, Robots(robots=self.pipeline.robots))
+
+
+def _parse_step(query: zenoh.Query) -> RigStepRequest:
+    payload = payload_of(query)
+    return parse_request(payload, RigStepRequest) if payload else RigStepRequest()
 
 
 @contextlib.contextmanager

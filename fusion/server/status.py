@@ -30,12 +30,14 @@ class PipelineStatus:
         calibrated: cameras with a pose in the active rig.
         excluded: cameras that were moved, whose detections are excluded.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        rig_t_ns: since when the active rig is in force.
     """
 
     limits: Limits | None = None
     calibrated: frozenset[str] = frozenset()
     excluded: frozenset[str] = frozenset()
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    rig_t_ns: int | None = None
 
 
 @dataclass
@@ -148,6 +150,7 @@ class ServerStatistics:
             faults=faults,
             limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            rig_t_ns=pipeline.rig_t_ns,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()

@@ -17,7 +17,7 @@ from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import encode
 from camera_node.protocol.rate_limit import RateLimit
-from camera_node.protocol.requests import respond
+from camera_node.protocol.requests import REQUEST_S, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
@@ -95,6 +95,16 @@ class Transport:
                 self._count_fault(ABOVE_QUOTA, key)
 
         self._declare_subscriber(key, enqueue)
+
+    def request(self, key: str, handle: MessageHandler) -> None:
+        """Query a key; call `handle(data, key, received_ns)` for each reply, on the server's thread."""
+
+        def enqueue(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                key = str(reply.ok.key_expr)
+                self._enqueue(key, reply.ok.payload.to_bytes(), handle, key, MESSAGES)
+
+        self.session.get(key, self._guarded(key, enqueue), timeout=REQUEST_S)
 
     def answer(
         self, key: str, reply: Callable[[zenoh.Query], object], limit: RateLimit | None = None

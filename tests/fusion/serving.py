@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A live server on loopback, a client of it, and the detections of a synthetic arena."""
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,12 +14,15 @@ from typing import TypeVar
 import msgspec
 
 from calib.rig.rig import Rig, save_rig
+from camera_node.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
+from tests.conftest import ROOT
 from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
+from tests.waiting import wait_for
 
 T = TypeVar("T")
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
@@ -108,3 +113,26 @@ def serving_an_unknown_robot(folder: Path) -> Iterator[tuple[str, Client]]:
         finally:
             stopped.set()
             cameras.join()
+
+
+@contextmanager
+def serving_process(settings: ArenaConfig) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A server in a process of its own, and the endpoint on which it listens."""
+    folder = Path(settings.robots).parent
+    file, endpoints = folder / "arena.yaml", folder / "endpoints"
+    endpoints.unlink(missing_ok=True)
+    file.write_text(dump_yaml(settings))
+    words = ["--config", str(file), "--endpoints-file", str(endpoints)]
+    with subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT) as process:
+        try:
+            wait_for(lambda: endpoints.exists() or process.poll() is not None)
+            assert process.poll() is None, "the server ended"
+            yield endpoints.read_text().splitlines()[0], process
+        finally:
+            process.terminate()
+
+
+def run_program(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run `python -m PROGRAM ...` in a fresh process, as a user does."""
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)

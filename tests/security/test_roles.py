@@ -8,15 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from calib.live.collect import publish_rig
-from calib.rig.rig import Rig
+from calib.live.rig_requests import set_rig, undo_rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Detections, Roundels, encode
+from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots, request_robots
 from tests.security.lab import ARENA, KEYS, Lab, certificates
 from tests.waiting import DEADLINE_S, wait_for
+from tests.web.arena import four_cameras
 
 
 @pytest.fixture(scope="module")
@@ -53,5 +54,13 @@ def test_a_viewer_reads_robots_and_an_operator_changes_them(lab: Lab):
     assert "robot_b" not in change_robots(operator, ARENA, request)
 
 
-def test_an_operator_changes_the_rig(lab: Lab):
-    assert publish_rig(lab.session("operator"), ARENA, Rig(cameras={}))
+def test_only_an_operator_changes_the_rig(lab: Lab):
+    """A camera and a viewer find no server that takes a rig; nobody but the server publishes one."""
+    rig = four_cameras()
+    for role in ("camera.north", "viewer"):
+        with pytest.raises(NetworkError, match="no server answers"):
+            set_rig(lab.session(role), ARENA, rig, "test", timeout_s=0.5)
+    operator = lab.session("operator")
+    assert set_rig(operator, ARENA, rig, "test").rig == rig
+    with pytest.raises(RequestError, match="no earlier version"):
+        undo_rig(operator, ARENA, "test")

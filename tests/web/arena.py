@@ -20,6 +20,7 @@ class ArenaMessages:
     """Messages of the cameras and the server of arena "test"; `put` sends them."""
 
     keys = Keys("test")
+    rig_t_ns = time.time_ns()
 
     def put(self, key: str, data: bytes) -> None:
         raise NotImplementedError
@@ -96,11 +97,12 @@ class ArenaMessages:
             robots={"rover": "tracked"},
             faults={"camera unknown": 4},
             geometry_residuals_px=misfits or {},
+            rig_t_ns=self.rig_t_ns,
         )
         self.put(self.keys.fusion_status, encode(message))
 
     def rig(self, rig: Rig) -> None:
-        self.put(self.keys.rig, encode(RigMessage.of(rig)))
+        self.put(self.keys.rig, encode(RigMessage(t_ns=self.rig_t_ns, rig=rig)))
 
 
 class LiveArena(ArenaMessages):
@@ -118,7 +120,7 @@ class LiveArena(ArenaMessages):
         """Answer queries for the rig, as the server does."""
 
         def answer(query: zenoh.Query) -> None:
-            query.reply(self.keys.rig, encode(RigMessage.of(rig)))
+            query.reply(self.keys.rig, encode(RigMessage(t_ns=self.rig_t_ns, rig=rig)))
 
         return self.session.declare_queryable(self.keys.rig, answer)
 

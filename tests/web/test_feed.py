@@ -3,10 +3,10 @@
 
 import pytest
 
-from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import encode
+from tests.calib.rig.hostile import as_publication, hostile_messages
 from tests.waiting import wait_for
-from tests.web.arena import LiveArena
+from tests.web.arena import LiveArena, four_cameras
 from web.feed import MAX_REASONS, Feed
 from web.messages import DemoProgress, progress_key
 
@@ -61,10 +61,11 @@ def test_an_invalid_pose_is_counted(arena: LiveArena, feed: Feed):
 
 
 def test_an_invalid_rig_is_counted(arena: LiveArena, feed: Feed):
-    """Valid MessagePack that contains an invalid rig."""
-    for text in ("cameras: [", "cameras: 3", "&a [*a]", "!!python/object:os.system {}"):
-        arena.put(arena.keys.rig, encode(RigMessage(t_ns=0, yaml=text)))
-    wait_for(lambda: feed.state().faults.total() == 4)
+    """None of the hostile messages has another effect."""
+    hostile = hostile_messages(four_cameras())
+    for data in hostile.values():
+        arena.put(arena.keys.rig, as_publication(data))
+    wait_for(lambda: feed.state().faults.total() == len(hostile))
     assert feed.state().rig is None
 
 

@@ -4,11 +4,10 @@
 import numpy as np
 import zenoh
 
-from calib.rig.messages import RigMessage
+from calib.rig.messages import RigMessage, undo_rig_key
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
-from fusion.protocol.messages import undo_key
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.feed import Feed
@@ -50,8 +49,8 @@ def test_a_snapshot_is_the_camera_s_answer(arena: LiveArena, subscription: Subsc
 def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscription):
     """No answer, then a refusal in the server's words, then success."""
     assert "no server" in subscription.undo(timeout_s=0.2)
-    key = undo_key("test")
-    message = encode(RigMessage.of(Rig(cameras={})))
+    key = undo_rig_key("test")
+    message = encode(RigMessage(t_ns=0, rig=Rig(cameras={})))
     granted = [False]
 
     def answer(query: zenoh.Query) -> None:
@@ -64,5 +63,5 @@ def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscr
     queryable = arena.session.declare_queryable(key, answer)
     wait_for(lambda: subscription.undo(timeout_s=0.5) == "nothing to undo")
     granted[0] = True
-    assert "previous pose" in subscription.undo(timeout_s=5.0)
+    assert "previous rig is in force" in subscription.undo(timeout_s=5.0)
     queryable.undeclare()

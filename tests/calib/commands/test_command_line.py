@@ -180,7 +180,7 @@ def test_undo_restores_the_previous_rig(tmp_path: Path, arena: Arena, word: str)
     done = calib(word, "--rig", tmp_path / "rig.yaml")
     assert (done.returncode, "rig.1.yaml" in done.stdout) == (0, True), done.stderr
     assert load_rig(tmp_path / "rig.yaml") == load_rig(tmp_path / "lenses.yaml")
-    assert (tmp_path / "rig.undone.yaml").read_text() == "a mistake"
+    assert (tmp_path / "rig.undone.1.yaml").read_text() == "a mistake"
     done = calib(word, "--rig", tmp_path / "rig.yaml")
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
 

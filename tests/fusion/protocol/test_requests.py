@@ -1,23 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Requests to a running server: changes of robots, undone corrections; and the files that survive a restart."""
+"""Requests to a running server: changes of robots, and the file that survives a restart."""
 
 import json
 import os
-import subprocess
-import sys
 
 import msgspec
-import pytest
 
-from calib.rig.messages import RigMessage
-from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import decode, encode
-from fusion.errors import FusionError
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
-from fusion.server.active_rig import ActiveRig
-from fusion.server.persistence import PersistedFile
-from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
+from tests.fusion.serving import ARENA, DEADLINE_S, config, live, send, serving, until
 from tests.fusion.synthetic import WIDE
 
 
@@ -76,48 +67,6 @@ def test_the_key_for_reading_robots_changes_none(tmp_path):
         reply, _ = request_reply(client, robots_key("test"), b"{}")
         assert reply is not None
         assert list(json.loads(reply)["robots"]) == list(server.pipeline.robots) == ["a"]
-
-
-def test_undo_fails_without_a_correction_and_restores_a_corrected_camera(tmp_path):
-    with serving(config(tmp_path)) as (server, client):
-        with pytest.raises(FusionError, match="nothing to undo"):
-            client.undo_correction()
-        moved = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
-        server.transport.enqueue(lambda: server.pipeline.active_rig.correct("cam1", moved))
-        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == moved)
-        words = [sys.executable, "-m", "fusion", "undo", "--connect", server.endpoints[0], "--arena", "test"]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-        assert done.stdout == "cam1 has its previous pose again and is no longer monitored\n"
-        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras == ARENA.cameras)
-        assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.extrinsics.pinned == {"cam1"}
-
-
-def test_a_published_rig_is_used_after_a_restart(tmp_path):
-    saved = tmp_path / "rig.saved.yaml"
-    settings = msgspec.structs.replace(config(tmp_path, with_rig=False), saved_rig=str(saved))
-    with serving(settings) as (server, client):
-        server.session.put(KEYS.rig, encode(RigMessage.of(Rig(cameras=ARENA.cameras))))
-        until(lambda: client.rig(DEADLINE_S))
-    with serving(settings) as (_, client):
-        rig = client.rig(DEADLINE_S)
-        assert rig is not None
-        assert rig.cameras == ARENA.cameras
-
-
-def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path):
-    given, path = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
-    saved = PersistedFile("rig", str(path), load_rig, save_rig)
-    config(tmp_path)  # writes rig.yaml
-    fewer = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
-    path.write_text(dump_rig(fewer))
-    for age_ns, expected in ((-1, fewer), (1, Rig(cameras=ARENA.cameras))):
-        at = path.stat().st_mtime_ns + age_ns * 10**9
-        os.utime(given, ns=(at, at))
-        assert ActiveRig(given, saved).rig == expected
-    path.write_text("cameras: {")
-    os.utime(given, (0, 0))
-    assert ActiveRig(given, saved).rig == Rig(cameras=ARENA.cameras)
 
 
 def test_changed_robots_are_used_after_a_restart(tmp_path):

@@ -35,7 +35,9 @@ def write(path: Path, arena: Arena, n: int = 20) -> list:
     messages = sorted(arena.messages(n), key=lambda message: message.t_ns)
     arrivals = [(message.t_ns + 20_000_000, message) for message in messages]
     with RecordingWriter(path) as writer:
-        writer.put("x/rig", encode(RigMessage.of(Rig(cameras=arena.cameras))), arrivals[0][0])
+        writer.put(
+            "x/rig", encode(RigMessage(t_ns=arrivals[0][0], rig=Rig(cameras=arena.cameras))), arrivals[0][0]
+        )
         writer.put("x/robots", encode(Robots(robots=arena.robots)), arrivals[0][0])
         for received_ns, message in arrivals:
             writer.put(f"x/camera/{message.camera}/detections", encode(message), received_ns)

@@ -11,8 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.rig.messages import RigMessage
-from calib.rig.rig import Rig
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
@@ -135,20 +133,6 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
         finally:
             server.stop()
             thread.join(DEADLINE_S)
-
-
-def test_a_published_calibration_is_used_and_a_bad_one_is_not(tmp_path):
-    with serving(config(tmp_path, with_rig=False)) as (server, client):
-        assert client.rig(DEADLINE_S) is None
-        good = encode(RigMessage.of(Rig(cameras=ARENA.cameras)))
-        bad = encode(RigMessage(t_ns=0, yaml="cameras: {cam0: [1, 2"))
-        server.session.put(KEYS.rig, good)
-        rig = until(lambda: client.rig(DEADLINE_S))
-        assert rig is not None
-        assert rig.cameras.keys() == ARENA.cameras.keys()
-        server.session.put(KEYS.rig, bad)
-        until(lambda: client.status(DEADLINE_S).next().faults == {"undecodable rig": 1})
-        assert client.rig(DEADLINE_S) is not None
 
 
 def test_the_clock_is_answered(tmp_path):

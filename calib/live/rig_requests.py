@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Requests to the server to change the rig in force. The server validates, applies and saves it, or refuses."""
+
+import zenoh
+
+from calib.rig.messages import (
+    RigMessage,
+    RigRequest,
+    RigStepRequest,
+    redo_rig_key,
+    set_rig_key,
+    undo_rig_key,
+)
+from calib.rig.rig import Rig
+from camera_node.errors import NetworkError
+from camera_node.protocol.messages import Keys, MessageError, decode, encode
+from camera_node.protocol.requests import REQUEST_S, RequestSource, send_request
+
+
+def set_rig(
+    session: zenoh.Session, arena: str, rig: Rig, program: str, timeout_s: float = REQUEST_S
+) -> RigMessage:
+    """Have the server use a rig.
+
+    Args:
+        session, arena: where the server is reached.
+        rig: the rig; its cameras may lack poses.
+        program: the name of the program that asks, such as `calib wand`; the server reports it.
+        timeout_s: for a server to be found.
+
+    Returns:
+        The rig in force.
+
+    Raises:
+        RequestError: the server refuses it; the message is the server's.
+        NetworkError: no server answers in time.
+    """
+    request = RigRequest(rig=rig, source=RequestSource.of(program))
+    return _read(send_request(session, set_rig_key(arena), encode(request), timeout_s))
+
+
+def undo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
+    """Have the server undo the last change of its rig; returns and raises as `set_rig`."""
+    request = encode(RigStepRequest(source=RequestSource.of(program)))
+    return _read(send_request(session, undo_rig_key(arena), request, timeout_s))
+
+
+def redo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
+    """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
+    request = encode(RigStepRequest(source=RequestSource.of(program)))
+    return _read(send_request(session, redo_rig_key(arena), request, timeout_s))
+
+
+def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig | None:
+    """The rig in force; None if the server has none, or does not answer in time."""
+    for reply in session.get(Keys(arena).rig, timeout=timeout_s):
+        if reply.ok is not None:
+            return _read(reply.ok.payload.to_bytes()).rig
+    return None
+
+
+def _read(data: bytes) -> RigMessage:
+    try:
+        return decode(data, RigMessage)
+    except MessageError as error:
+        raise NetworkError(
+            f"the server's reply is no rig: {error}; is it of this version of Roundel?"
+        ) from None

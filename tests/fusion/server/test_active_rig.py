@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The rig in force: changed by requests, undone, redone, saved; a fault of either leaves the one before."""
+
+import logging
+import os
+import shutil
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from calib.live.rig_requests import set_rig
+from calib.rig.rig import Rig, dump_rig, load_rig
+from camera_node.geometry.pose import Pose
+from camera_node.protocol.requests import RequestError
+from fusion.client.arena import Arena as Client
+from fusion.server.active_rig import ActiveRig
+from fusion.server.config import ArenaConfig
+from tests.fusion.serving import ARENA, DEADLINE_S, config, connected, live, run_program, send, serving, until
+from tests.waiting import wait_for
+
+GIVEN = Rig(cameras=ARENA.cameras)
+FEWER = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
+MOVED = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))
+
+
+def numbered(k: int) -> Rig:
+    """A rig that differs from others in the offset of one clock."""
+    camera = msgspec.structs.replace(ARENA.cameras["cam0"], time_offset_ms=float(k))
+    return Rig(cameras={**ARENA.cameras, "cam0": camera})
+
+
+def saving(folder: Path, with_rig: bool = True) -> ArenaConfig:
+    """A server that saves changes of the rig."""
+    return msgspec.structs.replace(config(folder, with_rig), saved_rig=str(folder / "rig.saved.yaml"))
+
+
+def offset_of(rig: Rig | None) -> float:
+    assert rig is not None
+    return rig.cameras["cam0"].time_offset_ms
+
+
+def test_a_requested_rig_is_in_force_and_used_after_a_restart(tmp_path: Path):
+    settings = saving(tmp_path, with_rig=False)
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) is None
+        reply = client.set_rig(GIVEN)
+        assert (reply.rig, reply.saved) == (GIVEN, True)
+        assert client.rig(DEADLINE_S) == GIVEN
+        assert reply.source is not None
+        assert reply.source.program == "fusion.client"
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == GIVEN
+
+
+def test_a_server_that_saves_nothing_says_so_and_undoes_all_the_same(tmp_path: Path):
+    with serving(config(tmp_path)) as (_, client):
+        assert not client.set_rig(FEWER).saved
+        assert client.undo_rig().rig == GIVEN
+        assert client.redo_rig().rig == FEWER
+        with pytest.raises(RequestError, match="no undone version"):
+            client.redo_rig()
+    assert not list(tmp_path.glob("rig.*.yaml"))
+
+
+def test_subscribers_receive_the_rig_of_the_server_only(tmp_path: Path):
+    """A rig that somebody else publishes has no effect on the server."""
+    with serving(config(tmp_path)) as (server, client), connected(server) as other:
+        received = []
+        subscriber = other._session.declare_subscriber(server.keys.rig, received.append)
+        until(lambda: client.set_rig(FEWER) and received)
+        other._session.put(server.keys.rig, received[0].payload)
+        client.set_rig(GIVEN)
+        assert client.rig(DEADLINE_S) == GIVEN
+        subscriber.undeclare()
+
+
+def test_robots_stay_tracked_if_no_pose_or_that_of_one_camera_changes(tmp_path: Path):
+    with serving(config(tmp_path)) as (server, client):
+        send(server, live(ARENA.messages(30)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        tracker = server.pipeline.tracker
+        assert tracker is not None
+        client.set_rig(Rig(cameras=ARENA.cameras, calibration={"date": "today"}))
+        client.set_rig(numbered(1))
+        assert server.pipeline.tracker is tracker
+        assert tracker.table.status == ["tracked"]
+        client.set_rig(FEWER)
+        assert server.pipeline.tracker is not tracker
+
+
+def test_a_rig_that_cannot_be_saved_is_refused_and_the_old_one_stays(tmp_path: Path):
+    """Applied first, then rolled back: tracking continues with the old rig, and the server keeps running."""
+    (tmp_path / "saved").mkdir()
+    settings = msgspec.structs.replace(config(tmp_path), saved_rig=str(tmp_path / "saved" / "rig.yaml"))
+    with serving(settings) as (server, client):
+        shutil.rmtree(tmp_path / "saved")
+        for rig in (FEWER, numbered(1)):
+            with pytest.raises(RequestError, match=r"saved/rig\.yaml can't be"):
+                client.set_rig(rig)
+            assert client.rig(DEADLINE_S) == GIVEN
+            assert server.pipeline.cameras == ARENA.cameras
+        send(server, live(ARENA.messages(30)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+
+
+def test_changes_are_undone_and_redone_also_after_a_restart(tmp_path: Path):
+    settings = saving(tmp_path)
+    with serving(settings) as (_, client):
+        for k in (1, 2, 3):
+            client.set_rig(numbered(k))
+        assert [offset_of(client.undo_rig().rig) for _ in range(2)] == [2, 1]
+    with serving(settings) as (_, client):
+        assert offset_of(client.rig(DEADLINE_S)) == 1
+        assert offset_of(client.undo_rig().rig) == 0, "the rig of the configuration"
+        with pytest.raises(
+            RequestError, match=r"no earlier version of .*rig\.saved\.yaml; nothing was changed"
+        ):
+            client.undo_rig()
+        assert [offset_of(client.redo_rig().rig) for _ in range(3)] == [1, 2, 3]
+        with pytest.raises(RequestError, match="no undone version"):
+            client.redo_rig()
+
+
+def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_path: Path):
+    with serving(saving(tmp_path)) as (server, client):
+        with pytest.raises(RequestError, match="no earlier version"):
+            client.undo_rig()
+        server.transport.enqueue(lambda: server.pipeline.active_rig.correct("cam1", MOVED, 1))
+        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
+        where = ("--connect", server.endpoints[0], "--arena", "test")
+        done = run_program("fusion", "undo", *where)
+        expected = (
+            "the previous rig is in force on the server; changed cameras: cam1; cam1 is no longer monitored\n"
+        )
+        assert done.stdout == expected
+        assert client.rig(DEADLINE_S) == GIVEN
+        assert server.pipeline.tracker is not None
+        assert server.pipeline.tracker.extrinsics.pinned == {"cam1"}
+        done = run_program("fusion", "redo", *where)
+        assert done.stdout == "the undone rig is in force on the server; changed cameras: cam1\n"
+        done = run_program("fusion", "redo", *where)
+        assert (done.returncode, "no undone version" in done.stderr) == (2, True)
+
+
+def loaded(given: Path, saved: Path) -> Rig | None:
+    active = ActiveRig(given, saved)
+    active.load(lambda rig: None)
+    return active.rig
+
+
+def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path: Path):
+    given, saved = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
+    config(tmp_path)  # writes rig.yaml
+    saved.write_text(dump_rig(FEWER))
+    for age_ns, expected in ((-1, FEWER), (1, GIVEN)):
+        at = saved.stat().st_mtime_ns + age_ns * 10**9
+        os.utime(given, ns=(at, at))
+        assert loaded(given, saved) == expected
+
+
+def test_undo_restores_the_saved_rig_that_a_newer_file_replaced(tmp_path: Path):
+    settings = saving(tmp_path)
+    Path(settings.saved_rig or "").write_text(dump_rig(FEWER))
+    later = (tmp_path / "rig.saved.yaml").stat().st_mtime_ns + 10**9
+    os.utime(tmp_path / "rig.yaml", ns=(later, later))
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == GIVEN
+        assert client.undo_rig().rig == FEWER
+        assert client.redo_rig().rig == GIVEN
+
+
+@pytest.mark.parametrize(
+    "broken", ["cameras: {", "[" * 100, "cameras: {cam0: {time_offset_ms: .nan}}", "\0\xff"]
+)
+def test_a_broken_saved_rig_does_not_prevent_a_start(
+    tmp_path: Path, broken: str, caplog: pytest.LogCaptureFixture
+):
+    """The one before it is used; without one, the given rig. The log names the file."""
+    settings = saving(tmp_path)
+    with serving(settings) as (_, client):
+        for rig in (FEWER, numbered(1), numbered(2)):
+            client.set_rig(rig)
+    (tmp_path / "rig.saved.yaml").write_text(broken)
+    with caplog.at_level(logging.WARNING, "fusion"), serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == numbered(1)
+    assert f"the saved rig {tmp_path / 'rig.saved.yaml'} is not used" in caplog.text
+    for path in tmp_path.glob("rig.saved.*yaml"):
+        path.write_text(broken)
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == GIVEN
+
+
+def test_another_shard_follows_the_rig_of_the_first(tmp_path: Path):
+    """It starts after the first change, which it learns from the status."""
+    settings = msgspec.structs.replace(saving(tmp_path), shard="1/2")
+    with serving(settings) as (leader, client):
+        client.set_rig(numbered(1))
+        second = msgspec.structs.replace(settings, listen=leader.endpoints, shard="2/2")
+        with serving(second) as (follower, _):
+            wait_for(lambda: follower.pipeline.active_rig.rig == numbered(1))
+            client.set_rig(FEWER)
+            wait_for(lambda: follower.pipeline.active_rig.rig == FEWER)
+            client.undo_rig()
+            wait_for(lambda: follower.pipeline.active_rig.rig == numbered(1))
+            assert client.redo_rig().rig == FEWER, "the other shard wrote no files"
+
+
+def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
+    """The status tells since when the rig is in force."""
+    with serving(config(tmp_path)) as (_, client):
+        t_ns = client.set_rig(FEWER).t_ns
+        until(lambda: client.status(DEADLINE_S).next().rig_t_ns == t_ns)
+
+
+def test_a_client_without_a_server_is_told(endpoint: str):
+    with (
+        Client.connect(endpoint, arena="test") as client,
+        pytest.raises(Exception, match="no server answers"),
+    ):
+        set_rig(client._session, "test", GIVEN, "test", timeout_s=0.2)
+
+
+def test_the_saved_file_is_the_rig_in_force(tmp_path: Path):
+    settings = saving(tmp_path)
+    with serving(settings) as (_, client):
+        client.set_rig(numbered(1))
+        client.set_rig(numbered(2))
+        assert load_rig(tmp_path / "rig.saved.yaml") == numbered(2)
+        client.undo_rig()
+        assert load_rig(tmp_path / "rig.saved.yaml") == numbered(1)
+    assert [load_rig(p) for p in sorted(tmp_path.glob("rig.saved.[0-9].yaml"))] == [GIVEN]
+    assert load_rig(tmp_path / "rig.saved.undone.1.yaml") == numbered(2)
