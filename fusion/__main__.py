@@ -18,6 +18,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "health": "health",
     "doctor": "doctor",
     "define": "define",
+    "robots": "robots",
     "undo": "undo",
     "redo": "undo",
     "ros2": "ros2",

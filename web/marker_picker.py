@@ -83,11 +83,11 @@ class MarkerPicker:
             measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
             standing = _match_selected(measured, np.array(self.selected))
             robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
-            self._subscription.define(name, robot)
+            robots = self._subscription.define(name, robot)
         except RoundelError as error:
             return str(error)
         self.selected = []
-        return describe(name, robot)
+        return describe(name, robots)
 
     def _toggle(self) -> None:
         self._active, self.selected = not self._active, []

@@ -15,7 +15,7 @@ from camera_node.protocol.messages import MessageError, decode
 from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
-from fusion.protocol.messages import FusionStatus, Markers, RobotsRequest
+from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
 from fusion.protocol.requests import change_robots
 from web.feed import Feed
 
@@ -55,10 +55,15 @@ class Subscription:
         """Collect the server's marker messages for some seconds; raise FusionError if there are none."""
         return collect_markers(self.session, self.feed.keys.arena, seconds)
 
-    def define(self, name: str, robot: Robot) -> None:
-        """Have the server track a new robot; raise FusionError or NetworkError if it refuses or does not answer."""
+    def define(self, name: str, robot: Robot) -> Robots:
+        """Have the server track a new robot, and return all robots.
+
+        Raises:
+            FusionError: the server refuses, as it does where the name is in use.
+            NetworkError: it does not answer.
+        """
         request = RobotsRequest(define={name: robot})
-        change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
+        return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
         """Have the server undo the last change of its rig; return the outcome as text."""

@@ -68,22 +68,42 @@ def robot_state(state: ArenaState, robot: str) -> str:
 
 def tabulate_robots(state: ArenaState) -> HtmlTable:
     """One row per robot: state, position, speed, standard deviation of the position, number of markers."""
-    misfits = state.status.message.geometry_residuals_px if state.status else {}
-    rows = [_robot_row(state, name, misfits.get(name)) for name in sorted(state.poses)]
+    status: FusionStatus | None = state.status.message if state.status else None
+    missing = status.not_acquired if status else {}
+    rows = [
+        _robot_row(state, name) if name in state.poses else _missing_row(state, name)
+        for name in sorted({*state.poses, *missing})
+    ]
     return HtmlTable(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, "no robot yet")
 
 
-def _robot_row(state: ArenaState, name: str, misfit_px: float | None) -> TableRow:
+def _missing_row(state: ArenaState, name: str) -> TableRow:
+    """A robot that was never acquired."""
+    return TableRow((name, "not found", *[NO_VALUE] * 4), "bad", _robot_note(state, name))
+
+
+def _robot_note(state: ArenaState, name: str) -> str:
+    """What the operator should know about a robot."""
+    status: FusionStatus | None = state.status.message if state.status else None
+    if status is None:
+        return ""
+    notes = [status.not_acquired.get(name, "")]
+    if misfit_px := status.geometry_residuals_px.get(name):
+        notes.append(f"the markers differ from their definition by {misfit_px:.1f} px: measure them again")
+    if name in status.unsaved_robots:
+        notes.append("not saved: a restart of the server loses it")
+    return "; ".join(filter(None, notes))
+
+
+def _robot_row(state: ArenaState, name: str) -> TableRow:
     pose: RobotPose = state.poses[name].message
     tracking = robot_state(state, name)
     position = " ".join(f"{x:+.2f}" for x in pose.position)
     speed, sigma = float(np.linalg.norm(pose.velocity)), format_sigma(position_sigma_mm(pose))
     cells = (name, tracking, position, f"{speed:.2f}", sigma, str(pose.n_markers))
     level = LEVEL_OF_STATE.get(tracking, "bad")
-    if misfit_px is None:
-        return TableRow(cells, level)
-    note = f"the markers differ from their definition by {misfit_px:.1f} px: measure them again"
-    return TableRow(cells, "warn" if level == "ok" else level, note)
+    note = _robot_note(state, name)
+    return TableRow(cells, "warn" if note and level == "ok" else level, note)
 
 
 def format_sigma(sigma_mm: float) -> str:

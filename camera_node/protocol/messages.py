@@ -38,6 +38,7 @@ class Keys:
         self.markers = f"{arena}/markers"
         self.fusion_status = f"{arena}/fusion/status"
         self.fusion_alive = f"{arena}/fusion/alive"  # liveliness token
+        self.wand = f"{arena}/calib/wand"  # liveliness token of a program that records the wand
 
     def detections(self, camera: str = "*") -> str:
         return f"{self.arena}/camera/{camera}/detections"

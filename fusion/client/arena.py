@@ -28,8 +28,8 @@ from camera_node.protocol.messages import CameraStatus, Keys, MessageError, deco
 from camera_node.protocol.requests import RETRY_S
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotsRequest
-from fusion.protocol.requests import change_robots
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, RobotsRequest
+from fusion.protocol.requests import change_robots, request_robots
 
 T = TypeVar("T")
 TIMEOUT_S = 10.0
@@ -204,8 +204,11 @@ class Arena:
         rename: dict[str, str] | None = None,
         remove: Sequence[str] = (),
         define: dict[str, RobotBody] | None = None,
+        replace: bool = False,
     ) -> dict[str, RobotBody]:
         """Rename, then remove, then define robots while the server runs, all or none.
+
+        Defining a robot that exists is refused, unless `replace`.
 
         Returns:
             All robots that the server tracks after the change.
@@ -214,8 +217,18 @@ class Arena:
             FusionError: the server refuses the change; the message is the server's.
             NetworkError: no server answers in time.
         """
-        request = RobotsRequest(rename=rename or {}, remove=tuple(remove), define=define or {})
-        return change_robots(self._session, self.keys.arena, request)
+        request = RobotsRequest(
+            rename=rename or {}, remove=tuple(remove), define=define or {}, replace=replace
+        )
+        return change_robots(self._session, self.keys.arena, request).robots
+
+    def declared_robots(self) -> Robots:
+        """All robots that the server tracks, with their markers, and the names that a restart would lose.
+
+        Raises:
+            NetworkError: no server answers in time.
+        """
+        return request_robots(self._session, self.keys.arena)
 
     def set_rig(self, rig: Rig) -> RigMessage:
         """Have the server use another rig.

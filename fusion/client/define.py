@@ -9,10 +9,13 @@ import msgspec
 import zenoh
 
 from camera_node.config import require_name
+from camera_node.errors import ConfigError
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
-from fusion.model.robots import Robot, distances
-from fusion.protocol.messages import RobotsRequest
+from fusion.model.robots import distances
+from fusion.protocol.messages import Robots, RobotsRequest
 from fusion.protocol.requests import change_robots, request_robots
+
+LOST_AT_RESTART = "a restart of the server loses it, because arena.yaml names no saved_robots"
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class RobotDefinition:
         motion: how it moves.
         centre: its rough position, world, metres; None if it has all unlabeled markers.
         radius_m: the largest distance of its markers from there.
+        replace: whether it may replace a robot of that name.
 
     Raises:
         ConfigError: the name can't be one.
@@ -35,31 +39,37 @@ class RobotDefinition:
     motion: Literal["ground", "aerial"] = "aerial"
     centre: tuple[float, float, float] | None = None
     radius_m: float = 0.3
+    replace: bool = False
 
     def __post_init__(self) -> None:
         require_name(self.name, "a robot")
 
 
-def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robot:
-    """Measure a robot for `seconds`, and add it to the robots of the running server.
+def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robots:
+    """Measure a robot for `seconds`, and add it to the robots of the running server, which it returns.
 
     Raises:
+        ConfigError: there is a robot of that name.
         FusionError: the markers make no robot, or the server refuses it.
         NetworkError: no server answers in time.
     """
-    request_robots(session, arena)  # fails without a server, before the measurement
+    existing = request_robots(session, arena).robots  # fails without a server, before the measurement
+    if definition.name in existing and not definition.replace:
+        raise ConfigError(f"there is another robot '{definition.name}': add --replace, or use another name")
     markers = find_stationary_markers(collect_markers(session, arena, seconds))
     if definition.centre is not None:
         markers = markers.within(definition.centre, definition.radius_m)
     robot = robot_from_markers(markers, definition.diameter_m, definition.motion)
-    change_robots(session, arena, RobotsRequest(define={definition.name: robot}))
-    return robot
+    request = RobotsRequest(define={definition.name: robot}, replace=definition.replace)
+    return change_robots(session, arena, request)
 
 
-def describe(name: str, robot: Robot) -> str:
+def describe(name: str, robots: Robots) -> str:
     """The measured robot in words, and as an entry for robots.yaml."""
+    robot = robots.robots[name]
     D = distances(robot.points)
     pairs = ", ".join(f"{i}-{j} {D[i, j] * 1e3:.1f}" for i, j in combinations(range(len(D)), 2))
     defined = f"the server now tracks {name}, with {len(D)} marker{'s' * (len(D) > 1)}"
     entry = msgspec.json.encode({name: robot}).decode()[1:-1].replace('":', '": ').replace(",", ", ")
-    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}; for robots.yaml:\n  {entry}"
+    lost = f"; {LOST_AT_RESTART}" if name in robots.unsaved else ""
+    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}{lost}; for robots.yaml:\n  {entry}"

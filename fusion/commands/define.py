@@ -21,6 +21,7 @@ def define(
     within: float = 0.3,
     motion: Literal["ground", "aerial"] = "aerial",
     seconds: float = 2.0,
+    replace: bool = False,
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
@@ -36,14 +37,15 @@ def define(
         within: the largest distance of its markers from there, metres.
         motion: how it moves.
         seconds: the duration of the measurement.
+        replace: replace the robot of that name; without it, a name in use is refused.
         connect: the server's Zenoh endpoints.
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    definition = RobotDefinition(name, diameter, motion, at, within)
+    definition = RobotDefinition(name, diameter, motion, at, within, replace)
     if not 0 < seconds < 3600:
         raise ConfigError(f"--seconds is {seconds:g}; it must be above 0 and below 3600")
     with open_client(connect, zenoh_config) as session:
-        robot = define_robot(session, arena, definition, seconds)
-    say(describe(name, robot))
+        robots = define_robot(session, arena, definition, seconds)
+    say(describe(name, robots))
     return 0

@@ -14,8 +14,9 @@ class Serve:
     """Fuse what an arena's cameras publish into robot poses, until stopped; this is the arena's Zenoh router.
 
     Other commands, python -m fusion NAME --help: health and doctor report on a running arena and say what to do;
-    run, record, replay and repair are for recordings; define measures a new robot in the arena; undo and redo step
-    through the changes of the rig; ros2 publishes the robots to ROS 2.
+    run, record, replay and repair are for recordings; define measures a new robot in the arena; robots lists,
+    renames, removes and saves them; undo and redo step through the changes of the rig; ros2 publishes the robots to
+    ROS 2.
     """
 
     config: Path | None = None

@@ -145,12 +145,16 @@ def _require_few(robots: dict[str, Robot], where: str) -> None:
 
 
 def changed(
-    robots: dict[str, Robot], rename: dict[str, str], remove: tuple[str, ...], define: dict[str, Robot]
+    robots: dict[str, Robot],
+    rename: dict[str, str],
+    remove: tuple[str, ...],
+    define: dict[str, Robot],
+    replace: bool = False,
 ) -> dict[str, Robot]:
     """Rename, then remove, then define robots; returns the new robots.
 
     Raises:
-        ConfigError: a name is invalid, unknown, or already in use.
+        ConfigError: a name is invalid, unknown, or already in use; with `replace`, a defined robot may exist.
         FusionError: a constellation is symmetric, or two robots look alike.
     """
     _require_few(define, "the request")
@@ -164,6 +168,11 @@ def changed(
     remaining = {
         new: robot for new, (old, robot) in zip(renamed, robots.items(), strict=True) if old not in removed
     }
+    existing = [name for name, robot in define.items() if remaining.get(name, robot) != robot]
+    if existing and not replace:
+        raise ConfigError(
+            f"there is another robot '{existing[0]}': use another name, or confirm that it is replaced (--replace)"
+        )
     all_robots = remaining | define
     unchanged = {name for name, robot in remaining.items() if all_robots[name] == robot}
     require_trackable(all_robots, "robots", unchanged)

@@ -21,17 +21,23 @@ class ResidualMonitor:
         self._usual_px, self._learned, self._suspect = 0.0, 0, ""
 
     def is_unusual(self, squared_px: Array) -> bool:
-        """Whether the squared residuals (N,) of a frame set, px^2, are far above the usual ones."""
+        """Whether the squared residuals (N,) of a frame set, px^2, are far above the usual ones; learns others."""
         if len(squared_px) < MIN_RESIDUALS:
             return False
-        median = _median_px(squared_px)
-        return self._learned >= LEARNED and median > max(MIN_PX, MIN_RATIO * self._usual_px)
+        median_px = _median_px(squared_px)
+        if self._learned >= LEARNED and median_px > max(MIN_PX, MIN_RATIO * self._usual_px):
+            return True
+        self._learn(median_px)
+        return False
 
     def learn(self, squared_px: Array) -> None:
         """Count the squared residuals (N,) of a frame set, px^2, as usual."""
         if len(squared_px) >= MIN_RESIDUALS:
-            self._learned += 1
-            self._usual_px += (_median_px(squared_px) - self._usual_px) / min(self._learned, LEARNED)
+            self._learn(_median_px(squared_px))
+
+    def _learn(self, median_px: float) -> None:
+        self._learned += 1
+        self._usual_px += (median_px - self._usual_px) / min(self._learned, LEARNED)
 
     def suspects(self, names: tuple[str, ...]) -> list[str]:
         """All cameras, the last suspect first."""

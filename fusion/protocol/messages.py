@@ -250,6 +250,8 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     faults: dict[str, int]
     limits: Limits | None = None  # with which the server tracks, for a replay
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
+    not_acquired: dict[str, str] = {}  # why, by robot
+    unsaved_robots: tuple[str, ...] = ()  # names whose changes a restart would undo
     rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one
 
 
@@ -282,11 +284,15 @@ class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     version: int = VERSION
     rename: dict[str, str] = {}  # old name -> new name, applied first; a renamed robot stays tracked
     remove: tuple[str, ...] = ()
-    define: dict[str, Robot] = {}  # new robots, or new markers of old ones, which are then acquired again
+    define: dict[
+        str, Robot
+    ] = {}  # new robots, or with `replace` new markers of old ones, which are acquired again
+    replace: bool = False  # otherwise `define` with the name of another robot is refused
 
 
 class Robots(msgspec.Struct, frozen=True, kw_only=True):
-    """The robots that the server tracks."""
+    """The robots that the server tracks, and the names whose changes a restart of the server would undo."""
 
     version: int = VERSION
     robots: dict[str, Robot]
+    unsaved: tuple[str, ...] = ()

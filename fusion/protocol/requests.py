@@ -7,17 +7,16 @@ from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import REQUEST_S, RequestError, send_request
 from fusion.errors import FusionError
-from fusion.model.robots import Robot
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 
 
 def change_robots(
     session: zenoh.Session, arena: str, request: RobotsRequest, timeout_s: float = REQUEST_S
-) -> dict[str, Robot]:
+) -> Robots:
     """Rename, remove and define robots, all or none.
 
     Returns:
-        All robots that the server tracks after the change.
+        All robots that the server tracks after the change, and those that a restart would lose.
 
     Raises:
         FusionError: the server refuses the request; the message is the server's.
@@ -26,8 +25,8 @@ def change_robots(
     return _robots_of(_request(session, set_robots_key(arena), encode(request), timeout_s))
 
 
-def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> dict[str, Robot]:
-    """All robots that the server tracks.
+def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Robots:
+    """All robots that the server tracks, and those that a restart would lose.
 
     Raises:
         NetworkError: no server answers in time.
@@ -35,9 +34,9 @@ def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUES
     return _robots_of(_request(session, robots_key(arena), b"", timeout_s))
 
 
-def _robots_of(data: bytes) -> dict[str, Robot]:
+def _robots_of(data: bytes) -> Robots:
     try:
-        return decode(data, Robots).robots
+        return decode(data, Robots)
     except MessageError as error:
         raise NetworkError(f"the server's reply is no list of robots: {error}") from None
 

@@ -48,11 +48,13 @@ class PersistedFile(Generic[T]):
         log.info("using the %s that was last changed over the network: %s", self._content, self._path)
         return saved
 
-    def save(self, value: T) -> None:
-        """Write the file."""
+    def save(self, value: T) -> bool:
+        """Write the file; return whether the value survives a restart."""
         if self._path is None:
-            return
+            return False
         try:
             self._save(value, self._path)
         except RoundelError as error:
             log.warning("the %s is used, but not saved for a restart: %s", self._content, error)
+            return False
+        return True

@@ -48,9 +48,11 @@ class TrackingPipeline:
         self._saved_robots = PersistedFile("robots", config.saved_robots, load_saved_robots, save_robots)
         saved = self._saved_robots.load_if_newer(Path(config.robots))
         self.robots = load_robots(Path(config.robots)) if saved is None else saved
+        self._durable_robots = self.robots  # those that a restart would load
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
+        self._is_wand_recorded = False
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
 
@@ -132,6 +134,7 @@ class TrackingPipeline:
         """Start tracking anew."""
         limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
+        self.pause_acquisition(self._is_wand_recorded)
         self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
             log.info("active calibration: %s", ", ".join(cameras))
@@ -145,16 +148,38 @@ class TrackingPipeline:
         Raises:
             ConfigError, FusionError: the request is invalid.
         """
-        robots = changed(self.robots, request.rename, request.remove, request.define)
+        robots = changed(self.robots, request.rename, request.remove, request.define, request.replace)
         if robots == self.robots:
             return set()
         removed = self.robots.keys() - robots.keys()
         self.robots = robots
-        self._saved_robots.save(robots)
+        if self._saved_robots.save(robots):
+            self._durable_robots = robots
         log.info("robots: %s", ", ".join(robots) or "none")
+        if unsaved := self.unsaved_robots():
+            log.warning(
+                "a restart undoes the changes of %s: arena.yaml names no saved_robots", ", ".join(unsaved)
+            )
         if self.tracker is not None:
             self.tracker = self.tracker.with_robots(robots, request.rename)
         return removed
+
+    def unsaved_robots(self) -> tuple[str, ...]:
+        """Names of the robots that a restart would lose, change or bring back."""
+        names = sorted(self.robots.keys() | self._durable_robots.keys())
+        return tuple(name for name in names if self.robots.get(name) != self._durable_robots.get(name))
+
+    def pause_acquisition(self, is_wand_recorded: bool) -> None:
+        """Acquire no robots while a wand is recorded: its markers are none. Tracked robots continue."""
+        if is_wand_recorded != self._is_wand_recorded:
+            log.info(
+                "a wand is recorded: no robots are acquired"
+                if is_wand_recorded
+                else "robots are acquired again"
+            )
+        self._is_wand_recorded = is_wand_recorded
+        if self.tracker is not None:
+            self.tracker.acquires_none = is_wand_recorded
 
     def add_shard_poses(self, poses: ShardPoses) -> None:
         """Use the robots of another shard: their detections are not available to the robots of this one."""
@@ -182,6 +207,10 @@ class TrackingPipeline:
     def excluded_cameras(self) -> set[str]:
         """Cameras that were moved, whose detections are excluded."""
         return set(self.tracker.extrinsics.excluded) if self.tracker else set()
+
+    def not_acquired(self) -> dict[str, str]:
+        """Why the robots that are neither tracked nor coasting were not acquired, by name."""
+        return self.tracker.not_acquired() if self.tracker else {}
 
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""

@@ -134,6 +134,7 @@ class Server:
         self._update_quotas()
         transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
         transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
+        transport.watch_token(keys.wand, self.pipeline.pause_acquisition)
         audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
         transport.answer_on_server_thread(
             set_robots_key(keys.arena), audit.audited("change of robots", self._change_robots)
@@ -239,6 +240,8 @@ class Server:
             clocks=self.pipeline.clocks(),
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
+            not_acquired=self.pipeline.not_acquired(),
+            unsaved_robots=self.pipeline.unsaved_robots(),
         )
         status = self.statistics.report(now_ns, pipeline)
         self._publisher.publish_status(status)
@@ -331,13 +334,17 @@ class Server:
         payload = payload_of(query)
         if payload and parse_request(payload, RobotsRequest) != RobotsRequest():
             raise RequestError(f"send changes of robots to {set_robots_key(self.keys.arena)}")
-        return encode_reply(payload, Robots(robots=self.pipeline.robots))
+        return self._robots_reply(payload)
+
+    def _robots_reply(self, payload: bytes) -> bytes:
+        robots = Robots(robots=self.pipeline.robots, unsaved=self.pipeline.unsaved_robots())
+        return encode_reply(payload, robots)
 
     def _change_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
         request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self.pipeline.change_robots(request))
-        return encode_reply(payload, Robots(robots=self.pipeline.robots))
+        return self._robots_reply(payload)
 
 
 def _parse_step(query: zenoh.Query) -> RigStepRequest:

@@ -32,6 +32,8 @@ class PipelineStatus:
         excluded: cameras that were moved, whose detections are excluded.
         clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        not_acquired: why robots were not acquired, by name.
+        unsaved_robots: names of the robots whose changes a restart would undo.
         rig_t_ns: since when the active rig is in force.
     """
 
@@ -40,6 +42,8 @@ class PipelineStatus:
     excluded: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    not_acquired: dict[str, str] = field(default_factory=dict)
+    unsaved_robots: tuple[str, ...] = ()
     rig_t_ns: int | None = None
 
 
@@ -153,6 +157,8 @@ class ServerStatistics:
             faults=faults,
             limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            not_acquired=pipeline.not_acquired,
+            unsaved_robots=pipeline.unsaved_robots,
             rig_t_ns=pipeline.rig_t_ns,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s

@@ -129,6 +129,16 @@ class Transport:
 
         self.answer(key, enqueue)
 
+    def watch_token(self, key: str, handle: Callable[[bool], object]) -> None:
+        """Call `handle` on the server's thread with whether the liveliness token is there, now and on each change."""
+
+        def enqueue(sample: zenoh.Sample) -> None:
+            is_alive = sample.kind == zenoh.SampleKind.PUT
+            self.enqueue(lambda: handle(is_alive))
+
+        subscriber = self.session.liveliness().declare_subscriber(key, enqueue, history=True)
+        self._closing.callback(subscriber.undeclare)
+
     def declare_alive(self, key: str) -> None:
         """Declare a liveliness token."""
         self._closing.callback(self.session.liveliness().declare_token(key).undeclare)

@@ -13,30 +13,30 @@ from camera_node.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
-from fusion.model.states import POSITION, States
-from fusion.tracking.constellation import Fits, TriangulatedMarkers, search
+from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
-    DIAMETER_TOLERANCE,
     MAX_CHI2,
-    POSITION_GATE,
     START_S,
     START_SIGMAS,
     START_SIGMAS_SINGLE,
     mean_by_body,
     misfit,
 )
-from fusion.tracking.identification import Question, RefinedFits, identify
+from fusion.tracking.identity.constellation import MIN_MARKERS, Fits, TriangulatedMarkers, search
+from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
+from fusion.tracking.identity.single_markers import Histories, MarkerChoice, choose_markers, history_chi2
 from fusion.tracking.multiview import Marker, Portion, find_markers, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
 SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
-START_M = 0.1  # standard deviation of `start_m`
 FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
 MAX_DETECTIONS = (
     1_000  # unassigned, of one frame; of more, those around one of them are searched, each in its turn
 )
+CONFIRMATIONS = 5  # frame sets in which a poor fit must be at one place
+SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
 
@@ -49,6 +49,7 @@ class Acquired:
         displaced: single-marker robots whose detections belong to an acquired constellation.
         assignments: of all robots, including the acquired ones.
         markers: triangulated markers that stay unlabeled.
+        reasons: why the other missing robots of this shard were not acquired, by row.
     """
 
     rows: Index
@@ -56,6 +57,7 @@ class Acquired:
     displaced: Index
     assignments: Assignments
     markers: list[Marker]
+    reasons: dict[int, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,10 +98,16 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
+        self._poor: dict[int, tuple[Array, int]] = {}  # by robot, where poor fits were, and how often
         self._frame_sets = 0  # searched so far
 
     def acquire(
-        self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
+        self,
+        table: TrackTable,
+        missing: Index,
+        detections: DetectionTable,
+        assignments: Assignments,
+        histories: Histories,
     ) -> Acquired:
         """Acquire robots.
 
@@ -108,27 +116,29 @@ class Acquisition:
             missing: rows of the untracked robots.
             detections: of a frame set.
             assignments: of the tracked robots.
+            histories: of unlabeled markers before this frame set.
         """
         if not len(missing) and not self._leads:
-            return Acquired(missing, table.states.select(missing), missing, assignments, [])
+            return Acquired(missing, table.states.select(missing), missing, assignments, [], {})
         bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
         # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
         markers = self._find_markers(table, detections, of_bodies)
-        usual = _usual_misfit(table, detections, of_bodies)
-        found = self._acquire_bodies(table, bodies, markers, detections, usual)
+        found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
         of_bodies = of_bodies.joined(found.assignments)
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
         assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
         markers = _without(markers, assignments)
-        more = self._acquire_singles(table, singles, markers, detections)
+        choice = choose_markers(table, singles, markers, histories)
+        more = self._acquire_singles(table, choice, markers, detections)
         return Acquired(
             np.concatenate([found.rows, more.robot]),
             found.states.joined(more.states),
             table.markers.robot[displaced],
             assignments.joined(more.assignments),
             _without(markers, more.assignments),
+            reasons | choice.reasons,
         )
 
     def _acquire_bodies(
@@ -137,31 +147,36 @@ class Acquisition:
         missing: Index,
         markers: list[Marker],
         detections: DetectionTable,
-        usual: float,
-    ) -> _Found:
-        """The constellations of this shard that the markers identify."""
+        assignments: Assignments,
+    ) -> tuple[_Found, dict[int, str]]:
+        """The constellations of this shard that the markers identify, and why the others are not among them."""
+        none = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
+        if not len(missing):
+            return none, {}
         turn = self._turn
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
         scene = TriangulatedMarkers.of(markers, self._cameras)
+        question = Question(robots, scene, search(robots, scene))
         identified = identify(
-            Question(robots, scene, search(robots, scene)),
+            question,
             lambda fits: self._refine(table, _starts_of(fits, markers, table), detections),
-            usual,
+            _usual_misfit(table, detections, assignments),
             turn,
         )
         self._turn = identified.turn
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
-        found = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
-        for fits in identified.fits:
+        found = none
+        for fits in (*identified.fits, *self._confirmed(identified.poor)):
             found = found.joined(fits.select(table.owned[fits.robot]))
-        return found
+        left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
+        return found, {k: _reason(table, k, question, identified) for k in left}
 
     def _acquire_singles(
-        self, table: TrackTable, missing: Index, markers: list[Marker], detections: DetectionTable
+        self, table: TrackTable, choice: MarkerChoice, markers: list[Marker], detections: DetectionTable
     ) -> RefinedFits:
-        pairs = _pair_singles(table, missing.tolist(), markers)
+        pairs = [(robot, markers[k]) for robot, k in choice.pairs.items()]
         R = [
             start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)[0]
             for robot, marker in pairs
@@ -187,6 +202,19 @@ class Acquisition:
         rows = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         return find_markers(self._cameras, detections, rows, diameters)
 
+    def _confirmed(self, poor: list[RefinedFits]) -> list[RefinedFits]:
+        """The poor fits that were at one place in `CONFIRMATIONS` successive frame sets."""
+        before, self._poor = self._poor, {}
+        for fits in poor:
+            for robot, p in zip(fits.robot.tolist(), fits.states.p, strict=True):
+                place, count = before.get(robot, (p, 0))
+                stayed = np.linalg.norm(p - place) < SAME_PLACE_M
+                self._poor[robot] = p, count + 1 if stayed else 1
+        return [
+            fits.select(np.array([self._poor[k][1] >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
+            for fits in poor
+        ]
+
     def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
         """Update each start independently with its detections."""
         n, body = len(starts.robot), starts.body
@@ -197,7 +225,7 @@ class Acquisition:
         states, residuals = estimator.update(prediction, observations, SMALL)
         d2 = misfit(observations, residuals)
         history = [
-            _history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(starts.robot, states.p, strict=True)
+            history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(starts.robot, states.p, strict=True)
         ]
         return RefinedFits(
             starts.robot,
@@ -235,35 +263,22 @@ def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: As
 
 def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:
     """The markers none of whose detections is assigned."""
+    if not markers:
+        return []
     taken = set(assignments.detection.tolist())
     return [marker for marker in markers if taken.isdisjoint(marker.detections.tolist())]
 
 
-def _pair_singles(table: TrackTable, missing: list[int], markers: list[Marker]) -> list[tuple[int, Marker]]:
-    """Pairs of an owned single-marker robot and a marker, each the only one within reach of the other."""
-    within = np.array([[_reaches(table, k, marker) for marker in markers] for k in missing], bool)
-    within = within.reshape(len(missing), len(markers))
-    return [
-        (k, markers[int(np.argmax(row))])
-        for k, row in zip(missing, within, strict=True)
-        if table.owned[k] and row.sum() == 1 and within[:, np.argmax(row)].sum() == 1
-    ]
-
-
-def _reaches(table: TrackTable, k: int, marker: Marker) -> bool:
-    """Whether the size and the history of single-marker robot k allow this marker."""
-    if abs(marker.diameter_m / table.robots[k].diameter_m - 1) >= DIAMETER_TOLERANCE:  # False where unknown
-        return False
-    return _history_chi2(table, k, marker.position, marker.covariance) < POSITION_GATE
-
-
-def _history_chi2(table: TrackTable, k: int, p: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance of p from the last position of robot k, or from its start if never acquired."""
-    position, own = table.states.p[k], table.states.P[k, POSITION, POSITION]
-    if table.status[k] is None:
-        start = table.robots[k].start_m
-        if start is None:
-            return 0.0
-        position, own = np.array(start), START_M**2 * np.eye(3)
-    error = p - position
-    return float(error @ np.linalg.solve(own + covariance, error))
+def _reason(table: TrackTable, k: int, question: Question, identified: Identified) -> str:
+    """Why constellation k was not acquired."""
+    n, found = len(table.robots[k].markers), question.candidates
+    if k not in question.robots:
+        return "waits for its turn"
+    if k in found.crowded:
+        return "too many unlabeled markers have its distances"
+    if k in identified.rivals:
+        rival = identified.rivals[k]
+        return "its markers fit in several places" if rival == k else f"ambiguous with {table.names[rival]}"
+    if k not in found.tables or not len(found.tables[k]):
+        return f"fewer than {MIN_MARKERS} of its {n} markers are seen by two cameras"
+    return f"no {MIN_MARKERS} of its {n} markers fit well anywhere"

@@ -2,6 +2,7 @@
 """Tracks robots and unlabeled markers from frame set to frame set, live and offline. Reads no clock."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -36,6 +37,7 @@ from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
+PAUSED = "no robot is acquired while the wand is recorded"
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
 
@@ -87,6 +89,9 @@ class Tracker:
         robots: by name, as `load_robots` validated them.
         limits: see `Limits`.
         shard: which of the robots this process estimates; `table.receive` takes the others.
+
+    Attributes:
+        acquires_none: while the wand is recorded: its markers are no robots. Tracked robots continue.
     """
 
     def __init__(
@@ -108,6 +113,8 @@ class Tracker:
         self.extrinsics = ExtrinsicsMonitor()
         self.residuals = ResidualMonitor()
         self.geometry = GeometryCheck(self.table.names, self.table.single)
+        self.acquires_none = False
+        self._reasons: dict[int, str] = {}
 
     def track(self, frame_set: FrameSet) -> TrackingResult:
         """Track all robots and markers through a complete frame set."""
@@ -204,8 +211,15 @@ class Tracker:
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
         other.clocks.inherit(self.clocks)
         other.extrinsics, other.residuals = self.extrinsics, self.residuals
+        other.acquires_none = self.acquires_none
         other.table.inherit(self.table, renamed)
         return other
+
+    def not_acquired(self) -> dict[str, str]:
+        """Why the robots of this shard that are neither tracked nor coasting were not acquired, by name."""
+        missing = np.flatnonzero(self.table.owned & ~self.table.alive).tolist()
+        default = PAUSED if self.acquires_none else "not searched for yet"
+        return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
 
     def _is_current(self, association: Association, t_ns: int) -> bool:
         """Whether an association is of this frame set, and of the present robots and camera poses."""
@@ -239,8 +253,6 @@ class Tracker:
         states, fitted = self._fit(prediction, detections, assignments)
         if self.residuals.is_unusual(fitted.squared_px):
             states, fitted = self._leave_one_out(prediction, detections, fitted, states)
-        else:
-            self.residuals.learn(fitted.squared_px)
         self.table.states = states
         return fitted.joined(others)
 
@@ -276,10 +288,13 @@ class Tracker:
     def _acquire(self, update: Update) -> tuple[Update, list[Marker]]:
         """Acquire missing robots; returns the update with their assignments, and the remaining markers."""
         missing = np.flatnonzero(~update.tracked)
-        missing = (
-            missing if self.table.owned[missing].any() else missing[:0]
-        )  # other shards acquire their own
-        found = self.acquisition.acquire(self.table, missing, update.detections, update.assignments)
+        if self.acquires_none or not self.table.owned[missing].any():  # other shards acquire their own
+            missing = missing[:0]
+        histories = partial(self.unlabeled.histories, update.t_ns)
+        found = self.acquisition.acquire(
+            self.table, missing, update.detections, update.assignments, histories
+        )
+        self._reasons = found.reasons
         self.table.adopt(found.rows, found.states)
         self.table.lose(found.displaced)
         if len(found.assignments) != len(update.assignments):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.observations import DetectionTable, MatchedObservations
-from fusion.model.robots import MOTIONS
+from fusion.model.robots import MOTIONS, distances
 from fusion.model.states import POSITION, States, reset_unobservable
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import (
@@ -31,6 +31,10 @@ from fusion.tracking.normals import start_rotation
 MAX_TRACKS = 64  # markers with a velocity and a normal; false detections make hundreds of markers
 MAX_STARTS = 8  # tracks that begin in one frame set; a start costs a millisecond
 NORMAL_RAD = 0.2  # largest standard deviation of a published normal
+ANCHOR_NS = 1_000_000_000  # motions are compared over this time
+MOVED_M = 0.05  # since the anchor: far above the noise
+RIGID_M = 0.01  # largest change of the distance of two markers of one body
+BODY_M = 1.0  # largest distance of two markers of one body
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,24 +74,80 @@ class UnlabeledMarkers:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MarkerHistories:
+    """What N markers did before: for how long they were tracked, seconds (N,), and how they moved (N,).
+
+    A marker in company kept its distance from another one while one of them moved: they belong to one body. A lone one
+    moved since the last anchor, and none kept its distance. The motions of anchored markers are compared (N,).
+    """
+
+    age_s: Array
+    anchored: Mask
+    in_company: Mask
+    alone: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Tracks:
-    """K markers: states, assumed radius (K,), whether their normal was determined (K,), and time of detection (K,)."""
+    """K markers.
+
+    Attributes:
+        states: the last ones.
+        radius: (K,) the assumed one.
+        has_normal: (K,) whether the normal was determined.
+        seen_ns, since_ns: (K,) times of the last and the first detection.
+        anchor: (K, 3) positions at one time not long ago; NaN for younger tracks.
+        in_company, alone: (K,) see `MarkerHistories`.
+    """
 
     states: States
     radius: Array
     has_normal: Mask
     seen_ns: NDArray[np.int64]
+    since_ns: NDArray[np.int64]
+    anchor: Array
+    in_company: Mask
+    alone: Mask
 
     def __len__(self) -> int:
         return len(self.states)
 
     def select(self, rows: NDArray) -> "_Tracks":
-        return _Tracks(self.states.select(rows), self.radius[rows], self.has_normal[rows], self.seen_ns[rows])
+        return _Tracks(
+            self.states.select(rows),
+            self.radius[rows],
+            self.has_normal[rows],
+            self.seen_ns[rows],
+            self.since_ns[rows],
+            self.anchor[rows],
+            self.in_company[rows],
+            self.alone[rows],
+        )
 
     def joined(self, other: "_Tracks") -> "_Tracks":
-        names = "radius", "has_normal", "seen_ns"
+        names = "radius", "has_normal", "seen_ns", "since_ns", "anchor", "in_company", "alone"
         columns = (np.concatenate([getattr(self, k), getattr(other, k)]) for k in names)
         return _Tracks(self.states.joined(other.states), *columns)
+
+    @classmethod
+    def started(cls, states: States, radius: Array, has_normal: Mask, t_ns: int) -> "_Tracks":
+        """New tracks."""
+        n = len(states)
+        times, never = np.full(n, t_ns, np.int64), np.zeros(n, bool)
+        return cls(states, radius, has_normal, times, times, np.full((n, 3), np.nan), never, never)
+
+    def with_motion(self, is_due: bool) -> "_Tracks":
+        """With what the motion since the anchors shows; anchored anew if that is due."""
+        p, anchor = self.states.p, self.anchor
+        moved = np.linalg.norm(p - anchor, axis=1) > MOVED_M  # False without an anchor
+        in_company = self.in_company
+        if moved.any():
+            before, now = distances(anchor), distances(p)
+            rigid = (np.abs(now - before) < RIGID_M) & (now < BODY_M) & (moved[:, None] | moved)
+            np.fill_diagonal(rigid, False)
+            in_company = in_company | rigid.any(1)
+        alone = moved & ~in_company & (not is_due)
+        return replace(self, in_company=in_company, alone=alone, anchor=p if is_due else anchor)
 
 
 class UnlabeledTracker:
@@ -101,7 +161,8 @@ class UnlabeledTracker:
     def __init__(self, cameras: CameraArray, radii: Array) -> None:
         self._cameras, self._radii, self._t_ns = cameras, np.unique(radii), 0
         none = States.at_rest(np.empty((0, 3, 3)), np.empty((0, 3)), START_SIGMAS_SINGLE)
-        self._tracks = _Tracks(none, np.empty(0), np.empty(0, bool), np.empty(0, np.int64))
+        self._tracks = _Tracks.started(none, np.empty(0), np.empty(0, bool), 0)
+        self._anchored_ns = 0
 
     def track(self, t_ns: int, detections: DetectionTable, markers: Sequence[Marker]) -> UnlabeledMarkers:
         """Continue tracks with the markers that grouping found, and start tracks for others.
@@ -121,17 +182,34 @@ class UnlabeledTracker:
         rows = np.concatenate([old, new])
         current = tracks.select(pair[old]).joined(started)
         states, good = self._update(current, detections, [markers[k] for k in rows.tolist()])
-        current = _Tracks(states, current.radius, current.has_normal, np.full(len(states), t_ns)).select(good)
+        times = np.full(len(states), t_ns, np.int64)
+        current = replace(current, states=states, seen_ns=times).select(good)
         unseen = np.setdiff1d(np.arange(len(tracks)), pair)
-        self._tracks, self._t_ns = tracks.select(unseen).joined(current), t_ns
+        is_due = not 0 <= t_ns - self._anchored_ns < ANCHOR_NS
+        self._anchored_ns = t_ns if is_due else self._anchored_ns
+        self._tracks = tracks.select(unseen).joined(current).with_motion(is_due)
+        self._t_ns = t_ns
         grouped = UnlabeledMarkers(markers, position, covariance, *_unknown(len(markers)))
         return _with_tracks(grouped, rows[good], current)
+
+    def histories(self, t_ns: int, markers: Sequence[Marker]) -> MarkerHistories:
+        """The histories of markers of the present frame set, before `track` continues them."""
+        tracks = self._predict(t_ns)
+        position = np.array([marker.position for marker in markers]).reshape(-1, 3)
+        covariance = np.array([marker.covariance for marker in markers]).reshape(-1, 3, 3)
+        pair = _pair(tracks.states, position, covariance)
+        paired, known = np.flatnonzero(pair >= 0), pair[pair >= 0]
+        age_s, (anchored, in_company, alone) = np.zeros(len(pair)), np.zeros((3, len(pair)), bool)
+        age_s[paired] = (t_ns - tracks.since_ns[known]) * 1e-9
+        anchored[paired] = np.isfinite(tracks.anchor[known, 0])
+        in_company[paired], alone[paired] = tracks.in_company[known], tracks.alone[known]
+        return MarkerHistories(age_s, anchored, in_company, alone)
 
     def _predict(self, t_ns: int) -> _Tracks:
         tracks = self._tracks.select(t_ns - self._tracks.seen_ns < FORGET_NS)
         dt = np.full(len(tracks), max((t_ns - self._t_ns) * 1e-9, 0.0))
         states = self._estimator(len(dt)).predict(tracks.states, dt).states
-        return _Tracks(states, tracks.radius, tracks.has_normal, tracks.seen_ns)
+        return replace(tracks, states=states)
 
     def _start(self, t_ns: int, detections: DetectionTable, markers: list[Marker]) -> _Tracks:
         radius = np.array([self._radius(marker) for marker in markers])
@@ -144,7 +222,7 @@ class UnlabeledTracker:
         states = States.at_rest(R, p, START_SIGMAS_SINGLE)
         states.P[:] = reset_unobservable(states.P)
         has_normal = np.array([determined for _, determined in starts], bool)
-        return _Tracks(states, radius, has_normal, np.full(len(markers), t_ns))
+        return _Tracks.started(states, radius, has_normal, t_ns)
 
     def _update(
         self, tracks: _Tracks, detections: DetectionTable, markers: Sequence[Marker]

@@ -69,4 +69,4 @@ def test_false_robots_are_not_believed(tmp_path: Path):
         spoofer, session = (stack.enter_context(open_client(server.endpoints)) for _ in range(2))
         spoofer.declare_queryable(robots_key(KEYS.arena), answer, complete=True)
         wait_for_answers(session, robots_key(KEYS.arena), 2)
-        assert set(request_robots(session, KEYS.arena)) == {"a"}
+        assert set(request_robots(session, KEYS.arena).robots) == {"a"}

@@ -3,6 +3,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import msgspec
 import pytest
@@ -11,9 +13,13 @@ import zenoh
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import decode, encode
 from camera_node.protocol.session import open_client, open_router
+from fusion.client.define import LOST_AT_RESTART
+from fusion.errors import FusionError
+from fusion.model.robots import load_robots
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.protocol.requests import change_robots
-from tests.fusion.serving import ARENA, DEADLINE_S, config, live, send, serving, until
+from fusion.tracking.tracker import PAUSED
+from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, send, serving, until
 from tests.fusion.synthetic import WIDE
 
 
@@ -74,6 +80,60 @@ def test_an_invalid_change_of_robots_changes_nothing(tmp_path):
             assert reply is None
             assert said in error
         assert list(server.pipeline.robots) == ["a"]
+
+
+def test_a_robot_is_not_overwritten_unless_asked(tmp_path):
+    """The robots that a restart would lose are named, also in the status."""
+    with serving(config(tmp_path)) as (server, client):
+        client.change_robots(define={"b": WIDE})
+        other = msgspec.structs.replace(WIDE, motion="ground")
+        with pytest.raises(
+            FusionError, match=r"there is another robot 'b': use another name, or .*--replace"
+        ):
+            client.change_robots(define={"b": other})
+        assert server.pipeline.robots["b"] == WIDE
+        assert client.change_robots(define={"b": other}, replace=True)["b"] == other
+        client.change_robots(rename={"a": "c"})
+        assert client.declared_robots().unsaved == ("a", "b", "c")
+        until(lambda: client.status(DEADLINE_S).next().unsaved_robots == ("a", "b", "c"))
+
+
+def test_the_robots_command_lists_renames_removes_and_saves(tmp_path):
+    def robots(*words: str) -> tuple[int, str]:
+        command = [sys.executable, "-m", "fusion", "robots", *words, *where]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        return done.returncode, done.stdout + done.stderr
+
+    with serving(config(tmp_path)) as (server, client):
+        where = ["--connect", server.endpoints[0], "--arena", "test"]
+        assert robots("rename", "a", "rover") == (
+            0,
+            f"rover: 3 markers of 0.12 m; {LOST_AT_RESTART}\n"
+            "a: removed; a restart of the server brings it back, because arena.yaml names no saved_robots\n",
+        )
+        path = tmp_path / "mine.yaml"
+        assert robots("save", str(path)) == (0, f"wrote 1 robots to {path}\n")
+        assert load_robots(path) == client.declared_robots().robots
+        code, said = robots("save", str(path))
+        assert code == 2
+        assert "exists; add --force" in said
+        assert robots("remove", "rover")[0] == 0
+        assert "rover" not in robots("list")[1]
+
+
+def test_no_robot_is_acquired_while_a_wand_is_recorded(tmp_path):
+    """Another program declares the token, as calib does while it records; it is counted until that ends."""
+    with serving(config(tmp_path)) as (server, client):
+        wand = client._session.liveliness().declare_token(KEYS.wand)
+        until(lambda: client.status(DEADLINE_S).next().not_acquired == {"a": PAUSED})
+        send(server, live(ARENA.messages(30)))
+        until(lambda: client.status(DEADLINE_S).next().frame_sets_per_s > 0)
+        assert server.pipeline.tracker is not None
+        assert server.pipeline.tracker.table.status == [None]
+        wand.undeclare()
+        until(lambda: client.status(DEADLINE_S).next().not_acquired.get("a") != PAUSED)
+        send(server, live(ARENA.messages(30)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
 
 
 def test_the_key_for_reading_robots_changes_none(tmp_path):

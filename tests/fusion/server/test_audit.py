@@ -9,6 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from calib.live.rig_requests import redo_rig, set_rig, undo_rig
+from calib.rig.rig import Rig
 from camera_node.errors import RoundelError
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots
@@ -72,3 +74,21 @@ def test_without_certificates_the_address_is_known(tmp_path: Path):
 )
 def test_any_request_can_be_quoted(payload: bytes):
     assert len(msgspec.json.encode(quote(payload))) < 200
+
+
+def test_changes_of_the_rig_are_noted_with_their_claimed_source(tmp_path: Path):
+    """A change, its undo and its redo."""
+    audit = tmp_path / "audit.jsonl"
+    settings = msgspec.structs.replace(config(tmp_path), audit=str(audit))
+    with serving(settings) as (server, client):
+        rig = server.pipeline.active_rig.rig
+        assert rig is not None
+        cameras = {name: rig.cameras[name] for name in sorted(rig.cameras)[:3]}
+        set_rig(client._session, "test", Rig(cameras=cameras), "calib wand")
+        undo_rig(client._session, "test", "calib undo")
+        redo_rig(client._session, "test", "calib redo")
+    assert [(line["change"], line["claimed_source"]["program"]) for line in lines(audit)] == [
+        ("change of the rig", "calib wand"),
+        ("undo of the rig", "calib undo"),
+        ("redo of the rig", "calib redo"),
+    ]

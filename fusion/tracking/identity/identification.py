@@ -6,7 +6,7 @@ positions, which makes its distances uncertain; so the detections decide, with a
 
 In a crowd, detections of two markers make a third one, and a false fit may use it. Such a fit is poorer than those of
 other robots. So may be the fit of a robot whose markers are not quite as declared: a poor fit is accepted if all
-markers are seen and no good fit contradicts it.
+markers are seen and no good fit contradicts it, in several frame sets.
 
 All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
 """
@@ -20,8 +20,15 @@ from camera_node.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments
 from fusion.model.robots import Robot
 from fusion.model.states import States
-from fusion.tracking.constellation import MIN_MARKERS, Candidates, Fits, Mappings, TriangulatedMarkers, fit
 from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2
+from fusion.tracking.identity.constellation import (
+    MIN_MARKERS,
+    Candidates,
+    Fits,
+    Mappings,
+    TriangulatedMarkers,
+    fit,
+)
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
@@ -73,12 +80,14 @@ class Identified:
     """The accepted fits, the robots (rows) with plausible fits that were not accepted, and where to go on.
 
     Attributes:
-        fits: one for each number of markers.
+        fits: one entry for each number of markers.
+        poor: the same of poor fits, which the caller should confirm in several frame sets.
         rivals: by robot, the robot of the best rival; the robot itself where it fits in several places.
         turn: row of the first robot whose turn it is in the next frame set.
     """
 
     fits: list[RefinedFits]
+    poor: list[RefinedFits]
     rivals: dict[int, int]
     turn: int
 
@@ -131,7 +140,7 @@ def identify(question: "Question", refine: Refine, usual: float, turn: int) -> I
     for count in range(most, MIN_MARKERS - 1, -1):
         decisions.decide(count, refine)
     decisions.decide_poor()
-    return Identified(decisions.fits, decisions.rivals, decisions.turn)
+    return Identified(decisions.fits, decisions.poor, decisions.rivals, decisions.turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +161,7 @@ class _Decisions:
         self._accepted, self._open, self._open_good = _Claims(*size), _Claims(*size), _Claims(*size)
         self._poor: list[_Level] = []
         self.fits: list[RefinedFits] = []
+        self.poor: list[RefinedFits] = []
         self.rivals: dict[int, int] = {}
         self.turn = turn
 
@@ -180,7 +190,7 @@ class _Decisions:
             sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
             is_full = np.array(sizes, np.intp) == mappings.points.shape[1]
             is_free = ~self._open_good.touch(mappings) & ~self._accepted.touch(mappings)
-            self._accept(level, is_full & is_free & level.wins)
+            self.poor.append(level.refined.select(is_full & is_free & level.wins))
 
     def _compare(self, mappings: Mappings, refine: Refine) -> _Level:
         """Refine mappings and compare those that the detections allow."""
@@ -193,7 +203,8 @@ class _Decisions:
     def _accept(self, level: _Level, rows: Mask) -> None:
         self._accepted.add(level.fits.mappings.select(rows))
         self.fits.append(level.refined.select(rows))
-        for k in np.flatnonzero(~level.wins).tolist():
+        is_close = np.abs(level.refined.chi2 - level.best) < DECISIVE_CHI2
+        for k in np.flatnonzero(is_close).tolist():
             self.rivals.setdefault(int(level.refined.robot[k]), int(level.rival[k]))
 
 

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion robots`: lists, renames, removes and saves the robots of the running server."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+import zenoh
+
+from camera_node.errors import ConfigError
+from camera_node.protocol.session import open_client
+from camera_node.terminal import say
+from fusion.client.define import LOST_AT_RESTART
+from fusion.model.robots import Robot, save_robots
+from fusion.protocol.messages import Robots, RobotsRequest
+from fusion.protocol.requests import change_robots, request_robots
+
+USES = {"list": "", "rename": "OLD NEW", "remove": "NAME...", "save": "FILE"}
+
+
+def robots(
+    action: Literal["list", "rename", "remove", "save"],
+    arguments: tuple[str, ...] = (),
+    /,
+    *,
+    force: bool = False,
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
+    arena: str = "arena",
+    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+) -> int:
+    """List, rename or remove the robots of the running server, or save them in a file.
+
+    Args:
+        action: list; rename OLD NEW; remove NAME...; save FILE writes robots.yaml on this machine.
+        arguments: as the action needs them.
+        force: save overwrites the file.
+        connect: the server's Zenoh endpoints.
+        arena: the arena's name.
+        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+    """
+    counts = {"list": (0, 0), "rename": (2, 2), "remove": (1, 1000), "save": (1, 1)}[action]
+    if not counts[0] <= len(arguments) <= counts[1]:
+        raise ConfigError(f"{len(arguments)} arguments; use fusion robots {action} {USES[action]}".rstrip())
+    if action == "save" and Path(arguments[0]).exists() and not force:
+        raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
+    with open_client(connect, zenoh_config) as session:
+        after = _apply(session, arena, action, arguments)
+    if action == "save":
+        save_robots(after.robots, Path(arguments[0]))
+        say(f"wrote {len(after.robots)} robots to {arguments[0]}")
+        return 0
+    for name, robot in after.robots.items():
+        say(_line(name, robot, name in after.unsaved))
+    for name in sorted(set(after.unsaved) - after.robots.keys()):
+        say(
+            f"{name}: removed; a restart of the server brings it back, because arena.yaml names no saved_robots"
+        )
+    return 0
+
+
+def _apply(session: zenoh.Session, arena: str, action: str, arguments: tuple[str, ...]) -> Robots:
+    if action == "rename":
+        return change_robots(session, arena, RobotsRequest(rename={arguments[0]: arguments[1]}))
+    if action == "remove":
+        return change_robots(session, arena, RobotsRequest(remove=arguments))
+    return request_robots(session, arena)
+
+
+def _line(name: str, robot: Robot, is_unsaved: bool) -> str:
+    n = len(robot.markers)
+    size = f"{n} marker{'s' * (n > 1)} of {robot.diameter_m:g} m"
+    return f"{name}: {size}{f'; {LOST_AT_RESTART}' if is_unsaved else ''}"
