@@ -24,7 +24,7 @@ log = logging.getLogger("camera_node.requests")
 QUALITY = 85  # JPEG quality unless the request gives one
 MAX_PAYLOAD = 1 << 20  # bytes
 REQUEST_S = 5.0  # for a program that answers to be found
-ANSWER_S = 60.0  # for its answer; a server computes tables of the lenses of a new rig
+ANSWER_S = 60.0  # for the answer to a new rig: a server computes tables of its lenses
 RETRY_S = 0.1
 MAX_SOURCE = 64  # characters of each part of a request's source
 Part = Annotated[str, msgspec.Meta(max_length=MAX_SOURCE)]
@@ -67,19 +67,30 @@ class RequestSource(msgspec.Struct, frozen=True):
 
 
 def send_request(
-    session: zenoh.Session, key: str, payload: bytes = b"", timeout_s: float = REQUEST_S
+    session: zenoh.Session,
+    key: str,
+    payload: bytes = b"",
+    timeout_s: float = REQUEST_S,
+    answer_s: float = 0.0,
 ) -> bytes:
-    """Send a request until a program answers it; one that takes long to answer is awaited.
+    """Send a request until a program answers it.
+
+    Args:
+        session: an open session.
+        key: of the queryable.
+        payload: of the request.
+        timeout_s: for a program to be found, and for its answer unless `answer_s` is longer.
+        answer_s: for the answer of a program that was found.
 
     Raises:
         RequestError: the request is refused; the message is the program's.
-        NetworkError: no program answers within `timeout_s`.
+        NetworkError: no program answers in time.
     """
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
         every = zenoh.ConsolidationMode.NONE
         replies = session.get(
-            key, payload=payload, attachment=sender(session), consolidation=every, timeout=max(left, ANSWER_S)
+            key, payload=payload, attachment=sender(session), consolidation=every, timeout=max(left, answer_s)
         )
         if reply := reply_of_server(session, replies):
             if reply.ok is not None:

@@ -21,7 +21,7 @@ from fusion.model.limits import Limits
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
-from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 from tests.waiting import wait_for
 
 T = TypeVar("T")
@@ -81,6 +81,12 @@ def until(condition: Callable[[], T]) -> T:
 def live(messages: list[Detections], ago_ns: int = 10**9) -> list[Detections]:
     """The messages as if their first frame was taken `ago_ns` ago."""
     shift = time.time_ns() - ago_ns - messages[0].t_ns
+    return [msgspec.structs.replace(m, t_ns=m.t_ns + shift, sent_ns=m.t_ns + shift) for m in messages]
+
+
+def later(messages: list[Detections]) -> list[Detections]:
+    """The messages as if the same cameras, in their rhythm, had taken them in the last second."""
+    shift = round((time.time_ns() - messages[-1].t_ns) / PERIOD_NS) * PERIOD_NS
     return [msgspec.structs.replace(m, t_ns=m.t_ns + shift, sent_ns=m.t_ns + shift) for m in messages]
 
 

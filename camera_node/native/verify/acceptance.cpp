@@ -127,7 +127,7 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     if (!is_explained_by_noise(*fit, context.noise)) misfit.emplace(image, fit->p);
     const bool elliptic = !misfit || has_elliptic_edges(*misfit, *fit, context.noise);
     const bool accepted = elliptic && passes(image, *fit, context, {kMisfit, kMaxGrowth});
-    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, at_edges));
+    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, context.noise));
     claim_misfit(*fit, context.noise);
     if (fit->unoccluded || guess.model) return fit->unoccluded ? fit : std::nullopt;
     const auto rest = fit_occluded(image, {guess, *fit, misfit, at_edges, known || accepted});

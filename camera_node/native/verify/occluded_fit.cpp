@@ -21,7 +21,8 @@ constexpr double kSlacks[] = {0.48, 0.12,
                               0.03};  // of masked sectors, in turn: a biased fit spreads its misfit
 
 constexpr int kMaxMasked = 26, kMaxMaskedOfBoth = 44;  // sectors of 32, of one edge and of both
-constexpr double kMaxRatioError = 0.01;  // from the nearest print, beside its uncertainty: shows a bias
+constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
+constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
 constexpr double kMinKnown = 12, kMinNew = 16;  // pixels: smaller ones contain too little information
 
 // Levels in units of the contrast, from ink (0) to paper (1):
@@ -118,7 +119,7 @@ bool masks_too_much(const OcclusionMask& mask) {
 /// the residuals do not show biases the ratio as well as the position.
 bool has_print_ratio(const RoundelFit& fit, std::span<const double> ratios) {
     return ratios.empty() || std::abs(nearest_ratio(ratios, fit.ratio) - fit.ratio) <
-                                 std::hypot(kMaxRatioError, 2 * fit.ratio_sigma);
+                                 std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma));
 }
 
 }  // namespace

@@ -6,7 +6,9 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from contextlib import ExitStack
+from itertools import count
 
+COUNT = count()  # of networks: the names of one that was deleted are free a little later
 SUBNET = "10.213.77"  # private; the server has .1, this process .2, the cameras follow
 
 
@@ -30,10 +32,11 @@ class Namespaces(Loopback):
     host = f"{SUBNET}.1"
 
     def __init__(self, cameras: Sequence[str]) -> None:
-        self._prefix = f"rdl{os.getpid()}"
+        self._number = f"{os.getpid() % 10**6}{next(COUNT) % 10}"
+        self._prefix = f"rdl{self._number}"
         self._server = f"{self._prefix}-server"
         self._namespace = {name: f"{self._prefix}-{name}" for name in cameras}
-        self._link = {name: f"v{os.getpid() % 10**6}c{k}" for k, name in enumerate(cameras)}
+        self._link = {name: f"v{self._number}c{k}" for k, name in enumerate(cameras)}
         self._stack = ExitStack()
 
     def __enter__(self) -> "Namespaces":
@@ -43,7 +46,7 @@ class Namespaces(Loopback):
             run(*in_server, "link", "add", "br0", "type", "bridge")
             run(*in_server, "address", "add", f"{self.host}/24", "dev", "br0")
             run(*in_server, "link", "set", "br0", "up")
-            self._connect(f"v{os.getpid() % 10**6}", None, 2)
+            self._connect(f"v{self._number}", None, 2)
             for k, (name, namespace) in enumerate(self._namespace.items()):
                 self._add_namespace(namespace, stack)
                 self._connect(self._link[name], namespace, 10 + k)
