@@ -3,6 +3,7 @@
 
 import os
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ def read_yaml(path: Path) -> Any:
     """The content of a YAML file: mappings, lists, texts, numbers, dates, booleans and None.
 
     Raises:
-        ConfigError: the file is missing, not a regular file, too large, or not YAML; or it uses aliases or tags, or
-            has a key twice.
+        ConfigError: the file is missing, not a regular file, too large, or not YAML; or it uses tags, or has a key
+            twice. Aliases may be used; their values count each time.
     """
     text = _read_bounded(path)
     try:
@@ -58,23 +59,49 @@ def _read_bounded(path: Path) -> bytes:
     return data
 
 
+@dataclass(slots=True)
+class _Extent:
+    """A list or mapping that is being read, or one that has an anchor: its values and levels, aliases expanded."""
+
+    anchor: str | None
+    n_values: int = 1
+    n_levels: int = 1
+
+
 def _require_bounded(text: bytes) -> None:
-    """Raise YAMLError for too many levels or values, and for aliases and tags. The event parser does not recurse."""
-    depth = n_values = 0
+    """Raise YAMLError for tags, and for too many levels or values, aliases expanded. The parser does not recurse."""
+    open_extents, anchored = [_Extent(None)], dict[str, _Extent]()
     for event in yaml.parse(text, _Loader):
         line = event.start_mark.line + 1
-        if isinstance(event, yaml.AliasEvent):
-            raise yaml.YAMLError(f"line {line} has the alias *{event.anchor}; write the value out")
         if getattr(event, "tag", None) is not None:
             raise yaml.YAMLError(f"line {line} has the tag {event.tag}; write the value without it")
         if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        n_values += isinstance(event, yaml.NodeEvent)
+            open_extents.append(_Extent(event.anchor))
+        elif isinstance(event, yaml.AliasEvent) and event.anchor not in anchored:
+            raise yaml.YAMLError(f"line {line} has the alias *{event.anchor} inside itself, or of no anchor")
+        elif isinstance(event, (yaml.CollectionEndEvent, yaml.AliasEvent, yaml.ScalarEvent)):
+            _add(_extent_of(event, open_extents, anchored), open_extents[-1])
+        depth = len(open_extents) - 1 + open_extents[-1].n_levels - 1
+        n_values = sum(extent.n_values for extent in open_extents)
         if depth > MAX_DEPTH or n_values > MAX_VALUES:
             fault = f"{MAX_DEPTH} levels" if depth > MAX_DEPTH else f"{MAX_VALUES} values"
             raise yaml.YAMLError(f"more than {fault} at line {line}; is it the right file?")
+
+
+def _extent_of(event: yaml.Event, open_extents: list[_Extent], anchored: dict[str, _Extent]) -> _Extent:
+    """The extent of the value that ends with an event; one with an anchor is stored."""
+    if isinstance(event, yaml.AliasEvent):
+        return anchored[event.anchor]
+    is_scalar = isinstance(event, yaml.ScalarEvent)
+    extent = _Extent(event.anchor, n_levels=0) if is_scalar else open_extents.pop()
+    if extent.anchor is not None:
+        anchored[extent.anchor] = extent
+    return extent
+
+
+def _add(part: _Extent, whole: _Extent) -> None:
+    whole.n_values += part.n_values
+    whole.n_levels = max(whole.n_levels, part.n_levels + 1)
 
 
 def _require_unique_keys(node: yaml.Node | None) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from camera_node.errors import TEMPORARY_FAILURE
 from tests.calib.boards import SPEC, board_poses, render
 from tests.conftest import ROOT, free_port
 from tests.waiting import wait_for_port
@@ -132,7 +133,7 @@ def test_the_live_programs(server: tuple[Path, str]):
     folder, endpoint = server
     camera = find("python -m camera_node --source").replace("tcp/localhost:7447", endpoint)
     if not Path("/dev/video0").exists():
-        assert "/dev/video0 does not exist" in run(camera, folder, expected=2).stderr
+        assert "/dev/video0 does not exist" in run(camera, folder, expected=TEMPORARY_FAILURE).stderr
     shutil.copy(ROOT / "configs" / "wand.yaml", folder / "wand.yaml")
     run("python -m camera_node.simulation configs/demo/scene.yaml frames --seconds 0.1", folder)
     shutil.copy(folder / "frames" / "rig.yaml", folder / "rig.yaml")

@@ -26,7 +26,7 @@ from camera_node.geometry.body import Body
         ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' .*twice, in lines 1 and 2"),
         ("", "object"),
         ("a: \xff\x00", "YAML"),
-        ("diameter_m: 1\nmarkers: [[.nan, 0, 0]]", "finite"),
+        ("diameter_m: 1\nmarkers: [[.nan, 0, 0]]", "within 10 m"),
     ],
 )
 def test_an_error_names_the_file_and_the_place(tmp_path: Path, text: str, says: str):

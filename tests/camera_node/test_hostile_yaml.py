@@ -27,9 +27,10 @@ BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
 TEXTS = {
     "brackets": ("[" * 50_000, "levels"),
     "blocks": ("\n".join(" " * k + "a:" for k in range(1100)), "levels"),
-    "alias bomb": (BOMB, "alias"),
-    "recursive alias": ("diameter_m: 0.1\nmarkers: &m [*m]", "alias"),
-    "merged alias": ("base: &b {x: 1}\n<<: *b", "alias"),
+    "alias bomb": (BOMB, f"{MAX_VALUES} values"),
+    "recursive alias": ("diameter_m: 0.1\nmarkers: &m [*m]", "inside itself"),
+    "alias of no anchor": ("diameter_m: *d", "no anchor"),
+    "alias that doubles the depth": (f"a: &a {'[' * 20}{']' * 20}\nb: {'[' * 20}*a{']' * 20}", "levels"),
     "large": ("# " + "x" * MAX_BYTES, f"{MAX_BYTES} bytes"),
     "many values": ("markers: [" + "0," * MAX_VALUES + "]", f"{MAX_VALUES} values"),
     "tag": ('diameter_m: !!int ""', "tag"),
@@ -62,6 +63,13 @@ def test_a_hostile_text_is_refused_in_one_line(name: str, tmp_path: Path):
     path = tmp_path / "body.yaml"
     path.write_text(text)
     assert_refused(path, reason)
+
+
+def test_an_alias_stands_for_its_value(tmp_path: Path):
+    path = tmp_path / "body.yaml"
+    path.write_text("diameter_m: 0.1\nmarkers: [&origin [0, 0, 0], [0.3, 0, 0], [0, &wide 0.3, *wide]]")
+    done = read(path)
+    assert "(0.0, 0.3, 0.3)" in done.stdout, done.stderr
 
 
 def test_a_pipe_a_device_and_a_folder_are_refused_at_once(tmp_path: Path):

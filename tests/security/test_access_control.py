@@ -43,9 +43,7 @@ class Rights:
 
 
 VIEWER = Rights(query={*SERVER_READS, *SNAPSHOTS}, receive={*ALL})
-OPERATOR = Rights(
-    put={"rig"}, token={"calib/wand"}, query={*VIEWER.query, *SERVER_CHANGES, *SETTINGS}, receive={*ALL}
-)
+OPERATOR = Rights(token={"calib/wand"}, query={*VIEWER.query, *SERVER_CHANGES, *SETTINGS}, receive={*ALL})
 RIGHTS = {
     "camera.north": Rights(
         put={"camera/north/detections", "camera/north/status"},

@@ -51,7 +51,7 @@ def send_state(arena: LiveArena) -> None:
     arena.status(tuple(four_cameras().cameras))
     arena.pose("rover", (0.5, 0.0, 0.1))
     arena.pose("drone", (-0.5, 0.3, 0.8), "coasting")
-    arena.markers([(0.5, 0.1, 0.1), (0.5, -0.1, 0.1), (float("nan"), 0.0, 0.0)])
+    arena.markers([(0.5, 0.1, 0.1), (0.5, -0.1, 0.1), (0.4, 0.0, 0.1)])
 
 
 @contextmanager
@@ -91,7 +91,7 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
         if "64 x 48" in answer.inner_text():
             break
     page.get_by_text("east, 64 x 48").wait_for(timeout=20_000)
-    page.get_by_role("button", name="Undo the last correction").click()
+    page.get_by_role("button", name="Undo the last change").click()
     page.get_by_text("no server answers").wait_for(timeout=20_000)
     page.get_by_role("button", name="Show the whole arena").click()
     picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)

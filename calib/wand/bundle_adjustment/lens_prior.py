@@ -114,7 +114,9 @@ def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tupl
     `unknown` size."""
     lenses, size = [problem.lenses[k] for k in problem.estimated_cameras()], len(KINDS)
     sigma, unknown = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), size), bool)
-    covariance = np.asarray(np.linalg.inv(information + np.diag((WIDER * sigma).ravel() ** -2)), float)
+    # With wider priors, a recording that does not determine a lens would contradict any: the equations are linear only
+    # near the adjustment.
+    covariance = np.asarray(np.linalg.inv(information + np.diag(sigma.ravel() ** -2)), float)
     correction = (covariance @ gradient).reshape(-1, size)
     for k, lens in enumerate(lenses):
         block, given = covariance[size * k :, size * k :][:size, :size], calibrated_sigma(lens)
