@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The log of all programs, on stderr: one line for each message, and few lines however much happens.
 
-A message's kind is its logger and format string, so call `log.warning("camera %s ...", name)` with constant formats.
+A message's kind is its logger, its format string and its subject, so call `log.warning("camera %s ...", name)` with
+constant formats. Lines about cameras and robots that a file declares are of a kind for each: `extra=about(name)`.
 """
 
 import logging
@@ -15,6 +16,11 @@ from camera_node.text import printable
 FIRST_S = 1.0  # least interval between lines of one kind; it doubles while they keep coming ...
 LONGEST_S = 60.0  # ... up to this
 MAX_KINDS = 256  # further ones are limited together
+
+
+def about(name: str) -> dict[str, str]:
+    """The `extra` of a line about a camera or robot that a file declares, which no other's line may hold back."""
+    return {"subject": name}
 
 
 def set_up_logging(level: int = logging.INFO) -> None:
@@ -86,7 +92,10 @@ class LimitedHandler(logging.StreamHandler):
 
     def _kind_of(self, record: logging.LogRecord) -> _Kind:
         """The kind of a record; one that was silent for longer than its interval starts again."""
-        now_s, key = time.monotonic(), (record.name, record.levelno, record.msg)
+        now_s, key = (
+            time.monotonic(),
+            (record.name, record.levelno, record.msg, getattr(record, "subject", None)),
+        )
         if key not in self._kinds and len(self._kinds) >= MAX_KINDS:
             self._kinds = {k: kind for k, kind in self._kinds.items() if kind.last or now_s < kind.due_s}
             key = key if len(self._kinds) < MAX_KINDS else None

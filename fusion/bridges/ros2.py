@@ -16,6 +16,7 @@ from collections import Counter
 import zenoh
 
 from camera_node.errors import ConfigError
+from camera_node.logs import about
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometry, pose_stamped, transform
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
@@ -63,7 +64,7 @@ class Ros2Node:
 
     def _topic(self, name: str, kind: str) -> "Ros2Topic":
         if name not in self._topics:
-            log.info("publishes /%s, %s", name, kind)
+            log.info("publishes /%s, %s", name, kind, extra=about(name))
             package, _, message = kind.split("/")
             dds = f"{package}::msg::dds_::{message}_"
             typed = f"{dds}/{NO_HASH if self._humble else 'RIHS01_' + TYPE_HASHES[kind]}"

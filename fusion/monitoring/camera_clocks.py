@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from camera_node.arrays import Mask
+from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
@@ -295,7 +296,7 @@ class CameraClocks:
         clock.frames.clear()
         at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
         message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
-        log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s)
+        log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s, extra=about(name))
 
     def _correct_drift(self, name: str, offset_s: float, sigma_s: float) -> None:
         clock = self._clocks[name]
@@ -304,6 +305,7 @@ class CameraClocks:
             "camera %s: its clock drifts from those of the other cameras; its stamps are corrected by %.1f ms",
             name,
             clock.correction_ns * 1e-6,
+            extra=about(name),
         )
 
     def _set(self, clock: _Clock, correction_ns: int, sigma_s: float) -> None:

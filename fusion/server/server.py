@@ -21,6 +21,7 @@ from calib.rig.messages import (
     set_rig_key,
     undo_rig_key,
 )
+from camera_node.logs import about
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import (
@@ -217,7 +218,8 @@ class Server:
     def _report_correction(self, correction: ExtrinsicsCorrection) -> None:
         """Log a moved camera; publish the rig once the camera is recalibrated, by the leading shard."""
         if correction.camera is None:
-            log.warning("camera %s was moved: excluded until robots show its new pose", correction.name)
+            moved = "camera %s was moved: excluded until robots show its new pose"
+            log.warning(moved, correction.name, extra=about(correction.name))
             return
         self.pipeline.correct_rig(correction, self.clock.now_ns())
         self._publish_rig()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.logs import about
 from fusion.model.limits import Limits
 from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
@@ -82,6 +83,11 @@ class ServerStatistics:
         self._n_frame_sets = 0
         self._since_ns = 0
         self._cpu_s = time.process_time()
+        self._calibrated: frozenset[str] = frozenset()
+
+    def _about(self, name: str) -> dict[str, str]:
+        """The subject of a line about a camera of the rig; other names may come from anybody."""
+        return about(name) if name in self._calibrated else {}
 
     def count_fault(self, reason: str, camera: str | None = None) -> None:
         """Count something that was skipped, also among a camera's own faults if it is one of the known cameras."""
@@ -93,10 +99,10 @@ class ServerStatistics:
     def count_arrival(self, name: str, t_ns: int, received_ns: int) -> None:
         """Count a camera's frame; log a camera that is new or back."""
         if name not in self._cameras:
-            log.info("camera %s appeared", name)
+            log.info("camera %s appeared", name, extra=self._about(name))
         camera = self._cameras.setdefault(name, _CameraCounts())
         if camera.is_gone:
-            log.info("camera %s is back", name)
+            log.info("camera %s is back", name, extra=self._about(name))
         camera.is_gone, camera.last_ns = False, received_ns
         camera.lateness_ms.append((received_ns - t_ns) * 1e-6)
 
@@ -104,7 +110,9 @@ class ServerStatistics:
         """Log once that two nodes publish under a camera's name."""
         camera = self._cameras[name]
         if has_two_publishers and not camera.has_two_publishers:
-            log.warning("two nodes publish as camera %s: give each a --name of its own", name)
+            log.warning(
+                "two nodes publish as camera %s: give each a --name of its own", name, extra=self._about(name)
+            )
         camera.has_two_publishers = has_two_publishers
 
     def note_lateness(self, name: str, is_on_time: bool, age_ms: float) -> None:
@@ -112,10 +120,11 @@ class ServerStatistics:
         camera, limit_ms = self._cameras[name], self._lateness_limit_ms
         camera.late += not is_on_time
         if not is_on_time and not camera.is_late:
-            log.warning("%s is %.0f ms late (limit %.0f ms); its frames are dropped", name, age_ms, limit_ms)
+            late = "%s is %.0f ms late (limit %.0f ms); its frames are dropped"
+            log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
             camera.is_late = True
         elif is_on_time and camera.is_late and age_ms < limit_ms:
-            log.info("%s is on time again", name)
+            log.info("%s is on time again", name, extra=self._about(name))
             camera.is_late = False
 
     def count_frame_set(
@@ -139,6 +148,7 @@ class ServerStatistics:
     def report(self, now_ns: int, pipeline: PipelineStatus) -> FusionStatus:
         """The status since the last one; resets the counts of that period."""
         seconds = (now_ns - self._since_ns) * 1e-9 if 0 < self._since_ns < now_ns else 1.0
+        self._calibrated = pipeline.calibrated
         self._find_silent_cameras(now_ns)
         self._find_faulty_cameras()
         cpu_s = time.process_time()
@@ -176,7 +186,7 @@ class ServerStatistics:
     def _find_silent_cameras(self, now_ns: int) -> None:
         for name, camera in self._cameras.items():
             if not camera.is_gone and now_ns - camera.last_ns > SILENT_S * 1e9:
-                log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S)
+                log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S, extra=self._about(name))
                 camera.is_gone = True
 
     def _find_faulty_cameras(self) -> None:
@@ -186,7 +196,8 @@ class ServerStatistics:
                 new = camera.faults - camera.reported
                 camera.reported = camera.faults.copy()
             for reason in sorted(new.keys() - camera.growing):
-                log.warning("camera %s: %s, %d in the last second", name, reason, new[reason])
+                fault = "camera %s: %s, %d in the last second"
+                log.warning(fault, name, reason, new[reason], extra=self._about(name))
             camera.growing = frozenset(new)
 
 

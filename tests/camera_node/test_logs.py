@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from camera_node.logs import LONGEST_S, MAX_KINDS, LimitedHandler, LineFormatter
+from camera_node.logs import LONGEST_S, MAX_KINDS, LimitedHandler, LineFormatter, about
 from tests.waiting import wait_for
 
 INTERVAL_S = 0.05
@@ -96,3 +96,9 @@ def test_a_process_that_ends_in_a_flood_tells_the_count():
     written = [line for line in done.stderr.splitlines() if "refused" in line]
     counts = [int(n) for n in re.findall(r"\((\d+) lines like this\)", done.stderr)]
     assert sum(counts) + sum("(" not in line for line in written) == 85_804
+
+
+def test_a_line_about_one_camera_holds_back_none_about_another(stream: io.StringIO):
+    for name in ("north", "east", "south"):
+        log.warning("camera %s is gone", name, extra=about(name))
+    assert stream.getvalue().splitlines() == [f"camera {name} is gone" for name in ("north", "east", "south")]
