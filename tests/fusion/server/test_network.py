@@ -26,11 +26,13 @@ def apart(tmp_path: Path) -> Iterator[tuple[LiveArena, Namespaces]]:
         yield arena, network
 
 
+@pytest.mark.slow  # namespaces and a loaded machine: python -m tests.benchmarks.network measures them
 def test_a_camera_is_used_again_soon_after_its_link_is_up(apart: tuple[LiveArena, Namespaces]):
     """Longer than the interval at which TCP would retry, shorter than Zenoh's own lease."""
     assert interrupt(*apart, "cam1", 7.0).back_s < BACK_S
 
 
+@pytest.mark.slow  # namespaces and a loaded machine: python -m tests.benchmarks.network measures them
 def test_a_slow_link_builds_no_backlog(apart: tuple[LiveArena, Namespaces]):
     """Without a bound of the send buffer, the age rises by 0.6 s in each second."""
     ages = squeeze(*apart, "cam1", 1_000_000, 6.0)
