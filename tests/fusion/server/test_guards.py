@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from camera_node.protocol.messages import Detections
 from camera_node.protocol.requests import respond
 from fusion.protocol.messages import RobotPose
 from fusion.server.server import Server
 from fusion.server.transport import INTERNAL_ERROR
-from tests.fusion.serving import ARENA, DEADLINE_S, config, live, send, serving, until
+from tests.fusion.serving import ARENA, DEADLINE_S, config, later, live, send, serving, until
 from tests.waiting import Inbox
 
 
@@ -19,9 +20,9 @@ def raise_error(*_: object) -> None:
     raise ValueError("a bug that some input shows")
 
 
-def is_tracked_again(server: Server, poses: Inbox, n: int) -> bool:
+def is_tracked_again(server: Server, frames: list[Detections], poses: Inbox, n: int) -> bool:
     """Whether new frames give a tracked pose; waits, so that the next call's frames are later than these."""
-    send(server, live(ARENA.messages(12)))
+    send(server, later(frames))
     return poses.until(lambda items: any(pose.state == "tracked" for pose in items[n:]), 3.0)
 
 
@@ -31,7 +32,8 @@ def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage:
     with serving(config(tmp_path)) as (server, client):
         poses = Inbox()
         client.robot("a").on_pose(poses.put)
-        send(server, live(ARENA.messages(12)))
+        frames = live(ARENA.messages(12))
+        send(server, frames)
         assert poses.until(lambda items: any(pose.state == "tracked" for pose in items))
         tracker = server.pipeline.tracker
         faulty: dict[str, Callable[[], object]] = {
@@ -41,7 +43,7 @@ def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage:
             "the status": lambda: setattr(server.statistics, "_reset", raise_error),
         }
         server.transport.enqueue(faulty[stage])
-        send(server, live(ARENA.messages(12)))
+        send(server, later(frames))
         if stage == "the status":
             until(lambda: "the status failed" in caplog.text)
             server.transport.enqueue(lambda: delattr(server.statistics, "_reset"))
@@ -49,7 +51,7 @@ def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage:
         assert faults.keys() & {INTERNAL_ERROR, "frame set without a solution"}
         assert "a bug that some input shows" in caplog.text
         n = len(poses.items)
-        until(lambda: is_tracked_again(server, poses, n))
+        until(lambda: is_tracked_again(server, frames, poses, n))
 
 
 def test_a_request_that_fails_is_answered_at_once(tmp_path: Path, caplog):
@@ -68,7 +70,8 @@ def test_a_callback_that_fails_does_not_affect_the_others(tmp_path: Path, caplog
     with serving(config(tmp_path)) as (server, client), caplog.at_level(logging.ERROR):
         client.robot("a").on_pose(raise_error)
         client.robot("a").on_pose(poses.put)
-        send(server, live(ARENA.messages(12)))
+        frames = live(ARENA.messages(12))
+        send(server, frames)
         assert poses.until(lambda items: len(items) > 3)
     assert all(isinstance(pose, RobotPose) for pose in poses.items)
     assert "a callback for pose of 'a'" in caplog.text
