@@ -18,6 +18,7 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.sensor import Sensor
 
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print without vignetting
 SUBSAMPLES = 3  # each pixel has 3 x 3 sub-samples; the error at edges is then below 0.5 % of the contrast
@@ -196,5 +197,4 @@ def map_rays(lens: Lens, margin: int) -> Picture:
 
 def vignette(lens: Lens) -> Picture:
     """The share of the light that reaches each pixel (h, w): 100 % at the centre, 70 % in the corners."""
-    u, v = np.meshgrid(np.linspace(-1, 1, lens.width), np.linspace(-1, 1, lens.height))
-    return (1 - 0.15 * (u**2 + v**2)).astype(np.float32)
+    return Sensor(vignetting=0.3).falloff((lens.height, lens.width)).astype(np.float32)
