@@ -37,7 +37,7 @@ def main(thorough: bool = False) -> None:
     Args:
         thorough: all motions with all steps, and drifts of several minutes; takes an hour.
     """
-    columns = "fault", "wrong poses", "worst mm", "tracked", "reported s", "in use s", "others", "moves"
+    columns = "fault", "wrong poses", "worst mm", "tracked", "reported s", "again in use s", "others", "moves"
     table = Table(*columns, title="clocks of cameras; times since the fault")
     for case in _cases(thorough):
         table.add_row(*_row(case, fuse(case.load, case.seconds, case.faults, case.jitter_s)))
@@ -52,10 +52,15 @@ def _row(case: Case, outcome: Outcome) -> tuple[str, ...]:
         f"{1e3 * outcome.worst_m(FAULT_S + GRACE_S):.1f}",
         f"{100 * outcome.tracked(FAULT_S):.1f} %",
         " ".join(f"{outcome.reported_s(name) - FAULT_S:.2f}" for name in case.faults),
-        " ".join(f"{outcome.in_use_since_s(name) - FAULT_S:.2f}" for name in case.faults),
+        " ".join(_again_in_use(outcome.in_use_since_s(name)) for name in case.faults),
         " ".join(sorted(named - case.faults.keys())) or "none",
         str(len(outcome.moves)),
     )
+
+
+def _again_in_use(since_s: float) -> str:
+    """When a camera's detections were used again after the fault; without a gap above 0.3 s they always were."""
+    return "no gap" if since_s < FAULT_S else f"{since_s - FAULT_S:.2f}"
 
 
 def _cases(thorough: bool) -> Iterator[Case]:
