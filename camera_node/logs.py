@@ -92,10 +92,8 @@ class LimitedHandler(logging.StreamHandler):
 
     def _kind_of(self, record: logging.LogRecord) -> _Kind:
         """The kind of a record; one that was silent for longer than its interval starts again."""
-        now_s, key = (
-            time.monotonic(),
-            (record.name, record.levelno, record.msg, getattr(record, "subject", None)),
-        )
+        now_s = time.monotonic()
+        key = (record.name, record.levelno, record.msg, getattr(record, "subject", None))
         if key not in self._kinds and len(self._kinds) >= MAX_KINDS:
             self._kinds = {k: kind for k, kind in self._kinds.items() if kind.last or now_s < kind.due_s}
             key = key if len(self._kinds) < MAX_KINDS else None

@@ -79,7 +79,9 @@ def collect_frames(
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     key = Keys(arena).detections()
     subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
-    wand = session.liveliness().declare_token(Keys(arena).wand)  # meanwhile the server acquires no robots
+    wand = session.liveliness().declare_token(
+        Keys(arena).wand
+    )  # while it exists, the server acquires no robots
     try:
         collected, reason = _receive(arrived, seconds, inspect)
     finally:

@@ -216,7 +216,7 @@ class Node:
                 self._detector = apply_settings(wanted, self._source, self._detector)
                 log.info(
                     "settings changed by a session that claims to be %s: %s",
-                    sender_of(query) or "nobody",
+                    sender_of(query) or "unknown",
                     wanted,
                 )
             return encode_reply(payload, read_settings(self._source, self._detector))

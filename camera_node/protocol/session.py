@@ -22,7 +22,7 @@ SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
 OVER = b"Timeout"  # Zenoh's own error reply
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
-LEASE_MS = 2000  # of a silent connection, which is then made anew; TCP would retry ever more rarely
+LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
 ALWAYS = {
     "mode": "router",
     "transport/link/tx/lease": LEASE_MS,

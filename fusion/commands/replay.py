@@ -24,7 +24,7 @@ def replay(
 ) -> int:
     """Fuse a recording (MCAP) again, by the code that runs live: the poses are those of the server, byte for byte.
 
-    With another rig or rate, and in recordings without a server, frame sets are formed anew from the times of arrival.
+    With another rig or rate, and in recordings without a server, frame sets are formed again from the times of arrival.
 
     Args:
         recording: the MCAP file.

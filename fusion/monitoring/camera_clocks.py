@@ -48,7 +48,7 @@ MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arri
 MAX_MARKERS = 96  # observations of a frame set that are compared
 MIN_SPEED_M_S = 0.03  # of a robot that is compared
 UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
-MAX_SPREAD_S = 0.1  # standard deviation of all stamps meanwhile
+MAX_SPREAD_S = 0.1  # standard deviation of all stamps while cameras contradict each other
 HELD_NS = 3_000_000_000  # after such a contradiction no camera counts as moved
 
 
@@ -237,8 +237,8 @@ class CameraClocks:
     def _find_drifts(self, info: OffsetInformation, interval_s: float) -> None:
         """Correct the cameras that depart slowly from the others."""
         n = len(self._cameras.names)
-        kept = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
-        self._slow = kept.plus(info.relative_to(-self._offsets_s()))
+        faded = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
+        self._slow = faded.plus(info.relative_to(-self._offsets_s()))
         self._slow_since_ns = self._slow_since_ns or self._now_ns
         if self._now_ns < max(self._slow_since_ns + MIN_SLOW_NS, self._checked_ns + CHECKED_NS):
             return

@@ -69,7 +69,7 @@ class ActiveRig:
     def use(
         self, rig: Rig, now_ns: int, source: RequestSource | None = None, saved: bool | None = None
     ) -> None:
-        """Use a rig from now on; unless told, it counts as saved if the server saves rigs at all."""
+        """Use a rig from now on. Without `saved`, it counts as saved if the server has a file for rigs."""
         is_saved = self._saved is not None if saved is None else saved
         self.message = RigMessage(t_ns=now_ns, rig=rig, saved=is_saved, source=source)
 

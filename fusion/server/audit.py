@@ -64,7 +64,7 @@ class AuditLog:
             "claimed_source": source,
         }
         proven = entry["certificate"] or entry["address"] or "an unknown session"
-        log.info("%s by %s (claims to be %s): %s", change, proven, source or sender or "nobody", outcome)
+        log.info("%s by %s (claims to be %s): %s", change, proven, source or sender or "unknown", outcome)
         self._append(msgspec.json.encode(entry))
 
     def _append(self, line: bytes) -> None:

@@ -131,7 +131,7 @@ class TrackingPipeline:
             raise FusionError(f"the rig can't be used: {type(error).__name__}: {error}") from None
 
     def _start(self, cameras: dict[str, Camera]) -> None:
-        """Start tracking anew."""
+        """Restart tracking."""
         limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
         self.pause_acquisition(self._is_wand_recorded)

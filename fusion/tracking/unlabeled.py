@@ -137,7 +137,7 @@ class _Tracks:
         return cls(states, radius, has_normal, times, times, np.full((n, 3), np.nan), never, never)
 
     def with_motion(self, is_due: bool) -> "_Tracks":
-        """With what the motion since the anchors shows; anchored anew if that is due."""
+        """With what the motion since the anchors shows; with new anchors if these are due."""
         p, anchor = self.states.p, self.anchor
         moved = np.linalg.norm(p - anchor, axis=1) > MOVED_M  # False without an anchor
         in_company = self.in_company

@@ -58,7 +58,7 @@ class ChaosResult:
     Attributes:
         episodes: all faults.
         gaps: in the poses of visible robots, above `SHORT_S`; `waits_s` is for how long the machine let some
-            thread wait for a processor meanwhile.
+            thread wait for a processor during it.
         wrong: poses that are not excused.
         slopes_mb_per_min: of the resident memory of long-lived processes.
     """

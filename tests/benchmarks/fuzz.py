@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Mutated messages on all keys of a running arena: `python -m tests.benchmarks.fuzz [--messages 1000000] [--seed 1]`.
 
-Server, cameras, viewer, page, recorder and client run as processes and follow ten robots meanwhile.
+Server, cameras, viewer, page, recorder and client run as processes and follow ten robots during the run.
 """
 
 import tempfile

@@ -226,7 +226,7 @@ def test_a_client_sees_who_is_there(lab: Lab, observer: Observer, name: str, mod
 
 
 def test_a_certificate_without_a_rule_gives_no_rights(lab: Lab):
-    """It was created after the server started. A viewer's queries are answered meanwhile."""
+    """It was created after the server started. During that time a viewer's queries are answered."""
     certificates(lab.folder, "localhost", "viewer.late").check_returncode()
     late, viewer = lab.bare_session("viewer.late", "client"), lab.session("viewer")
     assert late.info.routers_zid() == viewer.info.routers_zid(), "both are connected"

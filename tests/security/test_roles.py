@@ -57,7 +57,7 @@ def test_a_viewer_reads_robots_and_an_operator_changes_them(lab: Lab):
 
 
 def test_only_an_operator_changes_the_rig(lab: Lab):
-    """A camera and a viewer find no server that takes a rig; nobody but the server publishes one."""
+    """A camera and a viewer find no server that takes a rig; only the server publishes one."""
     rig = four_cameras()
     for role in ("camera.north", "viewer"):
         with pytest.raises(NetworkError, match="no server answers"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Residuals of detections at a given rig, each with its marker triangulated anew: no motion prior, no wand length.
+"""Residuals of detections at a given rig, each with its marker triangulated again: no motion prior, no wand length.
 
 Detections that the rig was not adjusted to are held out: their residuals show how well it describes new ones.
 """

@@ -162,7 +162,7 @@ class Fuzzer:
         self._put(key, mutate(message, self.rng), "results of a server")
 
     def _send_elsewhere(self) -> None:
-        """To keys that nobody defines."""
+        """To keys that no program declares."""
         middle = self.rng.choice(("camera", "robot", "fusion", "rig", "robots", "x"))
         key = f"{self.arena}/{middle}/{odd_text(self.rng)[:200]}/{self.rng.choice(('pose', 'detections', 'status'))}"
         self._put(key, mutate(self._sample("/detections"), self.rng), "undefined keys")

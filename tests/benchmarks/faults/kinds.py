@@ -14,7 +14,7 @@ from tests.benchmarks.faults.arena import Fuzz, LiveArena
 from tests.benchmarks.faults.world import CameraFault, RobotEvent
 
 SHORT_S = 0.1  # a longer gap needs an explanation
-LATE_S = 0.35  # a camera falls silent: one frame set waits 0.15 s for it, and association begins anew
+LATE_S = 0.35  # a camera falls silent: one frame set waits 0.15 s for it, and association starts again
 LONGEST_S = 2.1  # any gap
 DISK_BYTES = 300_000
 
@@ -62,7 +62,7 @@ class Fault:
     Attributes:
         target: the camera, robot or program.
         begin, end: cause it and end it.
-        report: by what it is reported, empty before; None where nobody can report it but who starts the programs.
+        report: by what it is reported, empty before; None where only who starts the programs can report it.
         seconds: its duration.
         gap_s: the longest gap in the poses of a visible robot that it explains.
         robots: whose poses may have such a gap; None for all.
@@ -209,7 +209,7 @@ def carried_robot(arena: LiveArena, rng: random.Random) -> Fault:
 
 
 def carried(arena: LiveArena, rng: random.Random, moved_m: float) -> Fault:
-    """A robot is covered for some seconds, and meanwhile carried to another place."""
+    """A robot is covered for some seconds, and carried to another place during that time."""
     name, seconds = rng.choice(arena.world.names), rng.uniform(0.8, 3.0)
 
     def begin() -> None:
@@ -274,7 +274,7 @@ def full_disk(arena: LiveArena, rng: random.Random) -> Fault:
 
 
 def changed_robots(arena: LiveArena, rng: random.Random) -> Fault:
-    """A robot is defined that nobody has, and removed again."""
+    """A robot that does not exist is defined, and removed again."""
     answers: list[str] = []
     guest = next(iter(type(arena.load)(robots=1, markers=5, seed=rng.randrange(2, 999)).bodies.values()))
 

@@ -38,7 +38,7 @@ class Programs:
     """Child processes by name; each appends to `<folder>/<name>.log` (stderr) and `<name>.out` (stdout).
 
     Attributes:
-        crashes: programs that ended although nobody ended them, with their exit codes.
+        crashes: programs that ended by themselves, with their exit codes.
     """
 
     def __init__(self, folder: Path) -> None:

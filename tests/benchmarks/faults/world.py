@@ -13,7 +13,7 @@ Vector = tuple[float, float, float]
 
 
 class RobotEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot is covered for a while. It may be carried meanwhile: `before` and `after` are offsets of its path, m."""
+    """A robot is covered for a while and may be carried then: `before` and `after` are offsets of its path, m."""
 
     robot: str
     hidden_from_ns: int

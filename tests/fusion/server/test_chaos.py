@@ -15,7 +15,7 @@ MESSAGES = 3000
 
 
 @pytest.mark.slow  # gaps of 0.1 s mean nothing where other programs take the processors
-def test_faults_are_reported_and_disturb_nobody_else(tmp_path: Path):
+def test_faults_are_reported_and_disturb_nothing_else(tmp_path: Path):
     """No crash, no unexplained gap and no wrong pose."""
     *_, result = chaos(tmp_path, FAULTS_S, 1, KINDS)
     assert isinstance(result, ChaosResult)
