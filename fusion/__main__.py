@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m fusion` is the live server, `python -m fusion NAME` one of the commands."""
 
+import os
 import sys
 from importlib import import_module
+
+# Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Finds cameras whose clocks depart slowly from the others, by an offset or at a rate; docs/time_offsets.md section 3.
 
-Information about the offsets is summed over windows of 2 s. Calibration errors bias an offset, but the bias is about
-the same in all windows as long as the robots move alike; a drift changes the offset from window to window at a constant
-rate.
+Information about the offsets is summed over windows of 2 s or more. Calibration errors bias an offset, but the bias is
+about the same in all windows as long as the robots move alike; a drift changes the offset from window to window at a
+constant rate.
 
 The velocity of a filter follows the stamps of one frame set, right or wrong. So velocities are mean ones over 0.2 s
 around the frame set, in which a wrong stamp displaces both ends alike.
@@ -17,16 +17,16 @@ import numpy as np
 
 from camera_node.arrays import Array, Mask
 from fusion.model.states import States
-from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, contradiction, disagreement
+from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, contradiction
 from fusion.monitoring.time_search import Snapshot
 
-WINDOW_NS = 2_000_000_000
-MAX_WINDOWS = 16
+WINDOW_NS, WINDOW_PX = 2_000_000_000, 300.0  # smallest duration of a window, and smallest image motion in it
+MAX_WINDOWS, MAX_AGE_NS = 16, 60_000_000_000
 HALF_NS = 100_000_000  # before and after a frame set, for the velocities of its robots
-RECENT = 4  # windows that show an offset, with the open one
-MIN_NS = 1_500_000_000  # of the windows that show an offset
+RECENT = 5  # windows that show an offset, with the open one
+MIN_NS = 3_000_000_000  # of the windows that show an offset
 MIN_WINDOWS = 4  # complete ones that show a rate
-OFFSET_PX, RATE_PX = 0.4, 0.15  # RMS image motion that an offset explains, and the change of one at a rate
+OFFSET_PX, RATE_PX = 0.4, 0.2  # RMS image motion that an offset explains, and the change of one at a rate
 MIN_CHANGE_S = 0.0005  # of the offset in all windows, by a rate
 NOISE_CHI2 = 11.0  # 99 % of chi-square with three degrees of freedom
 PRIOR_FREEDOM = 3.0  # degrees of freedom of the prior variance factor, 1
@@ -57,6 +57,12 @@ class _Window:
     until_ns: int
     info: OffsetInformation
 
+    def is_complete(self, t_ns: int) -> bool:
+        """Whether the next window begins: calibration errors at other places in the images are independent."""
+        seconds = (t_ns - self.since_ns) * 1e-9
+        speed_px = np.sqrt(self.info.motion_px2.sum() / max(1.0, self.info.count.sum()))
+        return t_ns >= self.since_ns + WINDOW_NS and bool(speed_px * seconds >= WINDOW_PX)
+
 
 class DriftMonitor:
     """Accumulates the information of frame sets about the offsets of `n_cameras` cameras, before any correction."""
@@ -67,9 +73,9 @@ class DriftMonitor:
 
     def add(self, t_ns: int, info: OffsetInformation) -> bool:
         """Add the information of a frame set; whether a window was completed by it."""
-        while self._windows and self._windows[0].since_ns < t_ns - (MAX_WINDOWS + 1) * WINDOW_NS:
+        while self._windows and self._windows[0].since_ns < t_ns - MAX_AGE_NS:
             self._windows.popleft()
-        if self._windows and t_ns < self._windows[-1].since_ns + WINDOW_NS:
+        if self._windows and not self._windows[-1].is_complete(t_ns):
             last = self._windows.pop()
             self._windows.append(_Window(last.since_ns, t_ns, last.info.plus(info)))
             return False
@@ -82,13 +88,11 @@ class DriftMonitor:
 
     def offsets(self, corrections_s: Array) -> list[Drift]:
         """Cameras with an offset in the last windows that differs from the corrections (C,) in use."""
-        recent = [w for w in self._windows if w.since_ns > self._windows[-1].until_ns - RECENT * WINDOW_NS]
+        recent = list(self._windows)[-RECENT:]
         if not recent or recent[-1].until_ns < recent[0].since_ns + MIN_NS:
             return []
-        total = OffsetInformation.none(self._n)
-        for window in recent:
-            total = total.plus(window.info)
-        found = disagreement(total.relative_to(corrections_s), OFFSET_PX, has_shifts=True)
+        lines = _Lines.of(recent, recent[-1].until_ns)
+        found = contradiction(*lines.offsets(corrections_s), lines.speed_px, OFFSET_PX)
         return [Drift(k, offset + corrections_s[k], sigma) for k, offset, sigma in _rows(found)]
 
     def rates(self, t_ns: int) -> list[Drift]:
@@ -135,9 +139,13 @@ class _Lines:
         )
         squares = sum(_explained(*part) for part in zip(M, y, strict=True))
         squares -= _explained(lines.M[0], lines.y[0]) + _explained(*lines.rates())
-        freedom = (len(t) - 2) * (np.count_nonzero(lines.speed_px) - 1)
+        freedom = max(0, len(t) - 2) * (np.count_nonzero(lines.speed_px) - 1)
         factor = (max(squares, 0.0) + PRIOR_FREEDOM) / (freedom + PRIOR_FREEDOM)
         return cls(lines.M, lines.y, float(factor), lines.speed_px)
+
+    def offsets(self, known_s: Array) -> tuple[Array, Array]:
+        """M (C, C) and y (C,) of the mean offsets minus the known ones (C,)."""
+        return self.M[0] / self.factor, (self.y[0] - self.M[0] @ known_s) / self.factor
 
     def rates(self) -> tuple[Array, Array]:
         """M (C, C) and y (C,) of the rates alone, the offsets eliminated."""

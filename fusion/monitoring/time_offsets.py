@@ -135,9 +135,7 @@ def offset_information(
     )
 
 
-def disagreement(
-    info: OffsetInformation, min_shift_px: float, has_shifts: bool = False
-) -> Disagreement | None:
+def disagreement(info: OffsetInformation, min_shift_px: float) -> Disagreement | None:
     """The cameras whose offsets differ from those of the others; None if none differs.
 
     A common offset of all cameras is unobservable. So the smallest group of cameras is searched whose offsets, with
@@ -146,11 +144,9 @@ def disagreement(
     Args:
         info: of some frame sets.
         min_shift_px: RMS image motion that an offset must explain: calibration errors explain less.
-        has_shifts: whether images may be shifted too; then offsets are known only where motions differ.
     """
-    M, y = info.with_unknown_shifts() if has_shifts else info.without_shifts()
     speed_px = np.sqrt(info.motion_px2 / np.maximum(info.count, 1))
-    return contradiction(M, y, speed_px, min_shift_px)
+    return contradiction(*info.without_shifts(), speed_px, min_shift_px)
 
 
 def contradiction(
