@@ -3,6 +3,7 @@
 
 import logging
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
@@ -15,7 +16,8 @@ from calib.commands.plan import PlanArena
 from calib.commands.undo import Redo, Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
-from camera_node.errors import run
+from camera_node.command_line import parse
+from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
 
 Command = (
@@ -32,17 +34,27 @@ Command = (
 )
 
 
+COMMANDS = ("intrinsics", "wand", "world", "check", "plan", "undo", "redo", "apply")
+
+
 def main() -> None:
     """The program `roundel-calib`."""
     set_up_logging(logging.WARNING)
     run(lambda: execute(sys.argv[1:]))
 
 
-def execute(arguments: list[str]) -> None:
-    """Run a command line; `--undo` as the first argument stands for the subcommand `undo`."""
+def execute(arguments: list[str], prog: str = "calib", examples: Sequence[str] = ()) -> None:
+    """Run a command line; `--undo` as the first argument stands for the subcommand `undo`.
+
+    Args:
+        arguments: the command line without the program.
+        prog: the program's name in its help and in errors.
+        examples: complete command lines that `--help` shows.
+    """
     if arguments[:1] == ["--undo"]:
         arguments = ["undo", *arguments[1:]]
-    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute()
+    check_command(arguments, COMMANDS)
+    parse(Command, prog, arguments, examples).execute()
 
 
 if __name__ == "__main__":

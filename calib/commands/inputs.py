@@ -2,7 +2,8 @@
 """The options by which subcommands take their input, and the reading of recordings."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from calib.errors import CalibrationError
 from calib.rig.recording import read_detections
 from calib.rig.rig import Rig
 from calib.wand.scale import SIGMA_M, Distance
+from camera_node.config import example_file
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -24,7 +26,7 @@ Synchronised = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(alias
 class WandOptions:
     """The options of every calibration from a wand recording."""
 
-    wand: Path = Path("configs/wand.yaml")
+    wand: Path = field(default_factory=partial(example_file, "wand.yaml"))
     """The wand: markers, and diameter_m unless they are lights or points; metres."""
     frames: Path | None = None
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
