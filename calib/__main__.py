@@ -10,6 +10,7 @@ import tyro
 
 from calib.commands.apply import Apply
 from calib.commands.check import Check
+from calib.commands.formats import ExportRig, ImportData
 from calib.commands.intrinsics import Intrinsics
 from calib.commands.plan import PlanArena
 from calib.commands.undo import Redo, Undo
@@ -25,6 +26,8 @@ Command = (
     | Annotated[World, tyro.conf.subcommand("world")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[PlanArena, tyro.conf.subcommand("plan")]
+    | Annotated[ImportData, tyro.conf.subcommand("import")]
+    | Annotated[ExportRig, tyro.conf.subcommand("export")]
     | Annotated[Undo, tyro.conf.subcommand("undo")]
     | Annotated[Redo, tyro.conf.subcommand("redo")]
     | Annotated[Apply, tyro.conf.subcommand("apply")]

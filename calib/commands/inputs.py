@@ -27,11 +27,13 @@ class WandOptions:
     """The options of every calibration from a wand recording."""
 
     wand: Path = field(default_factory=partial(example_file, "wand.yaml"))
-    """The wand: diameter_m and markers, metres."""
+    """The wand: markers, and diameter_m unless they are lights or points; metres."""
     frames: Path | None = None
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
-    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker,sigma_px]; or with a column frame in place of t_ns."""
+    fps: float | None = None
+    """Frames a second, for a CSV with numbers of frames."""
     recording: Path | None = None
     """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
     distance: tuple[str, str, float] | None = None
@@ -54,7 +56,7 @@ class WandOptions:
 
     def read_recording(self, rig: Rig, wand: Body) -> list[Detections]:
         """The detections of the given recording; see `read_recording`."""
-        return read_recording(rig, self.frames, self.observations, self.recording, wand)
+        return read_recording(rig, self.frames, self.observations, self.recording, wand, self.fps)
 
     def measured_distance(self, rig: Rig) -> Distance | None:
         """The given distance.
@@ -84,6 +86,7 @@ def read_recording(
     observations: Path | None,
     recording: Path | None = None,
     body: Body | None = None,
+    fps: float | None = None,
 ) -> list[Detections]:
     """Read detections from one of: a folder of frames, a CSV of observations, an MCAP recording.
 
@@ -93,6 +96,7 @@ def read_recording(
         observations: CSV of marker centres.
         recording: MCAP of detections.
         body: the wand or frame, whose roundels are detected in `frames`.
+        fps: frames a second, for observations with numbers of frames.
 
     Raises:
         ConfigError, CameraError, CalibrationError: the input is unusable, or a camera is not in the rig.
@@ -104,7 +108,7 @@ def read_recording(
         return read_detections(recording)
     assert observations is not None
     sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
-    return read_observations(observations, sizes)
+    return read_observations(observations, sizes, fps)
 
 
 def _check_folders(folder: Path, rig: Rig) -> None:

@@ -82,13 +82,13 @@ class JoinArena:
         return None
 
     def _options(self, found: FoundArena) -> list[str]:
-        options = ["--connect", *found.endpoints, "--arena", found.arena, *_given(self.settings)]
+        options = ["--connect", *found.endpoints, "--arena", found.arena, *given_options(self.settings)]
         if self.name is not None:
             options += ["--name", self.name]
         return options + (["--zenoh", str(self.zenoh)] if self.zenoh else [])
 
 
-def _given(settings: SourceSettings) -> list[str]:
+def given_options(settings: SourceSettings) -> list[str]:
     """The options that differ from their defaults."""
     values, defaults = asdict(settings), asdict(SourceSettings())
     return [

