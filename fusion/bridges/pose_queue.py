@@ -93,7 +93,7 @@ class PoseQueue:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Connection:
+class ServerAddress:
     """The arena's server."""
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -121,8 +121,8 @@ class Connection:
                 log_faults(poses.faults + client.faults)
 
 
-Server = Annotated[Connection, tyro.conf.arg(name="")]
-LOCAL = Connection()
+Server = Annotated[ServerAddress, tyro.conf.arg(name="")]
+LOCAL = ServerAddress()
 
 
 def log_faults(faults: Counter[str]) -> None:
