@@ -23,6 +23,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "redo": "undo",
     "ros2": "ros2",
     "vrpn": "vrpn",
+    "mavlink": "mavlink",
 }
 
 

@@ -11,12 +11,13 @@ import re
 import struct
 import time
 from collections import Counter
+from collections.abc import Sequence
 
 import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.logs import about
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometry, pose_stamped, transform
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transform
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
@@ -24,6 +25,7 @@ NODE = "roundel"
 NO_HASH = "TypeHashNotSupported"  # in place of the hash in ROS 2 Humble, which has none
 QOS = "::,10:,:,:,,"  # reliable, volatile, the last ten; everything else is rmw_zenoh's default
 MAX_DOMAIN = 232
+NOT_PERMITTED = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Ros2Node:
@@ -46,17 +48,22 @@ class Ros2Node:
         self._robots: dict[str, str] = {}  # name in ROS -> name in the arena
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
-    def publish(self, pose: RobotPose, frame: str) -> None:
-        """Publish `<robot>/pose`, `<robot>/odometry` and `tf`, unless the robot is lost."""
-        name = ros_name(pose.robot)
-        known = self._robots.setdefault(name, pose.robot)
-        if known != pose.robot:
-            self.faults[f"poses of '{pose.robot}', which has the same ROS name as '{known}'"] += 1
-        elif pose.state != "lost":
+    def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
+        """Publish `<robot>/pose`, `<robot>/odometry` and `tf` of the robots that are not lost."""
+        shown = [pose for pose in poses if pose.state != "lost" and self._has_name(pose.robot)]
+        names = [ros_name(pose.robot) for pose in shown]
+        for pose, name, odom in zip(shown, names, odometries(shown, frame, names), strict=True):
             prefix = f"{self._namespace}/{name}".lstrip("/")
             self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped").put(pose_stamped(pose, frame))
-            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odometry(pose, frame, name))
+            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odom)
             self._topic("tf", "tf2_msgs/msg/TFMessage").put(transform(pose, frame, name))
+
+    def _has_name(self, robot: str) -> bool:
+        """Whether no other robot has its name in ROS; counted otherwise."""
+        first = self._robots.setdefault(ros_name(robot), robot)
+        if first != robot:
+            self.faults[f"poses of '{robot}', which has the same ROS name as '{first}'"] += 1
+        return first == robot
 
     def _topic(self, name: str, kind: str) -> "Ros2Topic":
         if name not in self._topics:
@@ -91,7 +98,7 @@ class Ros2Topic:
 
 def ros_name(robot: str) -> str:
     """The robot's name with the characters that ROS permits: letters, digits and underscores, no digit first."""
-    name = re.sub(r"[^A-Za-z0-9_]", "_", robot)
+    name = NOT_PERMITTED.sub("_", robot)
     return f"robot_{name}" if name[:1].isdigit() else name
 
 

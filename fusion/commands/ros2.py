@@ -39,7 +39,6 @@ def ros2(
         node = Ros2Node(session, ros_domain, prefix, humble)
         say(f"ROS 2, domain {ros_domain}")
         while not stop.is_set():
-            for pose in poses.take(WAIT_S):
-                node.publish(pose, frame)
+            node.publish(poses.take(WAIT_S), frame)
         log_faults(node.faults)
     return 0

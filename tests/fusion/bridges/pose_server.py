@@ -12,7 +12,7 @@ import numpy as np
 import zenoh
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
-from camera_node.protocol.messages import Keys, encode
+from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import open_router
 from fusion.protocol.messages import RobotPose
 from tests.conftest import ROOT
@@ -48,12 +48,19 @@ def moving_pose(robot: str, t_ns: int, seed: int = 1, state: str = "tracked") ->
 class PoseServer:
     """Publishes `robots` with `RATE_HZ` and a lost robot, from `start` to `stop`; a context manager that does both.
 
+    Args:
+        endpoint: to listen on.
+        robots: the names of those that are tracked.
+        ahead_ns: the server's time minus this machine's.
+
     Attributes:
         published: all poses, by robot and time.
     """
 
-    def __init__(self, endpoint: str, robots: tuple[str, ...] = ("rover", "drone")) -> None:
-        self.endpoint, self.robots = endpoint, robots
+    def __init__(
+        self, endpoint: str, robots: tuple[str, ...] = ("rover", "drone"), ahead_ns: int = 0
+    ) -> None:
+        self.endpoint, self.robots, self._ahead_ns = endpoint, robots, ahead_ns
         self.published: dict[tuple[str, int], RobotPose] = {}
         self._keys = Keys(ARENA)
 
@@ -68,6 +75,7 @@ class PoseServer:
         """Open the router and begin to publish."""
         self._stopped = threading.Event()
         self.session = open_router([self.endpoint])
+        self.session.declare_queryable(self._keys.clock, self._answer)
         self._thread = threading.Thread(target=self._run, args=(self.session,))
         self._thread.start()
 
@@ -77,9 +85,16 @@ class PoseServer:
         self._thread.join(DEADLINE_S)
         self.session.close()
 
+    def now_ns(self) -> int:
+        """The server's time."""
+        return time.time_ns() + self._ahead_ns
+
+    def _answer(self, query: zenoh.Query) -> None:
+        query.reply(query.key_expr, encode(ClockReply(t_ns=self.now_ns())))
+
     def _run(self, session: zenoh.Session) -> None:
         while not self._stopped.wait(1 / RATE_HZ):
-            t_ns = time.time_ns()
+            t_ns = self.now_ns()
             for seed, robot in enumerate((*self.robots, "gone")):
                 pose = moving_pose(robot, t_ns, seed, "lost" if robot == "gone" else "tracked")
                 self.published[robot, t_ns] = pose
@@ -110,8 +125,8 @@ def first_line(process: subprocess.Popen[str]) -> str:
 def restart(server: PoseServer) -> int:
     """Restart the server; the time after which its new poses are."""
     server.stop()
-    t_ns = time.time_ns()
-    wait_for(lambda: time.time_ns() > t_ns + START_S * 1e9)
+    t_ns = server.now_ns()
+    wait_for(lambda: server.now_ns() > t_ns + START_S * 1e9)
     server.start()
     wait_for(lambda: max(t for _, t in server.published) > t_ns)
     return t_ns
