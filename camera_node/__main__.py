@@ -3,8 +3,7 @@
 
 import sys
 
-import tyro
-
+from camera_node.command_line import run_command
 from camera_node.commands.publish import Publish
 from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
@@ -23,12 +22,12 @@ def _program() -> int | None:
     if name == "detect":
         from camera_node.commands.detect import Detect
 
-        return tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
+        return run_command(Detect, "camera_node detect", arguments[1:])
     if name == "print":
         from camera_node.commands.print import Sheet
 
-        return tyro.cli(Sheet, prog="camera_node print", args=arguments[1:]).run()
-    return tyro.cli(Publish, prog="camera_node", args=arguments).run()
+        return run_command(Sheet, "camera_node print", arguments[1:])
+    return run_command(Publish, "camera_node", arguments)
 
 
 if __name__ == "__main__":

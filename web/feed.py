@@ -17,11 +17,12 @@ from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
-from web.coverage import CoveragePicture
+from web.coverage_picture import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
+REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
 
@@ -38,6 +39,7 @@ class ArenaState:
     """The latest messages of an arena at one moment of the feed's clock."""
 
     now_s: float = 0.0
+    started_s: float = 0.0  # when the feed was created
     poses: dict[str, TimedMessage] = field(default_factory=dict)  # by robot
     cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
     coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
@@ -78,12 +80,12 @@ class Feed:
         self.keys = Keys(arena)
         self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
-        self._state = ArenaState()
+        self._state = ArenaState(started_s=clock())
         keys = self.keys
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
             keys.robot_pose(): (RobotPose, self._store_pose),
             keys.markers: (Markers, self._store_as("markers")),
-            keys.fusion_status: (FusionStatus, self._store_as("status")),
+            keys.fusion_status: (FusionStatus, self._store_status),
             keys.camera_status(): (CameraStatus, self._store_camera_status),
             keys.detections(): (Detections, self._add_coverage),
             keys.rig: (RigMessage, self._store_rig),
@@ -123,7 +125,10 @@ class Feed:
     def clear(self) -> None:
         """Discard all messages; fault counts and the server's presence remain."""
         with self._lock:
-            self._state = ArenaState(server_alive=self._state.server_alive, faults=self._state.faults)
+            old = self._state
+            self._state = ArenaState(
+                started_s=old.started_s, server_alive=old.server_alive, faults=old.faults
+            )
 
     def count_fault(self, reason: str) -> None:
         """Count a message or drawing that was skipped."""
@@ -138,6 +143,13 @@ class Feed:
         self._store_named(self._state.poses, pose.robot, pose, key)
         if self._on_pose is not None:
             self._on_pose(pose)
+
+    def _store_status(self, status: FusionStatus, key: str) -> None:
+        state = self._state
+        state.status = TimedMessage(status, self._clock())
+        for robot in state.poses.keys() - status.robots.keys():  # renamed or removed, unless it is new
+            if self._clock() - state.poses[robot].received_s > REMOVED_S:
+                del state.poses[robot]
 
     def _store_camera_status(self, status: CameraStatus, key: str) -> None:
         self._store_named(self._state.cameras, status.camera, status, key)

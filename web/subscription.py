@@ -2,14 +2,11 @@
 """Connects a feed to a running arena over Zenoh, and sends requests to its programs."""
 
 import contextlib
-from collections.abc import Callable
 from typing import Any
 
 import zenoh
 
 from calib.live.rig_requests import redo_rig, undo_rig
-from calib.rig.messages import RigMessage
-from camera_node.errors import RoundelError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import MessageError, decode
 from camera_node.protocol.rate_limit import RateLimit
@@ -66,19 +63,19 @@ class Subscription:
         return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
-        """Have the server undo the last change of its rig; return the outcome as text."""
-        return self._step(undo_rig, "the previous rig is in force on the server", timeout_s)
+        """Have the server undo the last change of its rig; return the outcome as text.
+
+        Raises:
+            RequestError: the server refuses, as it does where there is none.
+            NetworkError: it does not answer.
+        """
+        undo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        return "the previous rig is in force on the server"
 
     def redo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
-        """Have the server redo the change of its rig that was undone last; return the outcome as text."""
-        return self._step(redo_rig, "the undone rig is in force on the server again", timeout_s)
-
-    def _step(self, request: Callable[..., RigMessage], outcome: str, timeout_s: float) -> str:
-        try:
-            request(self.session, self.feed.keys.arena, "web", timeout_s)
-        except RoundelError as error:
-            return str(error)
-        return outcome
+        """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
+        redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        return "the undone rig is in force on the server again"
 
     def _subscribe(self, key_expr: str) -> zenoh.Subscriber:
         def receive(sample: zenoh.Sample) -> None:

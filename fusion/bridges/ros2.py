@@ -7,7 +7,6 @@ topic consists of domain, name, type and the type's hash; a liveliness token of 
 
 import hashlib
 import logging
-import queue
 import re
 import struct
 import time
@@ -18,15 +17,12 @@ import zenoh
 from camera_node.errors import ConfigError
 from camera_node.logs import about
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometry, pose_stamped, transform
-from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
 NODE = "roundel"
 NO_HASH = "TypeHashNotSupported"  # in place of the hash in ROS 2 Humble, which has none
 QOS = "::,10:,:,:,,"  # reliable, volatile, the last ten; everything else is rmw_zenoh's default
-QUEUE_SIZE = 2000
-SILENCE_S = 5.0
 MAX_DOMAIN = 232
 
 
@@ -91,43 +87,6 @@ class Ros2Topic:
         self._count += 1
         attachment = struct.pack("<qqB16s", self._count, time.time_ns(), len(self._gid), self._gid)
         self._publisher.put(data, attachment=attachment)
-
-
-class PoseQueue:
-    """The poses of an arena, from Zenoh's thread to that of the bridge.
-
-    Args:
-        client: connected to the arena.
-        faults: counts the poses that are dropped.
-    """
-
-    def __init__(self, client: Arena, faults: Counter[str]) -> None:
-        self._poses: queue.Queue[RobotPose] = queue.Queue(QUEUE_SIZE)
-        self._faults = faults
-        self.close = client.poses().on_message(self._put)
-
-    def publish(self, node: Ros2Node, frame: str, origin: str) -> None:
-        """Publish poses until Ctrl-C; log when none arrive from `origin`, and when they arrive again."""
-        is_silent = False
-        while True:
-            try:
-                pose = self._poses.get(timeout=SILENCE_S)
-            except queue.Empty:
-                if not is_silent:
-                    message = "no pose from %s within %g s; is python -m fusion running there?"
-                    log.warning(message, origin, SILENCE_S)
-                is_silent = True
-                continue
-            if is_silent:
-                log.info("receiving poses again")
-            is_silent = False
-            node.publish(pose, frame)
-
-    def _put(self, pose: RobotPose) -> None:
-        try:
-            self._poses.put_nowait(pose)
-        except queue.Full:
-            self._faults["poses dropped because the bridge is too slow"] += 1
 
 
 def ros_name(robot: str) -> str:
