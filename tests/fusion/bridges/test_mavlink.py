@@ -16,7 +16,7 @@ from fusion.bridges.mavlink import MavlinkVehicle, RateDivider, ResetCounter
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
 from fusion.protocol.messages import FusionStatus
 from tests.conftest import ROOT, free_port
-from tests.fusion.bridges.pose_server import PoseServer, bridge, first_line, moving_pose, restart
+from tests.fusion.bridges.pose_server import PoseServer, bridge, moving_pose, restart
 from tests.waiting import DEADLINE_S, wait_for
 
 ORIGIN, HEADING_DEG, FORWARD_DEG = (1.0, -2.0, 0.5), 30.0, 100.0
