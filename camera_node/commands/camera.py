@@ -14,6 +14,7 @@ from camera_node.config import require_name
 from camera_node.errors import CameraAbsentError, ConfigError
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
 from camera_node.service import ServiceManager, stopped_by_signals
+from camera_node.sources.address import without_credentials
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.v4l2 import camera_names
 from camera_node.supervisor import Supervisor
@@ -126,7 +127,7 @@ class LocalCameras:
             if source not in self._seen:
                 self._seen.add(source)
                 options = ["--source", source, *self._options]
-                self._supervisor.start(f"camera {source}", "camera_node", options)
+                self._supervisor.start(f"camera {without_credentials(source)}", "camera_node", options)
 
     def run(self, stop: threading.Event) -> int:
         """Run the nodes until `stop`, or until all sources ended; return 0, or the code of one that failed."""

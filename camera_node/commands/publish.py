@@ -12,8 +12,10 @@ from typing import Annotated, Literal
 import tyro
 
 from camera_node.config import example_file, require_name
+from camera_node.errors import CameraError
 from camera_node.protocol.registration import CameraAssignment, CameraRegistration
 from camera_node.simulation.camera import SimulatedCamera
+from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.identity import SourceIdentity, identify, is_simulation
 from camera_node.sources.replay import ArenaTime, FrameFolder, PacedSource, VideoFile
@@ -125,6 +127,10 @@ def open_source(
     settings.check()
     if is_simulation(text):
         return _open_simulation(settings, text.partition(":")[2] or name, arena_time)
+    if is_url(text):
+        raise CameraError(
+            f"{without_credentials(text)} is a network stream, which can't be read yet; give a camera"
+        )
     if Path(text).is_dir():
         return PacedSource(FrameFolder(Path(text)), settings, arena_time)
     if Path(text).is_file():

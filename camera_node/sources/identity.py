@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from camera_node.config import is_name
+from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.v4l2 import SYS, camera_names, find_device
 
 LABEL = 200  # characters
@@ -16,7 +17,7 @@ class SourceIdentity:
     """A source of this machine.
 
     Attributes:
-        driver: the kind of source: sim, folder, video or v4l2.
+        driver: the kind of source: sim, folder, video, stream or v4l2.
         key: the same for the same source on every start, and for no other source of this machine.
         label: for people.
         name: a name for the camera that its source suggests; empty if it suggests none.
@@ -46,6 +47,8 @@ def identify(text: str, sys: Path = SYS) -> SourceIdentity:
     host = socket.gethostname()
     if is_simulation(text):
         return SourceIdentity("sim", text, f"{text} on {host}"[:LABEL], text.partition(":")[2])
+    if is_url(text):
+        return SourceIdentity("stream", text, without_credentials(text)[:LABEL])
     path = Path(text)
     if path.is_dir() or path.is_file():
         driver = "folder" if path.is_dir() else "video"
