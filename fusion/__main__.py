@@ -22,6 +22,8 @@ COMMANDS = {  # and their modules in fusion.commands
     "undo": "undo",
     "redo": "undo",
     "ros2": "ros2",
+    "vrpn": "vrpn",
+    "mavlink": "mavlink",
 }
 
 

@@ -11,7 +11,9 @@ from typing import Annotated, Literal
 import tyro
 
 from camera_node.config import example_file, require_name
+from camera_node.errors import CameraError
 from camera_node.simulation.camera import SimulatedCamera
+from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.replay import FrameFolder, PacedSource, VideoFile
 from camera_node.sources.v4l2 import V4l2Source, find_device
@@ -79,6 +81,10 @@ def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Sour
     settings.check()
     if text == "sim":
         return _open_simulation(settings, name)
+    if is_url(text):
+        raise CameraError(
+            f"{without_credentials(text)} is a network stream, which can't be read yet; give a camera"
+        )
     if Path(text).is_dir():
         return PacedSource(FrameFolder(Path(text)), settings)
     if Path(text).is_file():
