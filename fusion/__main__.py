@@ -21,6 +21,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "robots": "robots",
     "undo": "undo",
     "redo": "undo",
+    "export": "export",
     "ros2": "ros2",
     "vrpn": "vrpn",
     "mavlink": "mavlink",
