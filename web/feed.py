@@ -14,7 +14,7 @@ import msgspec
 
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
-from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
 from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage_picture import CoveragePicture
@@ -42,6 +42,8 @@ class ArenaState:
     started_s: float = 0.0  # when the feed was created
     poses: dict[str, TimedMessage] = field(default_factory=dict)  # by robot
     cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
+    previews: dict[str, TimedMessage] = field(default_factory=dict)  # picture of each camera
+    detections: dict[str, Detections] = field(default_factory=dict)  # latest of each camera
     coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
@@ -88,14 +90,15 @@ class Feed:
             keys.fusion_status: (FusionStatus, self._store_status),
             keys.camera_status(): (CameraStatus, self._store_camera_status),
             keys.detections(): (Detections, self._add_coverage),
+            keys.preview(): (Preview, self._store_preview),
             keys.rig: (RigMessage, self._store_rig),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
         }
 
     @property
     def key_exprs(self) -> tuple[str, ...]:
-        """The Zenoh key expressions of all messages that the feed decodes."""
-        return tuple(self._kinds)
+        """The Zenoh key expressions of all messages that the feed decodes, without those that are sent on demand."""
+        return tuple(key for key in self._kinds if key != self.keys.preview())
 
     def receive(self, key_expr: str, key: str, data: bytes) -> None:
         """Store a message; `key_expr` is the one of `key_exprs` that includes its `key`."""
@@ -154,6 +157,9 @@ class Feed:
     def _store_camera_status(self, status: CameraStatus, key: str) -> None:
         self._store_named(self._state.cameras, status.camera, status, key)
 
+    def _store_preview(self, preview: Preview, key: str) -> None:
+        self._store_named(self._state.previews, preview.camera, preview, key)
+
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
         _check_name(self._state.coverage, camera, key)
@@ -161,6 +167,7 @@ class Feed:
         if picture is None or picture.size != size:
             picture = self._state.coverage[camera] = CoveragePicture(*size)
         picture.add(detections)
+        self._state.detections[camera] = detections
         self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
@@ -173,7 +180,7 @@ class Feed:
         messages[name] = TimedMessage(message, self._clock())
 
 
-_CONTAINERS = ("poses", "cameras", "coverage", "message_counts", "faults")
+_CONTAINERS = ("poses", "cameras", "previews", "detections", "coverage", "message_counts", "faults")
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:

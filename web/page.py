@@ -6,7 +6,7 @@ import contextlib
 from web.replay import RecordingPlayer
 from web.subscription import Subscription
 from web.tabs.calibrate import RigHistory
-from web.tabs.cameras import CameraTable, SnapshotControls
+from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
 from web.tabs.record import ReplayControls
@@ -37,7 +37,10 @@ def add_live_page(
     view.add(header)
     with header.tabs["Cameras"]:
         view.add(CameraTable(gui))
-        view.add(SnapshotControls(gui, subscription))
+        pictures = LivePictures(view.server, subscription, view.cameras)
+        closing.callback(pictures.close)
+        view.add(pictures)
+        view.add(CameraSettings(gui, subscription))
     with header.tabs["Calibrate"]:
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)

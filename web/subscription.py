@@ -2,13 +2,15 @@
 """Connects a feed to a running arena over Zenoh, and sends requests to its programs."""
 
 import contextlib
+import threading
 from typing import Any
 
 import zenoh
 
 from calib.live.rig_requests import redo_rig, undo_rig
 from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.messages import MessageError, decode
+from camera_node.protocol.camera_requests import request_settings
+from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
@@ -27,6 +29,9 @@ class Subscription:
     def __init__(self, session: zenoh.Session, feed: Feed) -> None:
         self.session, self.feed = session, feed
         keys = feed.keys
+        self._lock = threading.Lock()
+        self._previews: zenoh.Subscriber | None = None
+        self._closed = False
         self._rig_requests = RateLimit(RIG_REQUESTS_HZ, 2.0)
         self._entities: list[Any] = [self._subscribe(key_expr) for key_expr in feed.key_exprs]
         self._entities += [
@@ -40,8 +45,23 @@ class Subscription:
 
     def close(self) -> None:
         """End the subscription."""
+        self.watch_previews(False)
+        self._closed = True
         for entity in self._entities:
             entity.undeclare()
+
+    def watch_previews(self, watched: bool) -> None:
+        """Subscribe to the cameras' small pictures or not: the cameras send them only while someone subscribes."""
+        with self._lock:
+            if watched and self._previews is None and not self._closed:
+                self._previews = self._subscribe(self.feed.keys.preview())
+            elif not watched and self._previews is not None:
+                self._previews.undeclare()
+                self._previews = None
+
+    def change_settings(self, camera: str, wanted: Settings | None = None) -> Settings:
+        """Change settings of a camera, or none, and return those in use; raises as `request_settings`."""
+        return request_settings(self.session, self.feed.keys.arena, camera, wanted, REQUEST_TIMEOUT_S)
 
     def snapshot(self, camera: str, timeout_s: float = REQUEST_TIMEOUT_S) -> bytes | None:
         """Return a camera's current image as JPEG, or None if the camera does not answer in time."""
