@@ -22,6 +22,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "cameras": "cameras",
     "undo": "undo",
     "redo": "undo",
+    "export": "export",
     "ros2": "ros2",
     "vrpn": "vrpn",
     "mavlink": "mavlink",
