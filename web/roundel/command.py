@@ -92,7 +92,7 @@ COMMANDS = {
     ),
     "cameras": Command(
         "list, rename and forget cameras, set exposure, gain and masks",
-        _class_or_function("fusion.commands.cameras:cameras"),
+        _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
@@ -106,9 +106,15 @@ COMMANDS = {
         ("roundel detect picture.png --draw seen.png", "roundel detect *.png --json"),
     ),
     "print": Command(
-        "print roundels",
+        "print roundels, wands, boards, L-frames and robots at true scale",
         _class_or_function("camera_node.commands.print:Sheet"),
-        ("roundel print roundels.svg", "roundel print roundels.svg --diameter 0.09 --paper letter"),
+        (
+            "roundel print roundels",
+            "roundel print roundels sheet.svg --diameter 0.12 --paper letter",
+            "roundel print wand",
+            "roundel print board board.pdf --columns 5 --rows 7 --square 0.035",
+            "roundel print robot rover.pdf --file robots.yaml --name rover",
+        ),
     ),
     "calibrate": Command(
         "calibrate lenses, camera poses and the floor",

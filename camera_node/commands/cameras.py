@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion cameras`: lists, renames and forgets the cameras that registered, and changes their settings."""
+"""`cameras`: lists, renames and forgets the cameras that registered, and changes their settings."""
 
 from pathlib import Path
 from typing import Annotated, Literal
