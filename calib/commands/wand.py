@@ -18,11 +18,11 @@ from calib.live.collect import CollectedFrames
 from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
+from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import Distance
-from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -53,7 +53,7 @@ class Wand(WandOptions):
         check_folder(self.out)
         self.require_recording(live=self.live)
         require_positive(self.seconds)
-        rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        rig, wand = load_rig(self.rig), load_wand(self.wand)
         if self.distance is not None and self.only is not None:
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"

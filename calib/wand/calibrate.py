@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
+from calib.rig.wand_file import check_diameter
 from calib.wand.adjustment import RoughRig, Solution, adjust_rig
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.conclusion import Placement, conclude
@@ -53,6 +54,7 @@ def calibrate(
         CalibrationError: the recording or the wand does not place two cameras, or most cameras contradict each other.
     """
     check_recording(rig, messages)
+    check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
     recording, timing = label_by_timing(rig, wand, messages, synchronous)

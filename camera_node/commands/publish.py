@@ -10,9 +10,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from camera_node.config import require_name
-from camera_node.errors import ConfigError
+from camera_node.config import example_file, require_name
+from camera_node.errors import CameraError
 from camera_node.simulation.camera import SimulatedCamera
+from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.replay import FrameFolder, PacedSource, VideoFile
 from camera_node.sources.v4l2 import V4l2Source, find_device
@@ -80,6 +81,10 @@ def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Sour
     settings.check()
     if text == "sim":
         return _open_simulation(settings, name)
+    if is_url(text):
+        raise CameraError(
+            f"{without_credentials(text)} is a network stream, which can't be read yet; give a camera"
+        )
     if Path(text).is_dir():
         return PacedSource(FrameFolder(Path(text)), settings)
     if Path(text).is_file():
@@ -88,7 +93,6 @@ def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Sour
 
 
 def _open_simulation(settings: SourceSettings, name: str) -> Source:
-    if settings.scene is None:
-        raise ConfigError("--source sim needs an arena: add --scene FILE, such as configs/demo/scene.yaml")
+    scene = settings.scene or example_file("demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
-    return SimulatedCamera(settings.scene, name, epoch_ns)
+    return SimulatedCamera(scene, name, epoch_ns)

@@ -14,6 +14,7 @@ import zenoh
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_roundels
 from camera_node.node.clock_sync import ClockSync
+from camera_node.node.preview import Content, PreviewPublisher
 from camera_node.node.settings import apply_settings, read_settings
 from camera_node.node.status import DetectedFrame, NodeStatistics
 from camera_node.protocol.callbacks import guarded
@@ -75,6 +76,7 @@ class Node:
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
+        self._previews: PreviewPublisher | None = None
 
     def run(self) -> None:
         """Publish every frame until the source ends or `close` is called; each frame is progress of the service.
@@ -144,6 +146,10 @@ class Node:
             queryable = session.declare_queryable(key, guarded(key, partial(self._answer, answer)))
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
+        previews = self._previews = PreviewPublisher(
+            session, keys.preview(name), name, self._latest, lambda: self._clock.to_server(time.time_ns())
+        )
+        stack.callback(previews.close)
         watch = ServerWatch(session, keys.fusion_alive)
         stack.callback(watch.close)
         self._clock.start()
@@ -157,6 +163,11 @@ class Node:
         if self._source.is_recording:
             self._await_subscriber(publisher)
         return publisher
+
+    def _latest(self) -> Content | None:
+        """The latest frame, its roundels and the mask, for previews."""
+        latest = self._statistics.latest
+        return (latest.frame.image, latest.roundels, self._detector.settings["mask"]) if latest else None
 
     def _await_subscriber(self, publisher: zenoh.Publisher) -> None:
         """Wait until there is a subscriber, so that it receives all frames of a recording."""

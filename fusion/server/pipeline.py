@@ -18,10 +18,10 @@ from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
-from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.persistence import PersistedFile
+from fusion.server.storage.active_rig import ActiveRig
+from fusion.server.storage.persistence import PersistedFile
 from fusion.tracking.tracker import AssociatedFrames, Tracker
 
 log = logging.getLogger("fusion")

@@ -9,61 +9,34 @@ import gc
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 
-import zenoh
-
-from calib.rig.messages import (
-    RigMessage,
-    RigRequest,
-    RigStepRequest,
-    redo_rig_key,
-    set_rig_key,
-    undo_rig_key,
-)
+from calib.rig.messages import RigMessage
 from camera_node.logs import about
-from camera_node.protocol.messages import Keys, MessageError, decode, encode
-from camera_node.protocol.rate_limit import RateLimit
-from camera_node.protocol.requests import (
-    RequestError,
-    RequestSource,
-    encode_reply,
-    parse_request,
-    payload_of,
-)
+from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import listening_endpoints
 from camera_node.service import ServiceManager
 from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.health import describe_status
-from fusion.protocol.messages import (
-    FusionStatus,
-    Robots,
-    RobotsRequest,
-    ShardPoses,
-    TrackingState,
-    robots_key,
-    set_robots_key,
-    shard_key,
-)
+from fusion.protocol.messages import FusionStatus, ShardPoses, TrackingState, shard_key
 from fusion.protocol.shards import Shard
-from fusion.server.audit import AuditLog
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
 from fusion.server.ingest import MAX_AGE_NS, Ingest
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
-from fusion.server.server_clock import ServerClock, clock_of
+from fusion.server.requests import RequestHandlers
+from fusion.server.server_clock import clock_of
 from fusion.server.status import PipelineStatus, ServerStatistics
+from fusion.server.storage.audit import AuditLog
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
 from fusion.tracking.result import latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # resolution at which a wait for frames ends
-RIG_ANSWERS_HZ = 20.0  # answers with the rig, of any number of clients
 MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
 
 
@@ -134,24 +107,14 @@ class Server:
         keys, transport = self.keys, self.transport
         self._update_quotas()
         transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
-        transport.answer_on_server_thread(robots_key(keys.arena), self._answer_robots)
         transport.watch_token(keys.wand, self.pipeline.pause_acquisition)
-        audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
-        transport.answer_on_server_thread(
-            set_robots_key(keys.arena), audit.audited("change of robots", self._change_robots)
-        )
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
-        if isinstance(self.clock, ServerClock):
-            transport.answer(keys.clock, partial(self._answer_clock, self.clock))
+        audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
+        requests = RequestHandlers(keys, self.pipeline, self._publisher, self.clock, self._update_quotas)
+        requests.declare(transport, audit)
         if self.shard.leads:
-            transport.answer(keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
-            for key, change, answer in (
-                (set_rig_key(keys.arena), "change of the rig", self._set_rig),
-                (undo_rig_key(keys.arena), "undo of the rig", self._undo_rig),
-                (redo_rig_key(keys.arena), "redo of the rig", self._redo_rig),
-            ):
-                transport.answer_on_server_thread(key, audit.audited(change, answer))
+            requests.declare_rig(transport, audit)
             transport.declare_alive(keys.fusion_alive)
         else:
             transport.subscribe(keys.rig, self._follow_rig)
@@ -222,14 +185,11 @@ class Server:
             log.warning(moved, correction.name, extra=about(correction.name))
             return
         self.pipeline.correct_rig(correction, self.clock.now_ns())
-        self._publish_rig()
+        if self.pipeline.active_rig.message is not None:
+            self._publisher.publish_rig(self.pipeline.active_rig.message)
         log.warning(
             "camera %s is recalibrated and used again; python -m fusion undo reverts that", correction.name
         )
-
-    def _publish_rig(self) -> None:
-        if self.pipeline.active_rig.message is not None:
-            self._publisher.publish_rig(self.pipeline.active_rig.message)
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""
@@ -298,60 +258,6 @@ class Server:
             self.statistics.count_fault("implausible time")
         else:
             self.pipeline.add_shard_poses(poses)
-
-    # Answered queries.
-
-    def _answer_clock(self, clock: ServerClock, query: zenoh.Query) -> None:
-        query.reply(self.keys.clock, encode(clock.reply()))
-
-    def _answer_rig(self, query: zenoh.Query) -> None:
-        if (message := self.pipeline.active_rig.message) is not None:
-            query.reply(self.keys.rig, encode(message))
-
-    def _set_rig(self, query: zenoh.Query) -> bytes:
-        request = parse_request(payload_of(query), RigRequest)
-        self.pipeline.replace_rig(request.rig, self.clock.now_ns(), request.source)
-        return self._announce_rig(query, "changed", request.source)
-
-    def _undo_rig(self, query: zenoh.Query) -> bytes:
-        request = _parse_step(query)
-        self.pipeline.undo_rig(self.clock.now_ns(), request.source)
-        return self._announce_rig(query, "set back to the previous one", request.source)
-
-    def _redo_rig(self, query: zenoh.Query) -> bytes:
-        request = _parse_step(query)
-        self.pipeline.redo_rig(self.clock.now_ns(), request.source)
-        return self._announce_rig(query, "set to the one that was undone", request.source)
-
-    def _announce_rig(self, query: zenoh.Query, change: str, source: RequestSource | None) -> bytes:
-        """Publish and log the rig in force; returns the reply to the request that changed it."""
-        message = self.pipeline.active_rig.message
-        assert message is not None
-        log.warning("the rig was %s by %s", change, source or "an unnamed program")
-        self._update_quotas()
-        self._publish_rig()
-        return encode_reply(payload_of(query), message)
-
-    def _answer_robots(self, query: zenoh.Query) -> bytes:
-        payload = payload_of(query)
-        if payload and parse_request(payload, RobotsRequest) != RobotsRequest():
-            raise RequestError(f"send changes of robots to {set_robots_key(self.keys.arena)}")
-        return self._robots_reply(payload)
-
-    def _robots_reply(self, payload: bytes) -> bytes:
-        robots = Robots(robots=self.pipeline.robots, unsaved=self.pipeline.unsaved_robots())
-        return encode_reply(payload, robots)
-
-    def _change_robots(self, query: zenoh.Query) -> bytes:
-        payload = payload_of(query)
-        request = parse_request(payload, RobotsRequest)
-        self._publisher.stop_robots(self.pipeline.change_robots(request))
-        return self._robots_reply(payload)
-
-
-def _parse_step(query: zenoh.Query) -> RigStepRequest:
-    payload = payload_of(query)
-    return parse_request(payload, RigStepRequest) if payload else RigStepRequest()
 
 
 @contextlib.contextmanager

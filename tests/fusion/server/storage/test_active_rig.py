@@ -14,8 +14,8 @@ from calib.rig.rig import Rig, dump_rig, load_rig
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena as Client
-from fusion.server.active_rig import ActiveRig
 from fusion.server.config import ArenaConfig
+from fusion.server.storage.active_rig import ActiveRig
 from tests.fusion.serving import ARENA, DEADLINE_S, config, connected, live, run_program, send, serving, until
 from tests.waiting import wait_for
 

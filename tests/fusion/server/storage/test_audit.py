@@ -14,7 +14,7 @@ from calib.rig.rig import Rig
 from camera_node.errors import RoundelError
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots
-from fusion.server.audit import quote
+from fusion.server.storage.audit import quote
 from tests.conftest import ROOT
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import WIDE

@@ -16,7 +16,7 @@ from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.corrections import correct
-from fusion.server.persistence import is_newer
+from fusion.server.storage.persistence import is_newer
 
 log = logging.getLogger("fusion")
 
