@@ -39,7 +39,7 @@ def flat(size: tuple[int, int], level: float) -> Array:
 
 @dataclass(frozen=True)
 class Card:
-    """A card to render: its disc's centre and frontal diameter in pixels, its orientation, and inner over outer diameter."""
+    """A card to render: its disc's centre and frontal diameter in pixels, its orientation, and the print's ratio."""
 
     uv: tuple[float, float]
     diameter: float
