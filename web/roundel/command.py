@@ -91,14 +91,28 @@ COMMANDS = {
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras, set exposure, gain and masks",
+        "list, rename and forget cameras",
         _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
-            "roundel cameras set north --exposure-us 4000",
-            "roundel cameras set north --mask 0 0 640 0 640 80 0 80",
         ),
+    ),
+    "settings": Command(
+        "show and change exposure, gain and mask of a running camera",
+        _class_or_function("camera_node.commands.adjust:ChangeSettings"),
+        (
+            "roundel settings north",
+            "roundel settings north --exposure-us 4000 --gain 2",
+            "roundel settings north --mask-detected",
+        ),
+        logging.WARNING,
+    ),
+    "snapshot": Command(
+        "save the image of a running camera",
+        _class_or_function("camera_node.commands.adjust:SaveSnapshot"),
+        ("roundel snapshot north north.jpg --draw",),
+        logging.WARNING,
     ),
     "detect": Command(
         "detect roundels in pictures",

@@ -27,7 +27,8 @@ TOLERANCE_MM = 0.1
 def rasterize(pdf: Path) -> list[np.ndarray]:
     """The pages as grey images of 300 dots per inch; pixel (0, 0) is the paper's upper left corner."""
     with pypdfium2.PdfDocument(pdf) as document:
-        return [cv2.cvtColor(page.render(scale=DPI / 72).to_numpy(), cv2.COLOR_BGR2GRAY) for page in document]
+        pages = [page.render(scale=DPI / 72).to_numpy() for page in document]  # pyright: ignore[reportArgumentType]
+    return [cv2.cvtColor(page, cv2.COLOR_BGR2GRAY) for page in pages]
 
 
 def to_mm(uv: np.ndarray) -> np.ndarray:
@@ -40,7 +41,8 @@ def scan(raster: np.ndarray, diameter_mm: float) -> tuple[np.ndarray, np.ndarray
     width = round(raster.shape[1] * min(1.0, 200 / (diameter_mm * PX_PER_MM)))
     scale = width / raster.shape[1]
     height = round(raster.shape[0] * scale)
-    found = Detector().detect(cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA))
+    smaller = cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA)
+    found = Detector().detect(np.asarray(smaller, np.uint8))
     factor = np.array([raster.shape[1] / width, raster.shape[0] / height]) / PX_PER_MM
     return (found.uv + 0.5) * factor, found.axes_px * factor.mean(), found.ratio
 
