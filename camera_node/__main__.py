@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels."""
+"""The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels,
+`snapshot` and `settings` ask a camera that runs."""
 
 import sys
 
@@ -17,7 +18,7 @@ def main() -> None:
 
 def _program() -> int | None:
     arguments = sys.argv[1:]
-    check_command(arguments, ("detect", "print"))
+    check_command(arguments, ("detect", "print", "snapshot", "settings"))
     name = arguments[0] if arguments else ""
     if name == "detect":
         from camera_node.commands.detect import Detect
@@ -27,6 +28,11 @@ def _program() -> int | None:
         from camera_node.commands.print import Sheet
 
         return run_command(Sheet, "camera_node print", arguments[1:])
+    if name in ("snapshot", "settings"):
+        from camera_node.commands.adjust import ChangeSettings, SaveSnapshot
+
+        kind = SaveSnapshot if name == "snapshot" else ChangeSettings
+        return run_command(kind, f"camera_node {name}", arguments[1:])
     return run_command(Publish, "camera_node", arguments)
 
 

@@ -90,11 +90,10 @@ def _show(
     if options.headless:
         _print_lines(feed, stop)
         return
-    from web.controls import LiveControls, ReplayControls
-    from web.marker_picker import MarkerPicker
+    from web.page import add_live_page, add_replay_page
     from web.page_access import PageAccess
+    from web.tabs.wand_session import CalibrationFiles
     from web.view import View
-    from web.wand_calibration import CalibrationFiles, WandSessionPanel
 
     files = CalibrationFiles(options.rig, options.wand) if options.rig is not None else None
     if files is not None:
@@ -104,12 +103,9 @@ def _show(
         view = View(feed, access)
         stack.callback(view.close)
         if isinstance(source, RecordingPlayer):
-            view.add(ReplayControls(view.server, source))
+            add_replay_page(view, source)
         else:
-            if files is not None:
-                stack.callback(WandSessionPanel(view.server, source, files).close)
-            view.add(LiveControls(view.server, source))
-            view.add(MarkerPicker(view.server, source))
+            add_live_page(view, source, " ".join(options.connect), files, stack)
         print(*access.instructions(options.tokens), sep="\n", flush=True)
         view.run(stop)
 

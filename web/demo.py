@@ -22,6 +22,7 @@ from web.demo_progress import (
     ProgressReporter,
     SceneClock,
     describe_calibration_step,
+    describe_errors,
     describe_tracking_step,
 )
 from web.demo_server import RunningServer, start_server
@@ -169,7 +170,8 @@ class Demo:
             for whole_second in self._ticks(seconds):
                 if whole_second:
                     self.processes.measure()
-                    self._reporter.report(describe_tracking_step(score, usage, self.scene.cameras), 1.0, True)
+                    self._reporter.report(describe_errors(score), 1.0, print_text=False)
+                    print(describe_tracking_step(score, usage, self.scene.cameras), flush=True)
         except KeyboardInterrupt:  # the user ended the demo and expects the summary
             print(flush=True)
         self._score = None
