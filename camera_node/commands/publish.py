@@ -47,8 +47,8 @@ class Publish:
     """A Zenoh configuration file (JSON5) for TLS, access control or scouting."""
     detector: Literal["chords", "paper"] = "chords"
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
-    inner_ratios: tuple[float, ...] = (0.6, 0.41)
-    """Inner over outer diameters of the roundels in use."""
+    inner_ratios: tuple[float, ...] = ()
+    """Inner over outer diameters of the prints in use, such as 0.6; without any, they are found."""
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> None:

@@ -138,6 +138,7 @@ class Node:
             clock_error_us=clock_error_us,
             width=width,
             height=height,
+            found_ratios=self._detector.found_ratios,
         )
         return encode(message)
 
