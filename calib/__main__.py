@@ -3,18 +3,21 @@
 
 import logging
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
 
 from calib.commands.apply import Apply
 from calib.commands.check import Check
+from calib.commands.formats import ExportRig, ImportData
 from calib.commands.intrinsics import Intrinsics
 from calib.commands.plan import PlanArena
 from calib.commands.undo import Redo, Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
-from camera_node.errors import run
+from camera_node.command_line import parse
+from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
 
 Command = (
@@ -23,10 +26,15 @@ Command = (
     | Annotated[World, tyro.conf.subcommand("world")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[PlanArena, tyro.conf.subcommand("plan")]
+    | Annotated[ImportData, tyro.conf.subcommand("import")]
+    | Annotated[ExportRig, tyro.conf.subcommand("export")]
     | Annotated[Undo, tyro.conf.subcommand("undo")]
     | Annotated[Redo, tyro.conf.subcommand("redo")]
     | Annotated[Apply, tyro.conf.subcommand("apply")]
 )
+
+
+COMMANDS = ("intrinsics", "wand", "world", "check", "plan", "undo", "redo", "apply")
 
 
 def main() -> None:
@@ -35,11 +43,18 @@ def main() -> None:
     run(lambda: execute(sys.argv[1:]))
 
 
-def execute(arguments: list[str]) -> None:
-    """Run a command line; `--undo` as the first argument stands for the subcommand `undo`."""
+def execute(arguments: list[str], prog: str = "calib", examples: Sequence[str] = ()) -> None:
+    """Run a command line; `--undo` as the first argument stands for the subcommand `undo`.
+
+    Args:
+        arguments: the command line without the program.
+        prog: the program's name in its help and in errors.
+        examples: complete command lines that `--help` shows.
+    """
     if arguments[:1] == ["--undo"]:
         arguments = ["undo", *arguments[1:]]
-    tyro.cli(Command, prog="calib", description=__doc__, args=arguments).execute()
+    check_command(arguments, COMMANDS)
+    parse(Command, prog, arguments, examples).execute()
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels."""
+"""The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels,
+`snapshot` and `settings` ask a camera that runs, `cameras` the server for all of them."""
 
 import sys
 
-import tyro
-
+from camera_node.command_line import run_command
 from camera_node.commands.publish import Publish
 from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
@@ -18,17 +18,26 @@ def main() -> None:
 
 def _program() -> int | None:
     arguments = sys.argv[1:]
-    check_command(arguments, ("detect", "print"))
+    check_command(arguments, ("detect", "print", "snapshot", "settings", "cameras"))
     name = arguments[0] if arguments else ""
     if name == "detect":
         from camera_node.commands.detect import Detect
 
-        return tyro.cli(Detect, prog="camera_node detect", args=arguments[1:]).run()
+        return run_command(Detect, "camera_node detect", arguments[1:])
     if name == "print":
         from camera_node.commands.print import Sheet
 
-        return tyro.cli(Sheet, prog="camera_node print", args=arguments[1:]).run()
-    return tyro.cli(Publish, prog="camera_node", args=arguments).run()
+        return run_command(Sheet, "camera_node print", arguments[1:])
+    if name in ("snapshot", "settings"):
+        from camera_node.commands.adjust import ChangeSettings, SaveSnapshot
+
+        kind = SaveSnapshot if name == "snapshot" else ChangeSettings
+        return run_command(kind, f"camera_node {name}", arguments[1:])
+    if name == "cameras":
+        from camera_node.commands.cameras import cameras
+
+        return run_command(cameras, "camera_node cameras", arguments[1:])
+    return run_command(Publish, "camera_node", arguments)
 
 
 if __name__ == "__main__":

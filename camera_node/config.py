@@ -21,6 +21,21 @@ NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 NAME_RULE = "use letters, digits, _, . and -, at most 64 characters"
 
 
+def example_file(name: str) -> Path:
+    """An example of `configs/`, such as `wand.yaml`: the checkout's, or the one that the package contains.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    package = Path(__file__).resolve().parent
+    for configs in (package.parent / "configs", package / "configs"):
+        if (path := configs / name).is_file():
+            return path
+    raise ConfigError(
+        f"the example {name} is not installed; reinstall the package, or give a file of your own"
+    )
+
+
 def is_name(text: str) -> bool:
     """Whether a text can name an arena, a camera or a robot: names are parts of Zenoh keys and of file names."""
     return NAME.fullmatch(text) is not None

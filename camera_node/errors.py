@@ -72,10 +72,12 @@ def run(program: Callable[[], int | None]) -> None:
     sys.exit(code or 0)
 
 
-def check_command(arguments: Sequence[str], known: Sequence[str]) -> None:
+def check_command(
+    arguments: Sequence[str], known: Sequence[str], remedy: str = "--help lists the options"
+) -> None:
     """Raise ConfigError where the first argument is not an option and not a known command."""
     if not arguments or arguments[0].startswith("-") or arguments[0] in known:
         return
     similar = difflib.get_close_matches(arguments[0], known, 1)
     hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
-    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} (--help lists the options)")
+    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} ({remedy})")

@@ -6,6 +6,8 @@ constant formats. Lines about cameras and robots that a file declares are of a k
 """
 
 import logging
+import os
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -24,7 +26,11 @@ def about(name: str) -> dict[str, str]:
 
 
 def set_up_logging(level: int = logging.INFO) -> None:
-    """Write the log of this process to stderr."""
+    """Write the log of this process to stderr, without the lines of OpenCV, which repeat errors of this project."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+    if cv2 := sys.modules.get("cv2"):  # it read the variable when it was imported
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     handler = LimitedHandler()
     handler.setFormatter(LineFormatter("%(levelname)s %(name)s %(message)s"))
     logging.basicConfig(level=level, handlers=[handler])

@@ -2,6 +2,7 @@
 """Reads a YAML file in bounded time and memory: PyYAML and libyaml recurse, and expand aliases without a limit."""
 
 import os
+import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +15,25 @@ from camera_node.errors import ConfigError
 MAX_BYTES = 1 << 20  # 64 cameras with covariances take a tenth of it
 MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6
 MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
+OPENCV_SYNTAX = re.compile(rb"\A%YAML:1\.0[^\n]*\n|!!opencv-matrix")
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path, foreign: bool = False) -> Any:
     """The content of a YAML file: mappings, lists, texts, numbers, dates, booleans and None.
+
+    Args:
+        path: the file.
+        foreign: accept what OpenCV writes: the line `%YAML:1.0`, which YAML does not allow, and the tag
+            `!!opencv-matrix`.
 
     Raises:
         ConfigError: the file is missing, not a regular file, too large, or not YAML; or it uses tags, or has a key
             twice. Aliases may be used; their values count each time.
     """
     text = _read_bounded(path)
+    if foreign:
+        text = OPENCV_SYNTAX.sub(b"", text)
     try:
         _require_bounded(text)
         loader = _Loader(text)

@@ -4,12 +4,12 @@
 import os
 import sys
 from importlib import import_module
+from typing import Any
 
 # Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import tyro
-
+from camera_node.command_line import run_command
 from camera_node.errors import check_command, run
 from camera_node.logs import set_up_logging
 from fusion.commands.serve import Serve
@@ -25,7 +25,10 @@ COMMANDS = {  # and their modules in fusion.commands
     "robots": "robots",
     "undo": "undo",
     "redo": "undo",
+    "export": "export",
     "ros2": "ros2",
+    "vrpn": "vrpn",
+    "mavlink": "mavlink",
 }
 
 
@@ -39,10 +42,13 @@ def _program() -> int:
     check_command(sys.argv[1:], tuple(COMMANDS))
     name, *arguments = sys.argv[1:] or [""]
     if name not in COMMANDS:
-        return tyro.cli(Serve, prog="fusion").run()
-    # imported on demand: a robot's computer has neither GTSAM nor SciPy
-    command = getattr(import_module(f"fusion.commands.{COMMANDS[name]}"), name)
-    return tyro.cli(command, prog=f"fusion {name}", args=arguments)
+        return run_command(Serve, "fusion", sys.argv[1:]) or 0
+    return run_command(load_command(name), f"fusion {name}", arguments) or 0
+
+
+def load_command(name: str) -> Any:
+    """Import the function of one of `COMMANDS`: a robot's computer has neither GTSAM nor SciPy."""
+    return getattr(import_module(f"fusion.commands.{COMMANDS[name]}"), name)
 
 
 if __name__ == "__main__":

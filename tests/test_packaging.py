@@ -18,8 +18,8 @@ import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fu
 here = pathlib.Path(sys.argv[1])
 for module in (camera_node, camera_node._core, calib, fusion, fusion._core):
     assert here in pathlib.Path(module.__file__).parents, module.__file__
-from web.demo import default_scene
-assert here in default_scene().parents, default_scene()
+from camera_node.config import example_file
+assert here in example_file("demo/scene.yaml").parents
 """
 
 
@@ -43,6 +43,13 @@ def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), dependencies])}
     probe = [sys.executable, "-S", "-c", PROBE, str(tmp_path)]
     subprocess.run(probe, check=True, timeout=60, cwd=tmp_path, env=env)
+    # `roundel` and the programs that it starts work in the checkout too, where the sources have no native modules.
+    command = [*probe[:2], "-P", "-c", "from web.roundel.command import main; main()"]
+    picture = [*command, "detect", str(ROOT / "docs" / "demo.png")]
+    subprocess.run(picture, check=True, timeout=60, cwd=ROOT, env=env, stdout=subprocess.DEVNULL)
+    child = [sys.executable, "-S", "-m", "camera_node", "detect", "--help"]
+    env["PYTHONSAFEPATH"] = "1"  # as `roundel` sets it
+    subprocess.run(child, check=True, timeout=60, cwd=ROOT, env=env, stdout=subprocess.DEVNULL)
 
 
 def test_a_wheel_contains_the_programs_only(wheel: Path):
@@ -56,7 +63,7 @@ def test_a_wheel_contains_the_programs_only(wheel: Path):
     }
     assert not [name for name in names if name.endswith((".cpp", ".hpp"))]
     assert {"camera_node/_core.pyi", "fusion/_core.pyi"} <= set(names)
-    assert "web/configs/wand.yaml" in names
+    assert "camera_node/configs/wand.yaml" in names
 
 
 def test_the_native_module_computes():

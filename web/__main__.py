@@ -3,12 +3,15 @@
 
 import contextlib
 import logging
+import sys
 import threading
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-import tyro
-
+from camera_node.command_line import parse
+from camera_node.config import example_file
 from camera_node.errors import run
 from camera_node.logs import set_up_logging
 from camera_node.protocol.session import open_client
@@ -52,7 +55,7 @@ class Options:
     seconds: float | None = None
     demo: bool = False
     rig: Path | None = None
-    wand: Path = Path("configs/wand.yaml")
+    wand: Path = field(default_factory=partial(example_file, "wand.yaml"))
     replay: Path | None = None
     scene: Path | None = None
     listen: str | None = None
@@ -87,11 +90,10 @@ def _show(
     if options.headless:
         _print_lines(feed, stop)
         return
-    from web.controls import LiveControls, ReplayControls
-    from web.marker_picker import MarkerPicker
+    from web.page import add_live_page, add_replay_page
     from web.page_access import PageAccess
+    from web.tabs.wand_session import CalibrationFiles
     from web.view import View
-    from web.wand_calibration import CalibrationFiles, WandSessionPanel
 
     files = CalibrationFiles(options.rig, options.wand) if options.rig is not None else None
     if files is not None:
@@ -101,12 +103,9 @@ def _show(
         view = View(feed, access)
         stack.callback(view.close)
         if isinstance(source, RecordingPlayer):
-            view.add(ReplayControls(view.server, source))
+            add_replay_page(view, source)
         else:
-            if files is not None:
-                stack.callback(WandSessionPanel(view.server, source, files).close)
-            view.add(LiveControls(view.server, source))
-            view.add(MarkerPicker(view.server, source))
+            add_live_page(view, source, " ".join(options.connect), files, stack)
         print(*access.instructions(options.tokens), sep="\n", flush=True)
         view.run(stop)
 
@@ -121,17 +120,18 @@ def _print_lines(feed: Feed, stop: threading.Event) -> None:
 
 def play_demo(options: Options) -> int:
     """Run the demo and return its exit code."""
-    from web.demo import default_scene, run_demo
+    from web.demo import run_demo
     from web.view import check_port
 
     if not options.headless:
         check_port(options.host, options.port)
     page = None if options.headless else (options.host, options.port)
-    return run_demo(options.scene or default_scene(), options.listen, page, options.seconds)
+    return run_demo(options.scene or example_file("demo/scene.yaml"), options.listen, page, options.seconds)
 
 
-def program() -> int | None:
-    options = tyro.cli(Options, prog="python -m web")
+def program(arguments: Sequence[str], prog: str = "python -m web", examples: Sequence[str] = ()) -> int:
+    """Run a command line and return the exit code."""
+    options = parse(Options, prog, arguments, examples)
     if options.demo:
         return play_demo(options)
     with stopped_by_signals() as stop:
@@ -146,7 +146,7 @@ def program() -> int | None:
 
 def main() -> None:
     set_up_logging(logging.WARNING)
-    run(program)
+    run(lambda: program(sys.argv[1:]))
 
 
 if __name__ == "__main__":

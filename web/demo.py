@@ -11,12 +11,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import web
 from calib.live.rig_requests import set_rig
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
-from camera_node.errors import ConfigError
 from camera_node.protocol.session import open_client
 from camera_node.simulation.scene import Scene
 from fusion.protocol.messages import RobotPose
@@ -24,6 +22,7 @@ from web.demo_progress import (
     ProgressReporter,
     SceneClock,
     describe_calibration_step,
+    describe_errors,
     describe_tracking_step,
 )
 from web.demo_server import RunningServer, start_server
@@ -40,19 +39,6 @@ CALIBRATION_S = 90.0  # limit for the calibration after the wand session
 SETTLE_S = 0.5  # after a new calibration, until no pose of the previous one arrives
 ACQUISITION_S = 5.0  # for all robots to be acquired; a robot that is not tracked then counts as lost
 TICK_S = 0.05
-
-
-def default_scene() -> Path:
-    """Return the scene of the checkout, or of the installed package.
-
-    Raises:
-        ConfigError: there is neither.
-    """
-    package = Path(web.__file__).parent
-    for configs in (package.parent / "configs", package / "configs"):
-        if (path := configs / "demo" / "scene.yaml").is_file():
-            return path
-    raise ConfigError("the demo's scene.yaml is not installed; give one with --scene scene.yaml")
 
 
 def run_demo(
@@ -184,7 +170,8 @@ class Demo:
             for whole_second in self._ticks(seconds):
                 if whole_second:
                     self.processes.measure()
-                    self._reporter.report(describe_tracking_step(score, usage, self.scene.cameras), 1.0, True)
+                    self._reporter.report(describe_errors(score), 1.0, print_text=False)
+                    print(describe_tracking_step(score, usage, self.scene.cameras), flush=True)
         except KeyboardInterrupt:  # the user ended the demo and expects the summary
             print(flush=True)
         self._score = None

@@ -69,6 +69,12 @@ def describe_calibration_step(clock: SceneClock, state: ArenaState) -> str:
     return f"waving the wand, {t_s:.0f} of {wave_s:.0f} s; image coverage: {shares or 'no camera yet'}"
 
 
+def describe_errors(score: PoseScore) -> str:
+    """Return the robots' position errors for the page, which has all other figures itself."""
+    errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.errors)
+    return f"simulation: position errors in mm: {errors}"
+
+
 def describe_tracking_step(score: PoseScore, usage: ResourceUsage, cameras: Iterable[str]) -> str:
     """Return the status line while the robots are tracked."""
     errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.errors)

@@ -14,14 +14,15 @@ import msgspec
 
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
-from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
 from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
-from web.coverage import CoveragePicture
+from web.coverage_picture import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
+REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
 
@@ -38,8 +39,11 @@ class ArenaState:
     """The latest messages of an arena at one moment of the feed's clock."""
 
     now_s: float = 0.0
+    started_s: float = 0.0  # when the feed was created
     poses: dict[str, TimedMessage] = field(default_factory=dict)  # by robot
     cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
+    previews: dict[str, TimedMessage] = field(default_factory=dict)  # picture of each camera
+    detections: dict[str, Detections] = field(default_factory=dict)  # latest of each camera
     coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
@@ -78,22 +82,23 @@ class Feed:
         self.keys = Keys(arena)
         self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
-        self._state = ArenaState()
+        self._state = ArenaState(started_s=clock())
         keys = self.keys
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
             keys.robot_pose(): (RobotPose, self._store_pose),
             keys.markers: (Markers, self._store_as("markers")),
-            keys.fusion_status: (FusionStatus, self._store_as("status")),
+            keys.fusion_status: (FusionStatus, self._store_status),
             keys.camera_status(): (CameraStatus, self._store_camera_status),
             keys.detections(): (Detections, self._add_coverage),
+            keys.preview(): (Preview, self._store_preview),
             keys.rig: (RigMessage, self._store_rig),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
         }
 
     @property
     def key_exprs(self) -> tuple[str, ...]:
-        """The Zenoh key expressions of all messages that the feed decodes."""
-        return tuple(self._kinds)
+        """The Zenoh key expressions of all messages that the feed decodes, without those that are sent on demand."""
+        return tuple(key for key in self._kinds if key != self.keys.preview())
 
     def receive(self, key_expr: str, key: str, data: bytes) -> None:
         """Store a message; `key_expr` is the one of `key_exprs` that includes its `key`."""
@@ -123,7 +128,10 @@ class Feed:
     def clear(self) -> None:
         """Discard all messages; fault counts and the server's presence remain."""
         with self._lock:
-            self._state = ArenaState(server_alive=self._state.server_alive, faults=self._state.faults)
+            old = self._state
+            self._state = ArenaState(
+                started_s=old.started_s, server_alive=old.server_alive, faults=old.faults
+            )
 
     def count_fault(self, reason: str) -> None:
         """Count a message or drawing that was skipped."""
@@ -139,8 +147,18 @@ class Feed:
         if self._on_pose is not None:
             self._on_pose(pose)
 
+    def _store_status(self, status: FusionStatus, key: str) -> None:
+        state = self._state
+        state.status = TimedMessage(status, self._clock())
+        for robot in state.poses.keys() - status.robots.keys():  # renamed or removed, unless it is new
+            if self._clock() - state.poses[robot].received_s > REMOVED_S:
+                del state.poses[robot]
+
     def _store_camera_status(self, status: CameraStatus, key: str) -> None:
         self._store_named(self._state.cameras, status.camera, status, key)
+
+    def _store_preview(self, preview: Preview, key: str) -> None:
+        self._store_named(self._state.previews, preview.camera, preview, key)
 
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
@@ -149,6 +167,7 @@ class Feed:
         if picture is None or picture.size != size:
             picture = self._state.coverage[camera] = CoveragePicture(*size)
         picture.add(detections)
+        self._state.detections[camera] = detections
         self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
@@ -161,7 +180,7 @@ class Feed:
         messages[name] = TimedMessage(message, self._clock())
 
 
-_CONTAINERS = ("poses", "cameras", "coverage", "message_counts", "faults")
+_CONTAINERS = ("poses", "cameras", "previews", "detections", "coverage", "message_counts", "faults")
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:

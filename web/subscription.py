@@ -2,16 +2,15 @@
 """Connects a feed to a running arena over Zenoh, and sends requests to its programs."""
 
 import contextlib
-from collections.abc import Callable
+import threading
 from typing import Any
 
 import zenoh
 
 from calib.live.rig_requests import redo_rig, undo_rig
-from calib.rig.messages import RigMessage
-from camera_node.errors import RoundelError
 from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.messages import MessageError, decode
+from camera_node.protocol.camera_requests import request_settings
+from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
@@ -30,6 +29,9 @@ class Subscription:
     def __init__(self, session: zenoh.Session, feed: Feed) -> None:
         self.session, self.feed = session, feed
         keys = feed.keys
+        self._lock = threading.Lock()
+        self._previews: zenoh.Subscriber | None = None
+        self._closed = False
         self._rig_requests = RateLimit(RIG_REQUESTS_HZ, 2.0)
         self._entities: list[Any] = [self._subscribe(key_expr) for key_expr in feed.key_exprs]
         self._entities += [
@@ -43,8 +45,23 @@ class Subscription:
 
     def close(self) -> None:
         """End the subscription."""
+        self.watch_previews(False)
+        self._closed = True
         for entity in self._entities:
             entity.undeclare()
+
+    def watch_previews(self, watched: bool) -> None:
+        """Subscribe to the cameras' small pictures or not: the cameras send them only while someone subscribes."""
+        with self._lock:
+            if watched and self._previews is None and not self._closed:
+                self._previews = self._subscribe(self.feed.keys.preview())
+            elif not watched and self._previews is not None:
+                self._previews.undeclare()
+                self._previews = None
+
+    def change_settings(self, camera: str, wanted: Settings | None = None) -> Settings:
+        """Change settings of a camera, or none, and return those in use; raises as `request_settings`."""
+        return request_settings(self.session, self.feed.keys.arena, camera, wanted, REQUEST_TIMEOUT_S)
 
     def snapshot(self, camera: str, timeout_s: float = REQUEST_TIMEOUT_S) -> bytes | None:
         """Return a camera's current image as JPEG, or None if the camera does not answer in time."""
@@ -66,19 +83,19 @@ class Subscription:
         return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
-        """Have the server undo the last change of its rig; return the outcome as text."""
-        return self._step(undo_rig, "the previous rig is in force on the server", timeout_s)
+        """Have the server undo the last change of its rig; return the outcome as text.
+
+        Raises:
+            RequestError: the server refuses, as it does where there is none.
+            NetworkError: it does not answer.
+        """
+        undo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        return "the previous rig is in force on the server"
 
     def redo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
-        """Have the server redo the change of its rig that was undone last; return the outcome as text."""
-        return self._step(redo_rig, "the undone rig is in force on the server again", timeout_s)
-
-    def _step(self, request: Callable[..., RigMessage], outcome: str, timeout_s: float) -> str:
-        try:
-            request(self.session, self.feed.keys.arena, "web", timeout_s)
-        except RoundelError as error:
-            return str(error)
-        return outcome
+        """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
+        redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        return "the undone rig is in force on the server again"
 
     def _subscribe(self, key_expr: str) -> zenoh.Subscriber:
         def receive(sample: zenoh.Sample) -> None:

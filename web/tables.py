@@ -1,63 +1,39 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Formats the state of an arena: tables for the panel, and one line for a terminal."""
 
-import html
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 
 from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, RobotPose
-from web.feed import ArenaState, TimedMessage
+from web.colours import css, robot_colour
+from web.feed import ArenaState
+from web.html_tables import Column, HtmlTable, TableRow
 
 STALE_S = 2.0  # a robot or camera without a message for so long counts as absent
 NO_VALUE = "–"
+ROBOT_COLUMNS = (
+    Column("robot", explanation="the dot has the robot's colour in the scene"),
+    Column(
+        "state", explanation="tracked: seen now; coasting: predicted; lost: no pose; not found: never seen"
+    ),
+    Column("x  y  z", "m", "position of the robot's origin in the world"),
+    Column("speed", "m/s"),
+    Column("\N{GREEK SMALL LETTER SIGMA}", "mm", "standard deviation of the position"),
+    Column("seen", "", "markers seen in the latest frame set"),
+)
+CAMERA_COLUMNS = (
+    Column("camera"),
+    Column("rate", "1/s", "frames per second"),
+    Column("detect", "ms", "time to find the roundels in a frame, at the camera"),
+    Column("seen", "", "roundels in a frame, mean over one second"),
+    Column("error", "px", "RMS distance between detections and their prediction"),
+    Column("arrival", "ms", "time from the middle of the exposure to the arrival at the server"),
+    Column("clock", "ms", "the server's time minus the clock of the camera's machine"),
+    Column("lost", "", "frames since the start: skipped by the camera / too late for the server"),
+)
 LEVEL_OF_STATE = {"tracked": "ok", "coasting": "warn"}  # other states are bad
-COLOURS = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b"}  # by level
-MARGIN_PX = 6
-CELL = "padding:3px 6px 3px 0"
 MAX_SIGMA_MM = 1000  # a larger standard deviation has no meaning for a lost robot
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """The cells of a row, its level (a key of `COLOURS`), and a note, or "": a fault or an instruction."""
-
-    cells: tuple[str, ...]
-    level: str
-    note: str = ""
-
-    def html(self) -> str:
-        """Return the row; the note has its own line, because a sentence does not fit beside figures."""
-        cell = f'<td style="{CELL};white-space:nowrap">'
-        texts = f"</td>{cell}".join(html.escape(text) for text in self.cells)
-        row = f'<tr style="border-top:1px solid #8883">{cell}{_dot(self.level)}{texts}</td></tr>'
-        style = f"white-space:normal;line-height:1.3;padding:0 0 4px 14px;color:{COLOURS[self.level]}"
-        note = f'<tr><td colspan="{len(self.cells)}" style="{style}">{html.escape(self.note)}</td></tr>'
-        return row + (note if self.note else "")
-
-
-@dataclass(frozen=True)
-class HtmlTable:
-    """Rows under a header; `placeholder` stands for no rows."""
-
-    header: tuple[str, ...]
-    rows: list[TableRow]
-    placeholder: str = "none"
-
-    def html(self) -> str:
-        """Return the table, with all texts escaped."""
-        if not self.rows:
-            text = html.escape(self.placeholder)
-            return f'<div style="margin:0 {MARGIN_PX}px;font-size:11px;opacity:.6">{text}</div>'
-        head = f'</th><th style="{CELL}">'.join(html.escape(text) for text in self.header)
-        body = "".join(row.html() for row in self.rows)
-        size = f"width:calc(100% - {2 * MARGIN_PX}px);margin:0 {MARGIN_PX}px"
-        style = f"{size};border-collapse:collapse;font-size:11px;text-align:left"
-        return (
-            f'<table style="{style}"><tr style="opacity:.6;vertical-align:bottom;line-height:1.2">'
-            f'<th style="{CELL}">{head}</th></tr>{body}</table>'
-        )
 
 
 def robot_state(state: ArenaState, robot: str) -> str:
@@ -69,17 +45,18 @@ def robot_state(state: ArenaState, robot: str) -> str:
 def tabulate_robots(state: ArenaState) -> HtmlTable:
     """One row per robot: state, position, speed, standard deviation of the position, number of markers."""
     status: FusionStatus | None = state.status.message if state.status else None
-    missing = status.not_acquired if status else {}
+    declared = {*status.robots, *status.not_acquired} if status else set()
     rows = [
         _robot_row(state, name) if name in state.poses else _missing_row(state, name)
-        for name in sorted({*state.poses, *missing})
+        for name in sorted({*state.poses, *declared})
     ]
-    return HtmlTable(("robot", "state", "x y z m", "m/s", "σ mm", "seen"), rows, "no robot yet")
+    return HtmlTable(ROBOT_COLUMNS, rows, "no robot is declared; create one below")
 
 
 def _missing_row(state: ArenaState, name: str) -> TableRow:
     """A robot that was never acquired."""
-    return TableRow((name, "not found", *[NO_VALUE] * 4), "bad", _robot_note(state, name))
+    cells = (name, "not found", *[NO_VALUE] * 4)
+    return TableRow(cells, "bad", _robot_note(state, name), css(robot_colour(name)))
 
 
 def _robot_note(state: ArenaState, name: str) -> str:
@@ -98,12 +75,16 @@ def _robot_note(state: ArenaState, name: str) -> str:
 def _robot_row(state: ArenaState, name: str) -> TableRow:
     pose: RobotPose = state.poses[name].message
     tracking = robot_state(state, name)
+    level, note = LEVEL_OF_STATE.get(tracking, "bad"), _robot_note(state, name)
+    figures = (NO_VALUE,) * 4 if tracking == "no data" else _figures(pose)
+    level = "warn" if note and level == "ok" else level
+    return TableRow((name, tracking, *figures), level, note, css(robot_colour(name)))
+
+
+def _figures(pose: RobotPose) -> tuple[str, str, str, str]:
     position = " ".join(f"{x:+.2f}" for x in pose.position)
     speed, sigma = float(np.linalg.norm(pose.velocity)), format_sigma(position_sigma_mm(pose))
-    cells = (name, tracking, position, f"{speed:.2f}", sigma, str(pose.n_markers))
-    level = LEVEL_OF_STATE.get(tracking, "bad")
-    note = _robot_note(state, name)
-    return TableRow(cells, "warn" if note and level == "ok" else level, note)
+    return position, f"{speed:.2f}", sigma, str(pose.n_markers)
 
 
 def format_sigma(sigma_mm: float) -> str:
@@ -124,30 +105,43 @@ def tabulate_cameras(state: ArenaState) -> HtmlTable:
     """
     server = state.status.message.cameras if state.status else {}
     rows = [_camera_row(state, name, server.get(name)) for name in sorted({*state.cameras, *server})]
-    header = ("camera", "fps", "detect ms", "seen", "px", "late ms", "clock ms", "lost")
-    return HtmlTable(header, rows, "no camera yet")
+    return HtmlTable(CAMERA_COLUMNS, rows, "no camera yet; start one with python -m camera_node")
 
 
 def _camera_row(state: ArenaState, name: str, health: CameraHealth | None) -> TableRow:
     timed = state.cameras.get(name)
+    silence = camera_silence_s(state, name)
+    if silence is not None:
+        cells = (name, *[NO_VALUE] * (len(CAMERA_COLUMNS) - 1))
+        return TableRow(cells, "bad", describe_silence(silence))
     own = timed.message if timed else None
-    advice = _advise(state, timed, health)
+    advice = _advise(own.advice if own else "", health)
     cells = (
         name,
         _number(own and own.fps, 1),
-        _number(own and own.detect_ms, 2),
+        _number(own and own.detect_ms, 1),
         _number(own and own.roundels, 1),
         _number(health and health.residual_px, 2),
         _number(health and health.lateness_ms, 1),
         _number(own and own.clock_offset_ms, 2),
         f"{own.dropped if own else 0} / {health.late if health else 0}",
     )
-    return TableRow(cells, "bad" if advice == "offline" else "warn" if advice else "ok", advice)
+    return TableRow(cells, "warn" if advice else "ok", advice)
 
 
-def _advise(state: ArenaState, timed: TimedMessage | None, health: CameraHealth | None) -> str:
-    if timed is None or state.age_s(timed) > STALE_S:
-        return "offline"
+def camera_silence_s(state: ArenaState, name: str) -> float | None:
+    """For how long a camera has sent no status, seconds: infinite if it never did; None while it sends."""
+    age = state.age_s(state.cameras.get(name))
+    return age if age > STALE_S else None
+
+
+def describe_silence(seconds: float) -> str:
+    """What to do about a camera that sends nothing."""
+    since = f"silent for {seconds:.0f} s" if np.isfinite(seconds) else "silent"
+    return f"{since}: check its cable and its program"
+
+
+def _advise(own_advice: str, health: CameraHealth | None) -> str:
     if health is not None and not health.calibrated:
         return "not calibrated"
     if health is not None and health.excluded:
@@ -158,7 +152,7 @@ def _advise(state: ArenaState, timed: TimedMessage | None, health: CameraHealth 
         return f"its stamps are corrected by {health.clock_correction_ms:.1f} ms: check its clock"
     if health is not None and health.duplicate_publisher:
         return "two nodes use this name"
-    return timed.message.advice
+    return own_advice
 
 
 def describe_server(state: ArenaState) -> str:
@@ -166,6 +160,8 @@ def describe_server(state: ArenaState) -> str:
     if state.status is None or not state.server_alive:
         return "no server found yet" if state.status is None else "the server is offline"
     status: FusionStatus = state.status.message
+    if state.age_s(state.status) > STALE_S:
+        return f"the server is silent for {state.age_s(state.status):.0f} s"
     return (
         f"{status.frame_sets_per_s:.0f} poses/s, latency {_number(status.latency_ms, 1)} ms, "
         f"processor {100 * status.cpu:.0f} %, {status.memory_mb:.0f} MB"
@@ -173,17 +169,21 @@ def describe_server(state: ArenaState) -> str:
 
 
 def describe_latency(state: ArenaState) -> str:
-    """Return the parts of the latency from mid-exposure to the pose, the mean of all robots' latest poses."""
+    """Return the shares of the latency's parts, the mean of all robots' latest poses.
+
+    Shares, because the latency itself is the server's median over one second.
+    """
     recent = [timed.message.latency for timed in state.poses.values() if state.age_s(timed) < STALE_S]
-    latencies = [latency for latency in recent if latency is not None]
+    latencies = [latency for latency in recent if latency is not None and latency.total_ms > 0]
     if not latencies:
         return ""
+    total = sum(latency.total_ms for latency in latencies)
     parts = (
-        f"{name.removesuffix('_ms')} {np.mean([getattr(latency, name) for latency in latencies]):.1f}"
+        f"{name.removesuffix('_ms')} {100 * sum(getattr(latency, name) for latency in latencies) / total:.0f} %"
         for name in Latency.__struct_fields__
-        if name not in ("exposure_ms", "detect_ms")  # camera_ms includes them
+        if name not in ("exposure_ms", "detect_ms", "total_ms")  # camera_ms includes the first two
     )
-    return f"latency ms: {', '.join(parts)}"
+    return f"of the latency: {', '.join(parts)}"
 
 
 def tabulate_faults(state: ArenaState) -> HtmlTable:
@@ -195,7 +195,7 @@ def tabulate_faults(state: ArenaState) -> HtmlTable:
         counts.update({f"{name}: {reason}": count for reason, count in health.faults.items()})
     counts.update({f"viewer: {reason}": count for reason, count in state.faults.items()})
     rows = [TableRow((reason, str(count)), "warn") for reason, count in counts.items() if count > 0]
-    return HtmlTable(("fault", "count"), rows)
+    return HtmlTable((Column("fault"), Column("count")), rows)
 
 
 def describe_arena(state: ArenaState) -> str:
@@ -223,7 +223,3 @@ def _number(value: float | None, digits: int) -> str:
 
 def _bracketed_note(row: TableRow) -> str:
     return f" ({row.note})" if row.note else ""
-
-
-def _dot(level: str) -> str:
-    return f'<span style="color:{COLOURS[level]}">&#9679;</span> '

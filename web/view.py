@@ -1,33 +1,29 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The page: a Viser server that draws the state of an arena thirty times a second."""
 
-import math
 import os
 import socket
 import threading
 import time
-from typing import Any, Protocol
+from typing import Protocol
 
-import numpy as np
 import viser
 
 from calib.rig.rig import Rig
 from camera_node.service import ServiceManager
-from web.drawing import MarkerCloud, RobotDrawing, TruePoints, add_lights, draw_camera
 from web.errors import PortError, WebError
 from web.feed import ArenaState, Feed
+from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding
-from web.panel import Panel
+from web.scene.cameras import CameraDrawing
+from web.scene.markers import MarkerCloud, TruePoints
+from web.scene.robots import RobotDrawing
+from web.scene.surroundings import FIELD_OF_VIEW, add_floor, add_lights, default_viewpoint
 
 PERIOD_S = 1 / 30
-TRAIL_INTERVAL = 3  # drawings from one update of the trails to the next
-PANEL_INTERVAL = 15  # drawings from one update of the panel to the next
-FIELD_OF_VIEW = math.radians(42)
-DISTANCE = 2.3  # of the initial viewpoint, in radii of the rig
-MIN_RADIUS_M = 1.5
-DIRECTION = np.array([-0.45, 0.78, -0.43])  # in which the initial view looks
+SLOW_INTERVAL = 3  # drawings from one update of trails and labels to the next
+PANEL_INTERVAL = 10  # drawings from one update of the panel to the next
 READ_ONLY = "**Read only**: the controls have no effect. Open the operator's address to change anything."
-PANEL_SHIFT = 0.11  # of the initial view to the right, in distances: the panel covers the right of the page
 
 
 class PanelSection(Protocol):
@@ -56,15 +52,15 @@ class View:
         self.server.gui.configure_theme(
             dark_mode=True, control_width="large", show_logo=False, show_share_button=False
         )
-        self._sections: list[PanelSection] = [Panel(self.server, self.reset_view)]
+        self._sections: list[PanelSection] = []
         self._drawings = 0
         self._rig: Rig | None = None
-        self._cameras: list[Any] = []
+        self.cameras = CameraDrawing(self.server.scene)
         self._robots = RobotDrawing(self.server.scene)
         self._markers = MarkerCloud(self.server.scene)
         self.true_points = TruePoints(self.server.scene)
         add_lights(self.server.scene)
-        _add_floor(self.server.scene)
+        add_floor(self.server.scene)
         self.server.initial_camera.fov = FIELD_OF_VIEW
         self.reset_view()
 
@@ -95,7 +91,7 @@ class View:
         with self.server.atomic():
             if state.rig is not self._rig:
                 self._draw_rig(state.rig)
-            self._robots.draw(state, trails=self._drawings % TRAIL_INTERVAL == 0)
+            self._robots.draw(state, is_slow=self._drawings % SLOW_INTERVAL == 0)
             self._markers.draw(state)
             self.true_points.draw(state)
             if self._drawings % PANEL_INTERVAL == 0:
@@ -117,32 +113,17 @@ class View:
             client.camera.look_at = target
 
     def _draw_rig(self, rig: Rig | None) -> None:
-        for handle in self._cameras:
-            handle.remove()
-        first, self._rig, self._cameras = self._rig is None, rig, []
-        for name, camera in (rig.placed() if rig else {}).items():
-            self._cameras += draw_camera(self.server.scene, name, camera)
+        first, self._rig = self._rig is None, rig
+        self.cameras.draw(rig)
         if first:
             self.reset_view()
 
 
 async def _describe_role(client: viser.ClientHandle) -> None:
-    """Show a viewer why the controls do nothing. Viser runs it in the context of the browser's connection."""
+    """Dim a viewer's controls, and say why they do nothing. Viser runs it in the context of the connection."""
     if current_role.get() == "viewer":
         client.gui.add_markdown(READ_ONLY, order=-1)
-
-
-def _add_floor(scene: viser.SceneApi) -> None:
-    scene.add_grid(
-        "/floor",
-        width=12.0,
-        height=12.0,
-        cell_color=(46, 49, 56),
-        section_color=(72, 77, 88),
-        fade_distance=14.0,
-        fade_strength=2.0,
-        fade_from="origin",
-    )
+        client.gui.add_html(READ_ONLY_STYLE)
 
 
 def check_port(host: str, port: int) -> None:
@@ -157,15 +138,3 @@ def check_port(host: str, port: int) -> None:
         raise PortError(
             f"cannot serve the page on {host}:{port} ({reason}); choose another port with --port"
         ) from None
-
-
-def default_viewpoint(
-    rig: Rig | None,
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return a position and a target, metres, from which the whole rig is visible."""
-    centres = [camera.matrix()[:3, 3] for camera in (rig.placed() if rig else {}).values()]
-    low, high = (np.min(centres, 0), np.max(centres, 0)) if centres else (np.full(3, -2.0), np.full(3, 2.0))
-    distance = DISTANCE * max(MIN_RADIUS_M, float(np.linalg.norm(high - low)) / 2)
-    target = np.array([*(low + high)[:2] / 2, 0.45 * high[2]])
-    target += PANEL_SHIFT * distance * np.cross(DIRECTION, [0.0, 0.0, 1.0])
-    return tuple((target - distance * DIRECTION).tolist()), tuple(target.tolist())

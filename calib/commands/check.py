@@ -13,12 +13,12 @@ from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_report
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig, load_rig
+from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.quality.grade import assess
 from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance
-from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.terminal import progress_console, say
@@ -40,7 +40,7 @@ class Check(WandOptions):
         self.require_recording()
         if self.out is not None:
             check_folder(self.out)
-        rig, wand = load_rig(self.rig), load_yaml(self.wand, Body)
+        rig, wand = load_rig(self.rig), load_wand(self.wand)
         figures = self._judge(rig, wand, self.read_recording(rig, wand), self.measured_distance(rig))
         if self.out is not None:
             calibration = {**rig.calibration, "check": {**provenance(), **figures}}

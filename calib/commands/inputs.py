@@ -2,7 +2,8 @@
 """The options by which subcommands take their input, and the reading of recordings."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from calib.errors import CalibrationError
 from calib.rig.recording import read_detections
 from calib.rig.rig import Rig
 from calib.wand.scale import SIGMA_M, Distance
+from camera_node.config import example_file
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -24,12 +26,14 @@ Synchronised = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(alias
 class WandOptions:
     """The options of every calibration from a wand recording."""
 
-    wand: Path = Path("configs/wand.yaml")
-    """The wand: diameter_m and markers, metres."""
+    wand: Path = field(default_factory=partial(example_file, "wand.yaml"))
+    """The wand: markers, and diameter_m unless they are lights or points; metres."""
     frames: Path | None = None
     """Detect in <FOLDER>/<camera>/<t_ns>.png|jpg."""
     observations: Path | None = None
-    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker]."""
+    """Or read marker centres from a CSV: t_ns,camera,u,v[,marker,sigma_px]; or with a column frame in place of t_ns."""
+    fps: float | None = None
+    """Frames a second, for a CSV with numbers of frames."""
     recording: Path | None = None
     """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
     distance: tuple[str, str, float] | None = None
@@ -52,7 +56,7 @@ class WandOptions:
 
     def read_recording(self, rig: Rig, wand: Body) -> list[Detections]:
         """The detections of the given recording; see `read_recording`."""
-        return read_recording(rig, self.frames, self.observations, self.recording, wand)
+        return read_recording(rig, self.frames, self.observations, self.recording, wand, self.fps)
 
     def measured_distance(self, rig: Rig) -> Distance | None:
         """The given distance.
@@ -82,6 +86,7 @@ def read_recording(
     observations: Path | None,
     recording: Path | None = None,
     body: Body | None = None,
+    fps: float | None = None,
 ) -> list[Detections]:
     """Read detections from one of: a folder of frames, a CSV of observations, an MCAP recording.
 
@@ -91,6 +96,7 @@ def read_recording(
         observations: CSV of marker centres.
         recording: MCAP of detections.
         body: the wand or frame, whose roundels are detected in `frames`.
+        fps: frames a second, for observations with numbers of frames.
 
     Raises:
         ConfigError, CameraError, CalibrationError: the input is unusable, or a camera is not in the rig.
@@ -102,7 +108,7 @@ def read_recording(
         return read_detections(recording)
     assert observations is not None
     sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
-    return read_observations(observations, sizes)
+    return read_observations(observations, sizes, fps)
 
 
 def _check_folders(folder: Path, rig: Rig) -> None:

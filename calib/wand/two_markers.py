@@ -17,6 +17,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace as replace_fields
 from numpy.typing import NDArray
 
 from calib.wand.detections import WandDetections
@@ -132,7 +133,7 @@ def label_ends(timing: Timing, detections: WandDetections, wand: Body, lenses: S
     sticks = _chain(detections, timing)
     if not len(sticks.rows):
         return np.full(len(detections), -1, np.intp)
-    tracks, light = _StickTracks.of(sticks, timing.gap_s), Body(diameter_m=wand.diameter_m)
+    tracks, light = _StickTracks.of(sticks, timing.gap_s), replace_fields(wand, markers=((0.0, 0.0, 0.0),))
     middles = TwoViewGeometry(_middles(detections, sticks), lenses, light, timing)
     start = build_initial_rig(middles, cameras)
     labels = _label(sticks, _estimate_signs(tracks, start, lenses, COARSE_PX), len(detections))

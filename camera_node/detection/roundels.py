@@ -56,12 +56,14 @@ class Roundels:
     track: NDArray[np.int32]
 
     @classmethod
-    def from_points(cls, uv: Array, sigma_px: float, id: NDArray[np.int32] | None = None) -> "Roundels":
-        """Detections with centres (N, 2) alone, each coordinate with the standard deviation `sigma_px`."""
+    def from_points(
+        cls, uv: Array, sigma_px: float | Array, id: NDArray[np.int32] | None = None
+    ) -> "Roundels":
+        """Detections with centres (N, 2) alone, each coordinate with the standard deviation `sigma_px`, () or (N,)."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         n = len(uv)
         unknown, none = np.full(n, np.nan), np.full(n, -1, np.int32)
-        cov = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
+        cov = np.broadcast_to(sigma_px, n)[:, None, None] ** 2 * np.eye(2)
         return cls(
             uv, cov, np.full((n, 2), np.nan), unknown, unknown, unknown, none if id is None else id, none
         )

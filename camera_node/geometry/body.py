@@ -28,6 +28,10 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     def __post_init__(self) -> None:
         if not 0.001 <= self.diameter_m <= MAX_EXTENT_M:
             raise ValueError(f"diameter_m is {self.diameter_m}; give the black disc's diameter d_o in metres")
+        self.check_layout()
+
+    def check_layout(self) -> None:
+        """Raise ValueError unless the markers' positions and the ratios of diameters are plausible."""
         if not self.markers or not all(abs(x) <= MAX_EXTENT_M for marker in self.markers for x in marker):
             raise ValueError(
                 f"markers must be one or more [x, y, z] in metres, each within {MAX_EXTENT_M:g} m"

@@ -14,6 +14,7 @@ import zenoh
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_roundels
 from camera_node.node.clock_sync import ClockSync
+from camera_node.node.preview import Content, PreviewPublisher
 from camera_node.node.settings import apply_settings, read_settings
 from camera_node.node.status import DetectedFrame, NodeStatistics
 from camera_node.protocol.callbacks import guarded
@@ -44,7 +45,10 @@ ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the rou
 
 
 class Node:
-    """Publishes the detections and the status of one camera, and answers requests for snapshots and settings."""
+    """Publishes the detections and the status of one camera, and answers requests for snapshots and settings.
+
+    `on_settings` is called with the settings that a request has changed, in Zenoh's thread.
+    """
 
     def __init__(
         self,
@@ -71,10 +75,12 @@ class Node:
         self._clock = ClockSync(session, self._keys)
         self._statistics = NodeStatistics(name)
         self._keep_stamps = keep_stamps
+        self.on_settings: Callable[[Settings], object] = lambda wanted: None
         self._changing = threading.Lock()  # of the detector, by requests
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
+        self._previews: PreviewPublisher | None = None
 
     def run(self) -> None:
         """Publish every frame until the source ends or `close` is called; each frame is progress of the service.
@@ -97,6 +103,15 @@ class Node:
         """End `run`; called from another thread."""
         self._closed.set()
         self._source.close()
+
+    def adjust(self, wanted: Settings) -> None:
+        """Apply the settings that are not None, all of them or none; callable from any thread.
+
+        Raises:
+            ConfigError: the source or the detector does not have a setting or refuses its value.
+        """
+        with self._changing:
+            self._detector = apply_settings(wanted, self._source, self._detector)
 
     def _detect(self, frame: Frame) -> DetectedFrame:
         begun_ns = time.perf_counter_ns()
@@ -123,6 +138,7 @@ class Node:
             clock_error_us=clock_error_us,
             width=width,
             height=height,
+            found_ratios=self._detector.found_ratios,
         )
         return encode(message)
 
@@ -144,6 +160,10 @@ class Node:
             queryable = session.declare_queryable(key, guarded(key, partial(self._answer, answer)))
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
+        previews = self._previews = PreviewPublisher(
+            session, keys.preview(name), name, self._latest, lambda: self._clock.to_server(time.time_ns())
+        )
+        stack.callback(previews.close)
         watch = ServerWatch(session, keys.fusion_alive)
         stack.callback(watch.close)
         self._clock.start()
@@ -157,6 +177,11 @@ class Node:
         if self._source.is_recording:
             self._await_subscriber(publisher)
         return publisher
+
+    def _latest(self) -> Content | None:
+        """The latest frame, its roundels and the mask, for previews."""
+        latest = self._statistics.latest
+        return (latest.frame.image, latest.roundels, self._detector.settings["mask"]) if latest else None
 
     def _await_subscriber(self, publisher: zenoh.Publisher) -> None:
         """Wait until there is a subscriber, so that it receives all frames of a recording."""
@@ -175,15 +200,24 @@ class Node:
 
     def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
+        announced = False
         while not self._closed.wait(STATUS_S):
             try:
                 watch.report_absence()
                 status = self._summarize()
                 publisher.put(encode(status))
+                if status.fps > 0 and not announced:
+                    announced = True
+                    self._announce(status)
                 service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
             except Exception:  # the next status is another
                 log.exception("the status could not be published")
         publisher.undeclare()
+
+    def _announce(self, status: CameraStatus) -> None:
+        """Log once that frames are published: success must not be silent."""
+        text = "camera %s publishes %.1f frames/s of %d x %d pixels in arena '%s'"
+        log.info(text, self.name, status.fps, status.width, status.height, self._keys.arena)
 
     def _summarize(self) -> CameraStatus:
         now_ns = self._clock.to_server(time.time_ns())
@@ -219,4 +253,5 @@ class Node:
                     sender_of(query) or "unknown",
                     wanted,
                 )
+                self.on_settings(wanted)
             return encode_reply(payload, read_settings(self._source, self._detector))

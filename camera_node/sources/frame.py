@@ -75,7 +75,7 @@ class SourceSettings:
     fourcc: str | None = None
     """Pixel format, four letters such as MJPG, YUYV, GREY, "Y10 " or RGGB (cameras)."""
     scene: Path | None = None
-    """The scene file of the simulated arena (--source sim)."""
+    """The scene file of the simulated arena (--source sim); the demo's unless given."""
     epoch_ns: int | None = None
     """Unix time of the simulation's time 0, or with --stamps now of the recording's; now unless given."""
     pace: Literal["recorded", "fast"] = "recorded"

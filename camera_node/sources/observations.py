@@ -2,7 +2,7 @@
 """Reads recorded detections as `Detections` messages: from folders of frames, or from `observations.csv`."""
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from camera_node.sources.replay import FrameFolder
 from camera_node.terminal import track
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
-Rows = dict[tuple[int, str], list[tuple[float, float, int]]]
+MAX_FPS = 1e5
+Rows = dict[tuple[int, str], list[tuple[float, float, int, float]]]
 
 
 def detect_frames(folder: Path, **settings) -> list[Detections]:
@@ -54,22 +55,27 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
     return sorted(messages, key=lambda message: message.t_ns)
 
 
-def read_observations(path: Path, sizes: dict[str, tuple[int, int]] | None = None) -> list[Detections]:
-    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker, one row for each centre.
+def read_observations(
+    path: Path, sizes: dict[str, tuple[int, int]] | None = None, fps: float | None = None
+) -> list[Detections]:
+    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker and sigma_px, one row for each centre.
+
+    Instead of t_ns, the number of the frame can be given, in the column frame.
 
     Args:
         path: the file.
         sizes: (width, height) of each camera's image; the extent of the observations where it is not given.
+        fps: frames a second, for a file with numbers of frames.
 
     Returns:
         one message for each camera and time, in order of time; `marker` becomes `id`.
 
     Raises:
-        ConfigError: the file is missing, lacks a column, or has a row with invalid values.
+        ConfigError: the file is missing, lacks a column, or has a row with invalid values, or frames without `fps`.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = _read_rows(file, path)
+            rows = _read_rows(file, path, fps)
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
     except UnicodeDecodeError:
@@ -110,29 +116,49 @@ def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:
             yield message.t_ns, message.camera, f"{roundel.uv[0]:.4f}", f"{roundel.uv[1]:.4f}", number
 
 
-def _read_rows(file: Iterable[str], path: Path) -> Rows:
+def _read_rows(file: Iterable[str], path: Path, fps: float | None) -> Rows:
     reader = csv.DictReader(file)
-    if missing := {"t_ns", "camera", "u", "v"} - set(reader.fieldnames or ()):
-        raise ConfigError(f"{path} lacks the column {', '.join(sorted(missing))}; it needs t_ns,camera,u,v")
+    read_time = _choose_clock(path, set(reader.fieldnames or ()), fps)
     rows: Rows = {}
     for row in reader:
         try:
             u, v, number = float(row["u"]), float(row["v"]), int(row.get("marker") or -1)
-            t_ns, in_range = int(row["t_ns"]), abs(u) < 1e5 and abs(v) < 1e5  # False for NaN
+            sigma = float(row.get("sigma_px") or SIGMA_PX)
+            t_ns, in_range = (
+                read_time(row),
+                abs(u) < 1e5 and abs(v) < 1e5 and 0 < sigma < 1e4,
+            )  # False for NaN
             if not (in_range and row["camera"] and 0 <= t_ns < 2**63 and -1 <= number < 2**31):
                 raise ValueError
-            rows.setdefault((t_ns, row["camera"]), []).append((u, v, number))
-        except (TypeError, ValueError):
+            rows.setdefault((t_ns, row["camera"]), []).append((u, v, number, sigma))
+        except (TypeError, ValueError, OverflowError):
             raise ConfigError(
-                f"{path}, line {reader.line_num}: invalid values; t_ns must be an integer, u and v pixels"
+                f"{path}, line {reader.line_num}: invalid values; t_ns and frame must be integers, u and v pixels, "
+                "sigma_px above 0"
             ) from None
     return rows
+
+
+def _choose_clock(path: Path, columns: set[str], fps: float | None) -> Callable[[dict[str, str]], int]:
+    """The function that gives the time of a row, from t_ns, or from the number of the frame and the rate.
+
+    Raises:
+        ConfigError: a column is missing, or the rate.
+    """
+    by_frame = "frame" in columns and "t_ns" not in columns
+    if missing := {"camera", "u", "v", "frame" if by_frame else "t_ns"} - columns:
+        raise ConfigError(f"{path} lacks the column {', '.join(sorted(missing))}; it needs t_ns,camera,u,v")
+    if not by_frame:
+        return lambda row: int(row["t_ns"])
+    if fps is None or not 0 < fps < MAX_FPS:
+        raise ConfigError(f"{path} has numbers of frames in place of t_ns; give --fps, frames a second")
+    return lambda row: round(int(row["frame"]) / fps * 1e9)
 
 
 def _message(key: tuple[int, str], points: list, seqs: dict[str, int], size: tuple[int, int]) -> Detections:
     t_ns, camera = key
     seqs[camera] = seqs.get(camera, -1) + 1
     columns = np.array(points)
-    roundels = Roundels.from_points(columns[:, :2], SIGMA_PX, columns[:, 2].astype(np.int32))
+    roundels = Roundels.from_points(columns[:, :2], columns[:, 3], columns[:, 2].astype(np.int32))
     width, height = size
     return Detections.pack(roundels, camera=camera, seq=seqs[camera], t_ns=t_ns, width=width, height=height)

@@ -14,6 +14,7 @@ import cv2
 
 from camera_node.errors import CameraAbsentError, CameraError
 from camera_node.protocol.host_clock import unix_ahead_ns
+from camera_node.sources.address import without_credentials
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import RAW, to_grey
 
@@ -47,7 +48,7 @@ def find_device(text: str, sys: Path = SYS) -> Path:
         raise CameraError(
             f"several cameras have the name '{text}'; give a path: {', '.join(map(str, matching))}"
         )
-    raise CameraAbsentError(f"no folder, video or camera '{text}'; {_present(names)}")
+    raise CameraAbsentError(f"no folder, video or camera '{without_credentials(text)}'; {_present(names)}")
 
 
 def camera_names(sys: Path = SYS) -> dict[Path, str]:

@@ -7,27 +7,25 @@ topic consists of domain, name, type and the type's hash; a liveliness token of 
 
 import hashlib
 import logging
-import queue
 import re
 import struct
 import time
 from collections import Counter
+from collections.abc import Sequence
 
 import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.logs import about
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometry, pose_stamped, transform
-from fusion.client.arena import Arena
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transform
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
 NODE = "roundel"
 NO_HASH = "TypeHashNotSupported"  # in place of the hash in ROS 2 Humble, which has none
 QOS = "::,10:,:,:,,"  # reliable, volatile, the last ten; everything else is rmw_zenoh's default
-QUEUE_SIZE = 2000
-SILENCE_S = 5.0
 MAX_DOMAIN = 232
+NOT_PERMITTED = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Ros2Node:
@@ -50,17 +48,22 @@ class Ros2Node:
         self._robots: dict[str, str] = {}  # name in ROS -> name in the arena
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
-    def publish(self, pose: RobotPose, frame: str) -> None:
-        """Publish `<robot>/pose`, `<robot>/odometry` and `tf`, unless the robot is lost."""
-        name = ros_name(pose.robot)
-        known = self._robots.setdefault(name, pose.robot)
-        if known != pose.robot:
-            self.faults[f"poses of '{pose.robot}', which has the same ROS name as '{known}'"] += 1
-        elif pose.state != "lost":
+    def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
+        """Publish `<robot>/pose`, `<robot>/odometry` and `tf` of the robots that are not lost."""
+        shown = [pose for pose in poses if pose.state != "lost" and self._has_name(pose.robot)]
+        names = [ros_name(pose.robot) for pose in shown]
+        for pose, name, odom in zip(shown, names, odometries(shown, frame, names), strict=True):
             prefix = f"{self._namespace}/{name}".lstrip("/")
             self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped").put(pose_stamped(pose, frame))
-            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odometry(pose, frame, name))
+            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odom)
             self._topic("tf", "tf2_msgs/msg/TFMessage").put(transform(pose, frame, name))
+
+    def _has_name(self, robot: str) -> bool:
+        """Whether no other robot has its name in ROS; counted otherwise."""
+        first = self._robots.setdefault(ros_name(robot), robot)
+        if first != robot:
+            self.faults[f"poses of '{robot}', which has the same ROS name as '{first}'"] += 1
+        return first == robot
 
     def _topic(self, name: str, kind: str) -> "Ros2Topic":
         if name not in self._topics:
@@ -93,46 +96,9 @@ class Ros2Topic:
         self._publisher.put(data, attachment=attachment)
 
 
-class PoseQueue:
-    """The poses of an arena, from Zenoh's thread to that of the bridge.
-
-    Args:
-        client: connected to the arena.
-        faults: counts the poses that are dropped.
-    """
-
-    def __init__(self, client: Arena, faults: Counter[str]) -> None:
-        self._poses: queue.Queue[RobotPose] = queue.Queue(QUEUE_SIZE)
-        self._faults = faults
-        self.close = client.poses().on_message(self._put)
-
-    def publish(self, node: Ros2Node, frame: str, origin: str) -> None:
-        """Publish poses until Ctrl-C; log when none arrive from `origin`, and when they arrive again."""
-        is_silent = False
-        while True:
-            try:
-                pose = self._poses.get(timeout=SILENCE_S)
-            except queue.Empty:
-                if not is_silent:
-                    message = "no pose from %s within %g s; is python -m fusion running there?"
-                    log.warning(message, origin, SILENCE_S)
-                is_silent = True
-                continue
-            if is_silent:
-                log.info("receiving poses again")
-            is_silent = False
-            node.publish(pose, frame)
-
-    def _put(self, pose: RobotPose) -> None:
-        try:
-            self._poses.put_nowait(pose)
-        except queue.Full:
-            self._faults["poses dropped because the bridge is too slow"] += 1
-
-
 def ros_name(robot: str) -> str:
     """The robot's name with the characters that ROS permits: letters, digits and underscores, no digit first."""
-    name = re.sub(r"[^A-Za-z0-9_]", "_", robot)
+    name = NOT_PERMITTED.sub("_", robot)
     return f"robot_{name}" if name[:1].isdigit() else name
 
 

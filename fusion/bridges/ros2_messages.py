@@ -6,11 +6,12 @@ position, then of rotation about the frame's fixed axes; a twist in the frame of
 """
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 
 from camera_node.arrays import Array
-from camera_node.geometry.pose import rotation_from_wxyz, skew
+from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.protocol.messages import RobotPose
 
 # ROS 2 name of a message -> hash of its definition (REP 2016), the same in all releases since Iron
@@ -59,19 +60,30 @@ def pose_stamped(pose: RobotPose, frame: str) -> bytes:
     return cdr.finish()
 
 
-def odometry(pose: RobotPose, frame: str, child: str) -> bytes:
-    """`nav_msgs/msg/Odometry`: the pose in `frame`, the twist in the body's frame `child`, and both covariances."""
-    R = rotation_from_wxyz(pose.quaternion_wxyz)
-    twist = np.array([pose.velocity, pose.angular_velocity]) @ R
-    C = covariance(pose, R, twist)
-    cdr = Cdr()
-    _put_header(cdr, pose, frame)
-    cdr.text(child)
-    _put_pose(cdr, pose)
-    cdr.array(C[:6, :6])
-    cdr.array(twist)
-    cdr.array(C[6:, 6:])
-    return cdr.finish()
+def odometries(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) -> list[bytes]:
+    """`nav_msgs/msg/Odometry` of each pose: the pose in `frame`, the twist in the body's frame, both covariances.
+
+    Args:
+        poses: N poses; arrays of all of them cost little more than those of one.
+        frame: the name of the arena's world.
+        children: the N names of the bodies' frames.
+    """
+    if not poses:
+        return []
+    R = rotations(poses)
+    twist = twists(poses, R)
+    C = covariances(poses, R, twist)
+    messages = []
+    for k, (pose, child) in enumerate(zip(poses, children, strict=True)):
+        cdr = Cdr()
+        _put_header(cdr, pose, frame)
+        cdr.text(child)
+        _put_pose(cdr, pose)
+        cdr.array(C[k, :6, :6])
+        cdr.array(twist[k])
+        cdr.array(C[k, 6:, 6:])
+        messages.append(cdr.finish())
+    return messages
 
 
 def transform(pose: RobotPose, frame: str, child: str) -> bytes:
@@ -82,23 +94,6 @@ def transform(pose: RobotPose, frame: str, child: str) -> bytes:
     cdr.text(child)
     _put_pose(cdr, pose)
     return cdr.finish()
-
-
-def covariance(pose: RobotPose, R: Array, twist: Array) -> Array:
-    """(12, 12) covariance in ROS's order: position, rotation (world), velocity, angular velocity (body's frame).
-
-    With the true rotation R exp(theta), the error of v_body = R^T v is R^T dv + v_body x theta to first order, and that
-    of the angular velocity has the same form.
-
-    Args:
-        pose: the pose with its own covariance.
-        R: (3, 3) its rotation, body to world.
-        twist: (2, 3) its velocity and angular velocity in the body's frame.
-    """
-    J = np.zeros((12, 12))  # columns: rotation (body), position, angular velocity, velocity (world)
-    J[0:3, 3:6], J[3:6, 0:3], J[6:9, 9:12], J[9:12, 6:9] = np.eye(3), R, R.T, R.T
-    J[6:12, 0:3] = skew(twist).reshape(6, 3)
-    return J @ pose.covariance_matrix @ J.T
 
 
 def _put_header(cdr: Cdr, pose: RobotPose, frame: str) -> None:

@@ -145,7 +145,7 @@ class RobotStream(Stream[RobotPose]):
 
 
 class Arena:
-    """A connection to an arena's server. `faults` counts undecodable messages."""
+    """A connection to an arena's server. `faults` counts undecodable messages, by kind."""
 
     def __init__(self, session: zenoh.Session, arena: str, endpoints: str) -> None:
         self.keys = Keys(arena)
@@ -158,6 +158,16 @@ class Arena:
         self._known: set[str] = set()
         poses = session.declare_subscriber(self.keys.robot_pose(), guarded("a pose", self._take_pose))
         self._subscribers: list[Any] = [poses]
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The Zenoh session, for what this class does not offer; it is closed with the arena."""
+        return self._session
+
+    @property
+    def origin(self) -> str:
+        """Where the messages come from, for log lines: "from arena 'demo' at tcp/host:7447"."""
+        return self._origin
 
     @classmethod
     def connect(cls, *endpoints: str, arena: str = "arena", zenoh_config: Path | None = None) -> "Arena":

@@ -17,6 +17,7 @@ from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
     MAX_CHI2,
+    POSITION_GATE,
     START_S,
     START_SIGMAS,
     START_SIGMAS_SINGLE,
@@ -25,7 +26,13 @@ from fusion.tracking.gating import (
 )
 from fusion.tracking.identity.constellation import MIN_MARKERS, Fits, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
-from fusion.tracking.identity.single_markers import Histories, MarkerChoice, choose_markers, history_chi2
+from fusion.tracking.identity.single_markers import (
+    Histories,
+    MarkerChoice,
+    choose_markers,
+    history_chi2,
+    is_local,
+)
 from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
@@ -35,7 +42,8 @@ FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried 
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
 MAX_PAIRS = 200_000
-CONFIRMATIONS = 5  # frame sets in which a poor fit must be at one place
+CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
+MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
@@ -88,6 +96,23 @@ class _Found:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sighting:
+    """Where the last weak fit of a robot was (3,), in which frame set, and how many were at one place so far."""
+
+    p: Array
+    frame_set: int
+    count: int
+
+    @classmethod
+    def after(cls, last: "_Sighting | None", p: Array, frame_set: int) -> "_Sighting":
+        """The next sighting."""
+        if last is None:
+            return cls(p, frame_set, 1)
+        stayed = np.linalg.norm(p - last.p) < SAME_PLACE_M * max(1, frame_set - last.frame_set)
+        return cls(p, frame_set, last.count + 1 if stayed else 1)
+
+
 class Acquisition:
     """Acquires robots of a track table.
 
@@ -100,7 +125,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self._poor: dict[int, tuple[Array, int]] = {}  # by robot, where poor fits were, and how often
+        self._weak: dict[int, _Sighting] = {}  # by robot
         self._frame_sets = 0  # searched so far
 
     def acquire(
@@ -172,7 +197,7 @@ class Acquisition:
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
         found = none
-        for fits in (*identified.fits, *self._confirmed(identified.poor)):
+        for fits in (*identified.fits, *self._confirmed(identified.weak)):
             found = found.joined(fits.select(table.owned[fits.robot]))
         left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
         return found, {k: _reason(table, k, question, identified) for k in left}
@@ -211,17 +236,16 @@ class Acquisition:
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         return find_markers(self._cameras, detections, rows, diameters), crowded
 
-    def _confirmed(self, poor: list[RefinedFits]) -> list[RefinedFits]:
-        """The poor fits that were at one place in `CONFIRMATIONS` successive frame sets."""
-        before, self._poor = self._poor, {}
-        for fits in poor:
+    def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
+        """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""
+        now = self._frame_sets
+        self._weak = {k: seen for k, seen in self._weak.items() if now - seen.frame_set <= MAX_BETWEEN}
+        for fits in weak:
             for robot, p in zip(fits.robot.tolist(), fits.states.p, strict=True):
-                place, count = before.get(robot, (p, 0))
-                stayed = np.linalg.norm(p - place) < SAME_PLACE_M
-                self._poor[robot] = p, count + 1 if stayed else 1
+                self._weak[robot] = _Sighting.after(self._weak.get(robot), p, now)
         return [
-            fits.select(np.array([self._poor[k][1] >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
-            for fits in poor
+            fits.select(np.array([self._weak[k].count >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
+            for fits in weak
         ]
 
     def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
@@ -233,14 +257,17 @@ class Acquisition:
         prediction = estimator.predict(starts.states, np.full(n, START_S))
         states, residuals = estimator.update(prediction, observations, SMALL)
         d2 = misfit(observations, residuals)
-        history = [
-            history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(starts.robot, states.p, strict=True)
-        ]
+        rows = starts.robot.tolist()
+        history = np.array(
+            [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
+        )
+        is_expected = (history < POSITION_GATE) & np.array([is_local(table, k) for k in rows], bool)
         return RefinedFits(
             starts.robot,
             states,
             np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
             mean_by_body(d2, body, n),
+            is_expected,
             starts.assignments.with_residuals(residuals),
             body,
         )

@@ -21,12 +21,13 @@ import numpy as np
 import tyro
 import zenoh
 
+from camera_node.config import example_file
 from camera_node.protocol.messages import CameraStatus, Detections, decode
 from camera_node.simulation.scene import Scene
 from tests.conftest import free_port
 from tests.waiting import wait_for_port
 from tests.web.browser import CHROMIUM, FLAGS
-from web.demo import Demo, default_scene
+from web.demo import Demo
 from web.demo_server import ANY_PORT, start_server
 from web.processes import Processes, interrupt_on_signals
 
@@ -119,7 +120,7 @@ def main(
 
 def play(browser: bool, seconds: float) -> tuple[str, str]:
     """Run the demo once; return its output with the log of its calibration, and the summary of its timestamps."""
-    path, output, port = default_scene(), io.StringIO(), free_port()
+    path, output, port = example_file("demo/scene.yaml"), io.StringIO(), free_port()
     with (
         interrupt_on_signals(),
         tempfile.TemporaryDirectory() as folder,

@@ -18,7 +18,7 @@ from tests.waiting import Inbox, wait_for
 CAMERAS = ("north", "south")
 SERVER_READS = ("clock", "rig", "robots")
 SERVER_CHANGES = ("rig/set", "rig/undo", "rig/redo", "robots/set")
-CAMERA_KEYS = ("detections", "status", "alive", "snapshot", "settings")
+CAMERA_KEYS = ("detections", "status", "alive", "snapshot", "settings", "@preview")
 PUBLISHED = ("markers", "robot/a/pose", "fusion/status", "fusion/shard/2", "fusion/alive", "rig")
 ALL = frozenset(
     {f"camera/{camera}/{key}" for camera in CAMERAS for key in CAMERA_KEYS}
@@ -46,7 +46,7 @@ VIEWER = Rights(query={*SERVER_READS, *SNAPSHOTS}, receive={*ALL})
 OPERATOR = Rights(token={"calib/wand"}, query={*VIEWER.query, *SERVER_CHANGES, *SETTINGS}, receive={*ALL})
 RIGHTS = {
     "camera.north": Rights(
-        put={"camera/north/detections", "camera/north/status"},
+        put={"camera/north/detections", "camera/north/status", "camera/north/@preview"},
         token={"camera/north/alive"},
         query={"clock"},
         answer={"camera/north/snapshot", "camera/north/settings"},
@@ -74,7 +74,9 @@ class Observer:
         everything = f"{ARENA}/**"
         self._entities = (
             session.declare_subscriber(everything, self._receive),
+            session.declare_subscriber(KEYS.preview(), self._receive),  # no wildcard includes a part with @
             session.declare_queryable(everything, self._answer),
+            session.declare_queryable(KEYS.preview(), self._answer),
             session.liveliness().declare_subscriber(f"{EMPTY_ARENA}/**", self._note_token),
         )
 
@@ -184,22 +186,30 @@ def test_a_client_answers_its_own_requests_only(lab: Lab, observer: Observer, na
 def test_a_client_receives_what_its_role_may_receive(lab: Lab, observer: Observer, name: str, mode: str):
     """A shard publishes on every key. A query to the client, or a publication, follows."""
     session, received = open_session(lab, name, mode), Inbox()
-    subscriber = session.declare_subscriber(
-        f"{ARENA}/**", lambda sample: received.put(str(sample.key_expr).removeprefix(f"{ARENA}/"))
-    )
+    subscribers = [
+        session.declare_subscriber(
+            key, lambda sample: received.put(str(sample.key_expr).removeprefix(f"{ARENA}/"))
+        )
+        for key in (f"{ARENA}/**", KEYS.preview())
+    ]
     queryable = session.declare_queryable(
         KEYS.settings("north"), lambda query: received.put("end") or query.drop()
     )
     pass_through(observer, session, "afterwards")
-    for key in (*sorted(ALL), "end"):
-        observer.session.put(f"{ARENA}/{key}", b"\xc1")
+
+    def publish() -> None:
+        for key in (*sorted(ALL), "end"):
+            observer.session.put(f"{ARENA}/{key}", b"\xc1")
+
+    publish()
+    wait_for(lambda: RIGHTS[name].receive <= set(received.items), publish)  # routes may take a moment
     observer.session.get(
         KEYS.settings("north"), lambda _: None, target=zenoh.QueryTarget.ALL, timeout=ANSWER_S
     )
     assert received.until(lambda items: "end" in items)
     assert set(received.items) & ALL == RIGHTS[name].receive
-    subscriber.undeclare()
-    queryable.undeclare()
+    for entity in (*subscribers, queryable):
+        entity.undeclare()
 
 
 @each_client

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, TimeoutError
 
+from camera_node.errors import RoundelError
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot
@@ -17,8 +18,9 @@ from tests.fusion.synthetic import WIDE
 from tests.waiting import wait_for
 from tests.web.browser import browsing, drawing, loopback
 from web.feed import Feed
-from web.marker_picker import MarkerPicker
 from web.subscription import Subscription
+from web.tabs.cameras import CameraTable
+from web.tabs.marker_picker import MarkerPicker
 from web.view import View
 
 
@@ -35,6 +37,7 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
         view = View(subscription.feed, loopback())
         picker = MarkerPicker(view.server, subscription)
         view.add(picker)
+        view.add(CameraTable(view.server.gui))
         with drawing(view):
             yield client, view, picker
         subscription.close()
@@ -99,7 +102,7 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
 def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
     """No marker selected; a marker deselected; one that is not there; two markers only; an invalid name."""
     _, _, picker = arena
-    assert "no marker" in picker.define()
+    refused(picker, "no marker")
     picker._toggle()
     above = marker_positions()[0] + [0.0, 0.0, 2.0]
     wait_for(lambda: picker.selected, lambda: picker.select(above, (0.0, 0.0, -1.0)))
@@ -108,11 +111,16 @@ def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicke
     picker.select(above, (1.0, 0.0, 0.0))
     assert picker.selected == [], "there is no marker in this direction"
     picker.selected = [np.array([0.9, 0.9, 0.1])]
-    assert "0.90, 0.90, 0.10 m" in picker.define()
+    refused(picker, "0.90, 0.90, 0.10 m")
     picker.selected = list(marker_positions()[:2])
-    assert "make no robot" in picker.define()
+    refused(picker, "make no robot")
     picker._name.value = "a/b"
-    assert "'a/b'" in picker.define()
+    refused(picker, "'a/b'")
+
+
+def refused(picker: MarkerPicker, reason: str) -> None:
+    with pytest.raises(RoundelError, match=reason):
+        picker.define()
 
 
 def test_clicks_select_nothing_before_the_button(arena: tuple[Client, View, MarkerPicker]):

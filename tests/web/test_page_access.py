@@ -285,7 +285,11 @@ def test_a_browser_of_each_role(closing: ExitStack):
     with open_as(page, "viewer") as browser:
         browser.get_by_text("Read only").wait_for(timeout=30_000)
         assert "token" not in browser.url
-        browser.get_by_role("button", name="Change the rig").click()
+        button = browser.get_by_role("button", name="Change the rig")
+        assert button.evaluate("b => getComputedStyle(b).pointerEvents") == "none", (
+            "dimmed, out of the mouse's reach"
+        )
+        button.dispatch_event("click")
     with open_as(page, "operator") as browser:
         browser.get_by_role("button", name="Change the rig").click(timeout=30_000)
         assert page.clicks.until(lambda items: items)

@@ -14,10 +14,10 @@ from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
 from web.__main__ import Options, show_recording
-from web.controls import ReplayControls
 from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.tables import tabulate_robots
+from web.tabs.record import ReplayControls
 from web.view import View
 
 HZ, SECONDS = 10, 20

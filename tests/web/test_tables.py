@@ -11,18 +11,19 @@ from camera_node.protocol.messages import CameraStatus
 from fusion.protocol.messages import CameraHealth, FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from web.coverage import CoveragePicture, montage
+from web.colours import css, robot_colour
+from web.coverage_picture import CoveragePicture, montage
 from web.feed import ArenaState, Feed, TimedMessage
+from web.html_tables import TableRow, status_line
+from web.scene.trails import LENGTH, Trails, fade
 from web.tables import (
     STALE_S,
-    TableRow,
     describe_arena,
     describe_server,
     format_sigma,
     tabulate_cameras,
     tabulate_robots,
 )
-from web.trails import LENGTH, Trails, fade
 
 
 def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
@@ -33,8 +34,8 @@ def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
     wait_for(lambda: (x := feed.state()).poses and x.cameras and x.status)
     state = feed.state()
     robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")
-    assert tabulate_robots(state).rows == [TableRow(robot, "ok")]
-    camera = ("north", "30.0", "0.71", "8.0", "0.08", "5.1", "0.02", "2 / 1")
+    assert tabulate_robots(state).rows == [TableRow(robot, "ok", dot=css(robot_colour("rover")))]
+    camera = ("north", "30.0", "0.7", "8.0", "0.08", "5.1", "0.02", "2 / 1")
     assert tabulate_cameras(state).rows == [TableRow(camera, "warn", "too dark")]
 
 
@@ -87,13 +88,13 @@ def test_an_unused_camera_has_a_note():
         == "two nodes use this name"
     )
     assert advice(msgspec.structs.replace(health, excluded=False)) == "too dark"
-    assert advice(health, now=2 * STALE_S) == "offline"
+    assert advice(health, now=2 * STALE_S).startswith("silent for 4 s: check its cable")
 
 
 def test_names_are_escaped():
     """A camera's name cannot add a script to the page."""
     status = {"<script>": TimedMessage(None, -1e9)}
-    html = tabulate_cameras(ArenaState(cameras=status)).html()
+    html = tabulate_cameras(ArenaState(cameras=status)).html() + status_line("bad", "<script>")
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
 
@@ -118,7 +119,7 @@ def test_an_old_pose_has_no_state(arena: LiveArena, feed: Feed):
     state = feed.state()
     state.poses["rover"] = replace(state.poses["rover"], received_s=time.monotonic() - 2 * STALE_S)
     (row,) = tabulate_robots(state).rows
-    assert (row.cells[1], row.level) == ("no data", "bad")
+    assert (row.cells[1:], row.level) == (("no data", "–", "–", "–", "–"), "bad")
 
 
 def test_the_status_line_of_an_empty_arena():

@@ -5,7 +5,7 @@ import re
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import cv2
 import numpy as np
@@ -16,21 +16,23 @@ from camera_node.protocol.messages import encode
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, drawing, loopback
-from web.controls import LiveControls, decode_jpeg
-from web.drawing import cylinder_mesh
 from web.errors import WebError
 from web.feed import Feed
 from web.messages import DemoProgress, progress_key
+from web.page import add_live_page
+from web.scene.robots import cylinder_mesh
+from web.scene.surroundings import default_viewpoint
 from web.subscription import Subscription
-from web.view import View, check_port, default_viewpoint
+from web.tabs.cameras import decode_jpeg
+from web.view import View, check_port
 
 
 @pytest.fixture
 def view(subscription: Subscription) -> Iterator[View]:
     """A view that draws."""
     view = View(subscription.feed, loopback())
-    view.add(LiveControls(view.server, subscription))
-    with drawing(view):
+    with ExitStack() as closing, drawing(view):
+        add_live_page(view, subscription, "tcp/127.0.0.1:1", None, closing)
         yield view
 
 
@@ -65,9 +67,11 @@ def sending(arena: LiveArena) -> Iterator[None]:
 
     thread = threading.Thread(target=run)
     thread.start()
-    yield
-    stop.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
@@ -78,9 +82,19 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     key = arena.keys.snapshot("east")
     camera = arena.session.declare_queryable(key, lambda query: query.reply(key, jpeg))
     with sending(arena):
-        for text in ("rover", "coasting", "north", "30 poses/s", "latency ms: camera 3.0, network 0.2"):
+        page.get_by_text("camera east: an advice").wait_for(timeout=20_000)
+        assert page.get_by_role("status").get_attribute("data-level") == "warn"
+        for text in ("Roundel: test at tcp/127.0.0.1:1", "north", "30.0"):
             page.get_by_text(text).first.wait_for(timeout=20_000)
-    page.get_by_text("too dark").first.wait_for(timeout=20_000)
+        for tab, text in (
+            ("Status", "30 poses/s, latency 7.7 ms"),
+            ("Robots", "coasting"),
+            ("Robots", "rover"),
+        ):
+            page.get_by_role("tab", name=tab).click()
+            page.get_by_text(text).first.wait_for(timeout=20_000)
+    page.get_by_role("tab", name="Cameras").click()
+    page.get_by_text("check its cable").first.wait_for(timeout=20_000)
     tables = "[...document.querySelectorAll('table')].map(t => t.offsetWidth - t.parentElement.clientWidth)"
     assert max(page.evaluate(tables)) <= 0, "a table is wider than the panel"
     page.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === 'east')")
@@ -91,6 +105,7 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
         if "64 x 48" in answer.inner_text():
             break
     page.get_by_text("east, 64 x 48").wait_for(timeout=20_000)
+    page.get_by_role("tab", name="Calibrate").click()
     page.get_by_role("button", name="Undo the last change").click()
     page.get_by_text("no server answers").wait_for(timeout=20_000)
     page.get_by_role("button", name="Show the whole arena").click()

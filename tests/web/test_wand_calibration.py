@@ -20,8 +20,8 @@ from tests.web.arena import LiveArena
 from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
 from web.subscription import Subscription
+from web.tabs.wand_session import CalibrationFiles, WandSessionPanel, calibrate_cameras, describe_calibration
 from web.view import View
-from web.wand_calibration import CalibrationFiles, WandSessionPanel, calibrate_cameras, describe_calibration
 
 ARENA = ring(3)
 CALIBRATION_MS = 120_000  # on a busy machine: two processes start, and one calibrates

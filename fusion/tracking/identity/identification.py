@@ -8,6 +8,10 @@ In a crowd, detections of two markers make a third one, and a false fit may use 
 other robots. So may be the fit of a robot whose markers are not quite as declared: a poor fit is accepted if all
 markers are seen and no good fit contradicts it, in several frame sets.
 
+Three markers of a larger robot are weak evidence: somewhere three of different robots have the distances of a robot
+whose own markers are covered. So are three markers with fewer than `STRONG_DETECTIONS`. Such a fit is accepted at once
+where the robot was last; elsewhere it must win in several frame sets too.
+
 All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
 """
 
@@ -31,6 +35,7 @@ from fusion.tracking.identity.constellation import (
 )
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
+STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
 MAX_RIVALS = (
     3_000  # mappings that compete with those of one robot; with more it waits until others are acquired
@@ -46,6 +51,7 @@ class RefinedFits:
         states: with velocities.
         chi2: (K,) of the detections, and of the position relative to the last one.
         misfit: (K,) mean squared residual of a detection in standard deviations.
+        is_expected: (K,) fits where the robot was last, or starts.
         assignments, body: detections, and the fit of each.
     """
 
@@ -53,6 +59,7 @@ class RefinedFits:
     states: States
     chi2: Array
     misfit: Array
+    is_expected: Mask
     assignments: Assignments
     body: Index
 
@@ -67,6 +74,7 @@ class RefinedFits:
             self.states.select(rows),
             self.chi2[rows],
             self.misfit[rows],
+            self.is_expected[rows],
             self.assignments.select(used),
             number[self.body[used]],
         )
@@ -81,13 +89,13 @@ class Identified:
 
     Attributes:
         fits: one entry for each number of markers.
-        poor: the same of poor fits, which the caller should confirm in several frame sets.
+        weak: the same of poor fits and of weak ones, which the caller should confirm in several frame sets.
         rivals: by robot, the robot of the best rival; the robot itself where it fits in several places.
         turn: row of the first robot whose turn it is in the next frame set.
     """
 
     fits: list[RefinedFits]
-    poor: list[RefinedFits]
+    weak: list[RefinedFits]
     rivals: dict[int, int]
     turn: int
 
@@ -140,7 +148,7 @@ def identify(question: "Question", refine: Refine, usual: float, turn: int) -> I
     for count in range(most, MIN_MARKERS - 1, -1):
         decisions.decide(count, refine)
     decisions.decide_poor()
-    return Identified(decisions.fits, decisions.poor, decisions.rivals, decisions.turn)
+    return Identified(decisions.fits, decisions.weak, decisions.rivals, decisions.turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +169,7 @@ class _Decisions:
         self._accepted, self._open, self._open_good = _Claims(*size), _Claims(*size), _Claims(*size)
         self._poor: list[_Level] = []
         self.fits: list[RefinedFits] = []
-        self.poor: list[RefinedFits] = []
+        self.weak: list[RefinedFits] = []
         self.rivals: dict[int, int] = {}
         self.turn = turn
 
@@ -187,10 +195,8 @@ class _Decisions:
         """Decide about the poor fits, each with all markers of its robot."""
         for level in self._poor:
             mappings = level.fits.mappings
-            sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
-            is_full = np.array(sizes, np.intp) == mappings.points.shape[1]
             is_free = ~self._open_good.touch(mappings) & ~self._accepted.touch(mappings)
-            self.poor.append(level.refined.select(is_full & is_free & level.wins))
+            self.weak.append(level.refined.select(self._has_all(mappings) & is_free & level.wins))
 
     def _compare(self, mappings: Mappings, refine: Refine) -> _Level:
         """Refine mappings and compare those that the detections allow."""
@@ -200,9 +206,23 @@ class _Decisions:
         fits, refined = fits.select(is_plausible), refined.select(is_plausible)
         return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 
+    def _is_evident(self, level: _Level) -> Mask:
+        """(K,) fits with more than three markers, or with all three of a robot and enough detections."""
+        mappings = level.fits.mappings
+        n_detections = np.bincount(level.refined.body, minlength=len(mappings))
+        is_whole = self._has_all(mappings) & (n_detections >= STRONG_DETECTIONS)
+        return is_whole | (mappings.points.shape[1] > MIN_MARKERS)
+
+    def _has_all(self, mappings: Mappings) -> Mask:
+        """(K,) mappings of all markers of a robot."""
+        sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
+        return np.array(sizes, np.intp) == mappings.points.shape[1]
+
     def _accept(self, level: _Level, rows: Mask) -> None:
         self._accepted.add(level.fits.mappings.select(rows))
-        self.fits.append(level.refined.select(rows))
+        is_strong = level.refined.is_expected | self._is_evident(level)
+        self.fits.append(level.refined.select(rows & is_strong))
+        self.weak.append(level.refined.select(rows & ~is_strong))
         is_close = np.abs(level.refined.chi2 - level.best) < DECISIVE_CHI2
         for k in np.flatnonzero(is_close).tolist():
             self.rivals.setdefault(int(level.refined.robot[k]), int(level.rival[k]))

@@ -53,7 +53,7 @@ def choose_markers(
     for row in np.flatnonzero(table.owned[missing]).tolist():
         k, options = int(missing[row]), np.flatnonzero(reach.chosen[row])
         others = np.flatnonzero(reach.chosen[:, options[0]]) if len(options) == 1 else np.empty(0, np.intp)
-        if len(others) == 1 and (_is_local(table, k) or _is_watched(history, options[0])):
+        if len(others) == 1 and (is_local(table, k) or _is_watched(history, options[0])):
             choice.pairs[k] = int(options[0])
         else:
             rivals = [table.names[missing[r]] for r in others if r != row]
@@ -93,7 +93,7 @@ def _is_near(table: TrackTable, k: int, marker: Marker) -> bool:
     return history_chi2(table, k, marker.position, marker.covariance) < POSITION_GATE
 
 
-def _is_local(table: TrackTable, k: int) -> bool:
+def is_local(table: TrackTable, k: int) -> bool:
     """Whether its start or its history says where robot k is."""
     if table.status[k] is None:
         return table.robots[k].start_m is not None

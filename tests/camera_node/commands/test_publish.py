@@ -18,7 +18,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
     [
         (["--source", "99"], "/dev/video99 does not exist"),
         (["--source", "nowhere"], "no folder, video or camera 'nowhere'"),
-        (["--source", "sim"], "--scene FILE"),
+        (["--source", "sim"], "cam0"),
         (["--source", "FRAMES", "--name", "a/b"], "'a/b' can't name a camera"),
         (["--source", "FRAMES", "--arena", "*"], "'*' can't name an arena"),
         (["--source", "FRAMES", "--connect", "server"], "tcp/host:7447"),

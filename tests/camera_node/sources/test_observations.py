@@ -51,6 +51,8 @@ def test_observations_are_read_as_they_were_written(tmp_path: Path):
         ("t_ns,camera,u,v,marker\n1,a,2,3,x\n", "line 2"),
         ("t_ns,camera,u,v,marker\n1,a,2,3,99999999999\n", "line 2"),
         ("t_ns,camera,u,v\n99999999999999999999,a,2,3\n", "line 2"),
+        ("t_ns,camera,u,v,sigma_px\n1,a,2,3,0\n", "line 2"),
+        ("frame,camera,u,v\n1,a,2,3\n", "give --fps"),
     ],
 )
 def test_an_error_names_the_file_and_the_line(tmp_path: Path, text: str, says: str):
@@ -59,6 +61,18 @@ def test_an_error_names_the_file_and_the_line(tmp_path: Path, text: str, says: s
     with pytest.raises(ConfigError, match=says) as caught:
         read_observations(path)
     assert str(path) in str(caught.value)
+
+
+def test_numbers_of_frames_and_standard_deviations_are_read(tmp_path: Path):
+    (tmp_path / "o.csv").write_text("frame,camera,u,v,sigma_px\n30,a,2,3,0.5\n30,a,4,5,\n60,a,2,3,2\n")
+    messages = read_observations(tmp_path / "o.csv", fps=30.0)
+    assert [m.t_ns for m in messages] == [1_000_000_000, 2_000_000_000]
+    np.testing.assert_allclose(
+        messages[0].unpack().cov[:, [0, 1], [0, 1]], [[0.25, 0.25], [0.09, 0.09]], rtol=1e-6
+    )
+    (tmp_path / "o.csv").write_text("frame,camera,u,v\n0,a,2,3\nnan,a,2,3\n")
+    with pytest.raises(ConfigError, match="line 3"):
+        read_observations(tmp_path / "o.csv", fps=30.0)
 
 
 def test_files_that_can_not_be_read_or_written_are_refused(tmp_path: Path):

@@ -20,8 +20,9 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
+from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.bridges.ros2 import Ros2Node, ros_name
-from fusion.bridges.ros2_messages import TYPE_HASHES, covariance, odometry, pose_stamped, transform
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transform
 from fusion.client.arena import Arena
 from fusion.commands.ros2 import ros2
 from fusion.protocol.messages import RobotPose
@@ -64,7 +65,7 @@ def test_type_hashes_are_those_of_ros(kind):
     ("kind", "write"),
     [
         ("geometry_msgs/msg/PoseStamped", lambda frame: pose_stamped(POSE, frame)),
-        ("nav_msgs/msg/Odometry", lambda frame: odometry(POSE, frame, "rover")),
+        ("nav_msgs/msg/Odometry", lambda frame: odometries([POSE], frame, ["rover"])[0]),
         ("tf2_msgs/msg/TFMessage", lambda frame: transform(POSE, frame, "rover")),
     ],
 )
@@ -75,7 +76,7 @@ def test_bytes_are_those_of_ros(kind, write, frame):
 
 def test_messages_have_the_values_of_the_pose():
     stamped = read(pose_stamped(POSE, "world"), "geometry_msgs/msg/PoseStamped")
-    odom = read(odometry(POSE, "world", "rover"), "nav_msgs/msg/Odometry")
+    odom = read(odometries([POSE], "world", ["rover"])[0], "nav_msgs/msg/Odometry")
     (tf,) = read(transform(POSE, "world", "rover"), "tf2_msgs/msg/TFMessage").transforms
     for message in (stamped, odom, tf):
         stamp = message.header.stamp
@@ -96,8 +97,8 @@ def test_messages_have_the_values_of_the_pose():
 
 
 def ros_covariance() -> np.ndarray:
-    R = rotation_from_wxyz(POSE.quaternion_wxyz)
-    return covariance(POSE, R, np.array([R.T @ POSE.velocity, R.T @ POSE.angular_velocity]))
+    R = rotations([POSE])
+    return covariances([POSE], R, twists([POSE], R))[0]
 
 
 def test_covariance_is_that_of_sampled_poses():
@@ -220,8 +221,7 @@ def test_robots_with_equal_ros_names_are_counted():
     ]
     with routing() as (session, _):
         node = Ros2Node(session)
-        for name in ("rover-2", "rover_2", "rover_2"):
-            node.publish(draw_pose(name), "world")
+        node.publish([draw_pose(name) for name in ("rover-2", "rover_2", "rover_2")], "world")
         assert node.faults == {"poses of 'rover_2', which has the same ROS name as 'rover-2'": 2}
 
 

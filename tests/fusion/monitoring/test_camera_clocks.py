@@ -72,7 +72,8 @@ def test_a_clock_that_drifts_is_reported_before_it_harms():
 
 
 @pytest.mark.parametrize(
-    ("ppm", "reported_s", "duration_s"), [(200.0, 12.0, 20.0), (-200.0, 12.0, 20.0), (50.0, 25.0, 30.0)]
+    ("ppm", "reported_s", "duration_s"),
+    [(200.0, 12.0, 16.0), (-200.0, 12.0, 16.0), pytest.param(50.0, 30.0, 36.0, marks=pytest.mark.slow)],
 )
 def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, duration_s: float):
     """Before: 200 ppm after 23 to 30 s, 50 ppm never. Windows of 2 s show the offset with a sigma of about 0.1 ms."""

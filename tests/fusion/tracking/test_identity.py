@@ -20,9 +20,10 @@ from fusion.tracking.identity import identification
 from fusion.tracking.identity.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
 from fusion.tracking.multiview import find_markers
 from fusion.tracking.tracker import Tracker
+from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.fusion_accuracy import accuracy, frame_sets
 from tests.benchmarks.fusion_grouping import cold_grouping
-from tests.benchmarks.fusion_load import DIAMETER_M, START_NS, Load
+from tests.benchmarks.fusion_load import DIAMETER_M, START_NS, Load, Scene
 from tests.benchmarks.fusion_swaps import WRONG_M, identity
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line, ring
 from tests.fusion.tracks import errors, track
@@ -143,6 +144,25 @@ def test_two_hundred_robots_are_acquired_at_once():
         tracked.append(int(rows.sum()))
     assert tracked[1] > 100
     assert tracked[-1] == 200
+
+
+def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
+    """Ten robots before four cameras, a third of whose frames are missing. Markers of different robots, seen by two
+    cameras, have the distances of a robot in one of a hundred of these acquisitions. Most robots are acquired at once:
+    in a frame set with all four markers."""
+    load, acquired = small_load(), 0
+    scene, rng = Scene(load), np.random.default_rng(1)
+    for start in rng.integers(0, 3000, 60).tolist():
+        tracker = Tracker(load.rig, load.bodies)
+        for seq in range(start, start + 4):
+            seen = np.flatnonzero(rng.random(load.cameras) > 0.35).tolist()
+            messages = [scene.detect(k, seq, (seq + load.phases()[k]) / load.hz, rng) for k in seen]
+            frames = tuple(CalibratedFrame.of(m, load.rig[m.camera]) for m in messages)
+            tracker.track(FrameSet(START_NS + round(seq / load.hz * 1e9), frames))
+            off = np.linalg.norm(tracker.table.states.p - load.paths.at(seq / load.hz).p, axis=1)
+            assert (off[tracker.table.tracked] < WRONG_M).all()
+        acquired += int(tracker.table.tracked.sum())
+    assert acquired > 0.5 * 60 * load.robots
 
 
 @pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_BODIES", "MAX_PAIRS"])

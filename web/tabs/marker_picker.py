@@ -7,14 +7,14 @@ from numpy.typing import ArrayLike
 
 from camera_node.arrays import Array
 from camera_node.config import require_name
-from camera_node.errors import RoundelError
 from fusion.client.define import describe
 from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
-from web.drawing import SELECTED
+from web.colours import SELECTED
+from web.condition import next_step
 from web.feed import ArenaState
-from web.panel import escape_markdown, set_content
 from web.subscription import Subscription
+from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_property
 
 MAX_ANGLE_RAD = 0.03  # between the ray of a click and the direction of the selected marker
 MARKERS_S = 1.0  # age up to which the latest markers can be selected
@@ -32,12 +32,18 @@ class MarkerPicker:
         self._unlabeled = np.empty((0, 3))  # current positions of unlabeled markers that several cameras see
         self._active = False
         with server.gui.add_folder("New robot"):
-            self._button = server.gui.add_button(SELECT)
+            self._button = server.gui.add_button(SELECT, color=GREY)
             self._name = server.gui.add_text("Name", "robot")
             self._diameter = server.gui.add_number("Black disc, mm", 120.0, min=1.0, max=10_000.0, step=0.1)
             self._motion = server.gui.add_dropdown("Motion", ("aerial", "ground"))
-            define = server.gui.add_button("Define robot")
-            self._answer = server.gui.add_markdown("")
+            self._answer = Answer(server.gui)
+            self._define = ActionButton(
+                server.gui,
+                "Define robot",
+                self.define,
+                self._answer,
+                "measures the selected markers for 1.5 s",
+            )
         self._cloud = server.scene.add_point_cloud(
             "/selected",
             np.zeros((1, 3), np.float32),
@@ -47,7 +53,6 @@ class MarkerPicker:
             visible=False,
         )
         self._button.on_click(lambda _: self._toggle())
-        define.on_click(lambda _: set_content(self._answer, escape_markdown(self.define())))
         server.scene.on_click()(lambda click: self.select(click.ray_origin, click.ray_direction))
 
     def update(self, state: ArenaState) -> None:
@@ -55,6 +60,10 @@ class MarkerPicker:
         timed = state.markers
         if timed is not None and state.age_s(timed) < MARKERS_S:
             self._unlabeled = timed.message.positions()[timed.message.unlabeled()]
+        is_next = next_step(state) == "robots"
+        set_property(self._button, "color", PRIMARY if is_next and not self.selected else GREY)
+        set_property(self._button, "disabled", not self._active and not len(self._unlabeled))
+        self._define.show(enabled=bool(self.selected), primary=bool(self.selected))
         self._cloud.visible = bool(self.selected)
         if self.selected:
             self._cloud.points = np.array(self.selected, np.float32)
@@ -74,18 +83,19 @@ class MarkerPicker:
         )
 
     def define(self) -> str:
-        """Measure the selected markers and have the server track the robot; return the outcome as text."""
+        """Measure the selected markers and have the server track the robot; return the outcome as text.
+
+        Raises:
+            RoundelError: the name can't be one or is in use, a marker moves, or the server does not answer.
+        """
         name = self._name.value
-        try:
-            require_name(name, "a robot")
-            if not self.selected:
-                raise FusionError("no marker is selected")
-            measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
-            standing = _match_selected(measured, np.array(self.selected))
-            robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
-            robots = self._subscription.define(name, robot)
-        except RoundelError as error:
-            return str(error)
+        require_name(name, "a robot")
+        if not self.selected:
+            raise FusionError("no marker is selected")
+        measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
+        standing = _match_selected(measured, np.array(self.selected))
+        robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
+        robots = self._subscription.define(name, robot)
         self.selected = []
         return describe(name, robots)
 
@@ -97,7 +107,7 @@ class MarkerPicker:
         )
 
     def _answer_with(self, text: str) -> None:
-        set_content(self._answer, escape_markdown(text))
+        self._answer.show(text)
 
 
 def _match_selected(measured: StationaryMarkers, selected: Array) -> StationaryMarkers:

@@ -26,6 +26,10 @@ class Trails:
         else:
             points[:-1], points[-1] = points[1:].copy(), new
 
+    def remove(self, robot: str) -> None:
+        """Forget a robot."""
+        self._points.pop(robot, None)
+
     def segments(self, robots: list[str]) -> NDArray[np.float32]:
         """Return the trails of robots that were added: (len(robots) * (LENGTH - 1), 2, 3), the oldest first."""
         lines = [np.stack([p[:-1], p[1:]], axis=1) for p in (self._points[robot] for robot in robots)]

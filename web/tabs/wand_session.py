@@ -10,6 +10,8 @@ from typing import Any
 
 import viser
 
+from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
+from calib.live.camera_sizes import running_camera_sizes
 from calib.live.rig_requests import set_rig
 from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
@@ -17,13 +19,21 @@ from calib.rig.rig import load_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
 from camera_node.geometry.body import Body
+from web.condition import next_step
 from web.errors import WebError
-from web.panel import escape_markdown, set_content
+from web.feed import ArenaState
+from web.html_tables import Column, HtmlTable, TableRow
 from web.subscription import Subscription
-from web.tables import HtmlTable, TableRow
+from web.widgets import GREY, PRIMARY, Answer, set_content, set_property
 
 SOLVE_S = 600.0  # limit for `calib wand`
 CLOSE_S = 5.0  # for the recording to be saved when the page closes
+WAND_COLUMNS = (
+    Column("camera"),
+    Column("frames", "", "frames in which the camera saw the wand"),
+    Column("image", "", "part of the image in which roundels were seen"),
+    Column("shared", "", "part of the image area shared with other cameras in which the wand was used"),
+)
 START, END = "Start wand session", "End wand session"
 
 
@@ -36,12 +46,12 @@ class CalibrationFiles:
 
     def check(self) -> None:
         """Raise ConfigError or CalibrationError if a file is missing or invalid."""
-        load_rig(self.rig)
+        load_known_lenses(self.rig)
         load_yaml(self.wand, Body)
 
 
 class WandSessionPanel:
-    """The panel's folder "Calibration": records a wand session, then calibrates the cameras from it."""
+    """The panel's folder "Wand": records a wand session, then calibrates the cameras from it."""
 
     def __init__(
         self, server: viser.ViserServer, subscription: Subscription, files: CalibrationFiles
@@ -50,11 +60,19 @@ class WandSessionPanel:
         self._lock, self._end_requested = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._closed = False
-        with server.gui.add_folder("Calibration"):
-            self._button = server.gui.add_button(START)
-            self._answer = server.gui.add_markdown("")
+        with server.gui.add_folder("Wand"):
+            self._button = server.gui.add_button(START, color=GREY)
+            self._answer = Answer(server.gui)
             self._cameras = server.gui.add_html("")
         self._button.on_click(lambda _: self.toggle())
+
+    def update(self, state: ArenaState) -> None:
+        """Enable the button while cameras send, and colour it while it is the next step."""
+        step = next_step(state)
+        is_running = self._thread is not None and self._thread.is_alive()
+        set_property(self._button, "color", PRIMARY if step == "calibrate" or is_running else GREY)
+        if not is_running:
+            set_property(self._button, "disabled", step == "cameras")
 
     def toggle(self) -> None:
         """Start a wand session, or end the current one."""
@@ -87,7 +105,8 @@ class WandSessionPanel:
 
     def _calibrate(self) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
-        rig, wand = load_rig(files.rig), load_yaml(files.wand, Body)
+        wand = load_yaml(files.wand, Body)
+        rig, _ = with_nominal_lenses(load_known_lenses(files.rig), running_camera_sizes(session, arena))
         settings = WandSession(rig=rig, wand=wand)
         collected, reason = run_wand_session(session, arena, settings, self._show, self._end_requested)
         self._button.disabled = True
@@ -107,12 +126,12 @@ class WandSessionPanel:
 
     def _show(self, progress: SessionProgress) -> None:
         rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]
-        table = HtmlTable(("camera", "frames", "image", "shared part"), rows, "no roundel yet")
+        table = HtmlTable(WAND_COLUMNS, rows, "no roundel yet")
         set_content(self._cameras, table.html())
         self._answer_with(f"{progress.summary}: {progress.advice}")
 
     def _answer_with(self, text: str) -> None:
-        set_content(self._answer, escape_markdown(text))
+        self._answer.show(text)
 
 
 def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`calib import` and `calib export`: recordings and rigs from and to other programs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from calib.commands.output import provenance, write_rig
+from calib.errors import CalibrationError
+from calib.formats.data import PixelOrigin, PointTable
+from calib.formats.registry import FORMATS, Format
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, load_rig
+from camera_node.errors import ConfigError
+from camera_node.terminal import say
+
+FormatName = Literal[
+    "argus", "easywand", "dltdv", "multicamselfcal", "caliscope", "opencv", "kalibr", "colmap"
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Conversion:
+    """The options of both directions."""
+
+    format: FormatName
+    """The other program."""
+    out: Path
+    """The folder for the files, which is made if it does not exist."""
+    first_pixel: Literal[0, 1] | None = None
+    """What the other program calls the first pixel; by default as the format says."""
+    y_up: bool | None = None
+    """Whether it counts rows from the lowest one; by default as the format says."""
+
+    def origin(self, of: Format) -> PixelOrigin:
+        """The pixel origin: that of the format, with the options that are given."""
+        first = of.origin.first if self.first_pixel is None else self.first_pixel
+        return PixelOrigin(first, of.origin.y_up if self.y_up is None else self.y_up)
+
+    def make_folder(self) -> None:
+        """Make the folder `out`.
+
+        Raises:
+            ConfigError: it can't be made.
+        """
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{self.out} can't be made: {error.strerror}; give --out a folder") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportData(_Conversion):
+    """Convert cameras and points of another program to rig.yaml and observations.csv."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Its files; of MultiCamSelfCal the folder."""
+
+    def execute(self) -> None:
+        """Read all files, then write; nothing is written if one of them is not usable."""
+        chosen = FORMATS[self.format]
+        if chosen.read is None:
+            raise ConfigError(f"--format {self.format} can only be exported")
+        if not self.files:
+            raise ConfigError("give the files to import")
+        data = chosen.read(self.files, self.origin(chosen))
+        if not data.cameras and data.points is None:
+            raise CalibrationError("the files have neither cameras nor points")
+        rig = make_rig(data.cameras) if data.cameras else None
+        self.make_folder()
+        if rig is not None:
+            write_rig(rig, self.out / "rig.yaml")
+            say(f"{len(rig.cameras)} cameras, {len(rig.placed())} with poses: {', '.join(rig.cameras)}")
+        if data.points is not None:
+            self._write_points(data.points)
+        for remark in data.remarks:
+            say(remark)
+
+    def _write_points(self, points: PointTable) -> None:
+        path = self.out / "observations.csv"
+        points.write(path)
+        markers, cameras = int(points.marker.max()) + 1, len(set(points.camera))
+        frames = len(set(points.frame.tolist()))
+        say(f"wrote {path}: {len(points)} points, {markers} markers, {cameras} cameras, {frames} frames")
+        clock = "--synchronised --fps RATE" if points.t_s is None else ""
+        say(
+            f"next: python -m calib wand --rig {self.out / 'rig.yaml'} --observations {path} {clock} --wand WAND.yaml "
+            "--out CALIBRATED.yaml"
+        )
+
+
+def make_rig(cameras: dict[str, Camera]) -> Rig:
+    """The rig of imported cameras.
+
+    Raises:
+        CalibrationError: a value or a name is not plausible.
+    """
+    try:
+        return Rig(cameras=cameras, calibration=provenance())
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRig(_Conversion):
+    """Convert a rig to the files of another program."""
+
+    rig: Path
+    """The rig."""
+
+    def execute(self) -> None:
+        """Write the files and print their names."""
+        chosen, rig = FORMATS[self.format], load_rig(self.rig)
+        self.make_folder()
+        for name in chosen.write(rig, self.out, self.origin(chosen)):
+            say(f"wrote {self.out / name}")

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the formats of other programs contain: cameras, and points that these cameras saw in numbered frames."""
+
+import csv
+import io
+import os
+import stat
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calib.errors import CalibrationError
+from calib.rig.camera import Camera
+from camera_node.arrays import Array, Index
+from camera_node.config import write_atomically
+from camera_node.errors import ConfigError
+
+MAX_FILE_BYTES = 1 << 28  # of a table of points: an hour of 16 cameras at 60 Hz takes a fifth of it
+
+
+@dataclass(frozen=True, slots=True)
+class PixelOrigin:
+    """Where a format counts pixels from.
+
+    Attributes:
+        first: the coordinates of the centre of the corner pixel, 0 or 1.
+        y_up: whether y is counted from the lowest row upwards.
+    """
+
+    first: int
+    y_up: bool = False
+
+    def read(self, uv: Array, height: int | None = None) -> Array:
+        """(n, 2) pixels with the centre of the top-left pixel at (0, 0), from pixels of this convention.
+
+        Raises:
+            CalibrationError: y is counted upwards, and no height is given.
+        """
+        return self._flip(np.asarray(uv, float) - self.first, height)
+
+    def write(self, uv: Array, height: int | None = None) -> Array:
+        """(n, 2) pixels of this convention, from pixels with the centre of the top-left pixel at (0, 0)."""
+        return self._flip(np.asarray(uv, float), height) + self.first
+
+    def _flip(self, uv: Array, height: int | None) -> Array:
+        if not self.y_up:
+            return uv
+        if height is None:
+            raise CalibrationError(
+                "y is counted from the lowest row, so the height of the images is needed: give the camera profile too"
+            )
+        return np.column_stack([uv[:, 0], height - 1 - uv[:, 1]])
+
+
+@dataclass(frozen=True, slots=True)
+class PointTable:
+    """Points, one row each.
+
+    Attributes:
+        camera: (n,) names of the cameras.
+        frame: (n,) numbers of the frames; frames of equal number are simultaneous unless `t_s` says otherwise.
+        marker: (n,) numbers of the points, from 0.
+        uv: (n, 2) raw pixels, the centre of the top-left pixel is (0, 0).
+        t_s: (n,) time of each frame, seconds; None if the format has none.
+    """
+
+    camera: list[str]
+    frame: Index
+    marker: Index
+    uv: Array
+    t_s: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def write(self, path: Path) -> None:
+        """Write `observations.csv`, with times or with numbers of frames.
+
+        Raises:
+            ConfigError: the file can't be written.
+        """
+        when = (
+            self.frame
+            if self.t_s is None
+            else np.round((self.t_s - min(self.t_s.min(), 0)) * 1e9).astype(np.int64)
+        )
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["frame" if self.t_s is None else "t_ns", "camera", "u", "v", "marker"])
+        for t, camera, (u, v), marker in zip(
+            when.tolist(), self.camera, self.uv, self.marker.tolist(), strict=True
+        ):
+            writer.writerow([t, camera, f"{u:.4f}", f"{v:.4f}", marker])
+        write_atomically(path, text.getvalue())
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignData:
+    """What was read from files of another program: cameras by name, points, and remarks for the user."""
+
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    points: PointTable | None = None
+    remarks: tuple[str, ...] = ()
+
+
+def make_camera(width: float, height: float, **values) -> Camera:
+    """A camera of the given image size, pixels, and other fields.
+
+    Raises:
+        CalibrationError: a value is impossible.
+    """
+    try:
+        camera = Camera(width=int(width), height=int(height), **values)
+        msgspec.convert(msgspec.to_builtins(camera), Camera)  # the types too
+    except (ValueError, TypeError, OverflowError) as error:
+        raise CalibrationError(str(error)) from None
+    return camera
+
+
+def read_text(path: Path) -> str:
+    """The text of a regular file of limited size.
+
+    Raises:
+        ConfigError: it is missing, too large, or not text.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{path} is not a regular file")
+            data = file.read(MAX_FILE_BYTES + 1)
+        if len(data) > MAX_FILE_BYTES:
+            raise ConfigError(f"{path} has more than {MAX_FILE_BYTES} bytes; is it the right file?")
+        return data.decode("utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is not a text file; check the path and --format") from None
+
+
+def read_numbers(path: Path, separators: str = ",;\t") -> list[list[float]]:
+    """The rows of numbers of a text file; `nan` is a number, lines that start with # or % are comments.
+
+    Raises:
+        ConfigError: the file can't be read, or a line has something else than numbers.
+    """
+    rows, table = [], str.maketrans(dict.fromkeys(separators, " "))
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.translate(table).split()
+        if not words or words[0].startswith(("#", "%")):
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            raise ConfigError(f"{path}, line {number}: '{line[:60]}' is not a row of numbers") from None
+    return rows

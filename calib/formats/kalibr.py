@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Kalibr's `camchain.yaml` (https://github.com/ethz-asl/kalibr/wiki/yaml-formats).
+
+cam0, cam1, ...: camera_model pinhole with intrinsics fu, fv, pu, pv; distortion_model radtan (OpenCV's k1, k2, p1, p2),
+equidistant (OpenCV's fisheye) or none; resolution; T_cn_cnm1, which takes points from the camera before into this one;
+timeshift_cam_imu in seconds: t_imu = t_cam + shift. The first camera is the world.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from calib.errors import CalibrationError
+from calib.formats.data import ForeignData, PixelOrigin, make_camera
+from calib.formats.lens_models import with_coefficients
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig
+from camera_node.arrays import Array
+from camera_node.config import write_atomically
+from camera_node.errors import ConfigError
+from camera_node.geometry.pose import Pose, invert
+from camera_node.yaml_file import read_yaml
+
+FROM_ZERO = PixelOrigin(0)
+MODELS = {"radtan": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
+COEFFICIENTS = 4
+ROTATION_TOLERANCE = 1e-3  # of R^T R from I
+
+
+def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
+    """Read one camchain. A camera has the name of its topic's first part, such as left of /left/image_raw, if these
+    differ; else cam0, cam1, ...
+
+    Raises:
+        ConfigError, CalibrationError: the file is not a camchain of pinhole cameras.
+    """
+    if len(paths) != 1:
+        raise ConfigError("give one camchain.yaml")
+    data = read_yaml(paths[0])
+    entries = (
+        [data[f"cam{k}"] for k in range(len(data)) if f"cam{k}" in data] if isinstance(data, Mapping) else []
+    )
+    if not entries or not all(isinstance(entry, Mapping) for entry in entries):
+        raise ConfigError(f"{paths[0]} has no cameras cam0, cam1, ...; is it a camchain of Kalibr?")
+    T, first_shift, cameras, chained = np.eye(4), None, {}, True
+    for k, entry in enumerate(entries):
+        where = f"{paths[0]}: cam{k}"
+        if k and "T_cn_cnm1" in entry:
+            T = T @ invert(_motion(where, entry["T_cn_cnm1"]))
+        chained &= k == 0 or "T_cn_cnm1" in entry
+        shift = _number(where, entry.get("timeshift_cam_imu", 0.0))
+        first_shift = shift if first_shift is None else first_shift
+        pose = Pose.from_matrix(T) if chained and len(entries) > 1 else None
+        cameras[f"cam{k}"] = _build(where, entry, origin, pose, 1e3 * (shift - first_shift))
+    return ForeignData(_rename(cameras, entries))
+
+
+def _number(where: str, value: Any) -> float:
+    if not isinstance(value, int | float):
+        raise ConfigError(f"{where}: timeshift_cam_imu is not a number")
+    return float(value)
+
+
+def _motion(where: str, rows: Any) -> Array:
+    try:
+        T = np.asarray(rows, float).reshape(4, 4)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{where}: T_cn_cnm1 is not a matrix of 4 x 4 numbers") from None
+    if not np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < ROTATION_TOLERANCE:
+        raise ConfigError(f"{where}: T_cn_cnm1 has no rotation")
+    return T
+
+
+def _build(
+    where: str, entry: Mapping[str, Any], origin: PixelOrigin, pose: Pose | None, offset_ms: float
+) -> Camera:
+    distortion_model = str(entry.get("distortion_model", "none"))
+    if entry.get("camera_model") != "pinhole" or distortion_model not in MODELS:
+        raise ConfigError(
+            f"{where}: camera_model '{entry.get('camera_model')}' with distortion_model '{distortion_model}' can't be "
+            "imported; pinhole with radtan, equidistant or none can"
+        )
+    try:
+        fx, fy, cx, cy = (float(x) for x in entry["intrinsics"])
+        width, height = (float(x) for x in entry["resolution"])
+        distortion = tuple(float(x) for x in entry.get("distortion_coeffs") or ())
+    except (KeyError, TypeError, ValueError):
+        raise ConfigError(f"{where}: intrinsics needs 4 numbers, resolution 2, distortion_coeffs 4") from None
+    (cx, cy), lens = origin.read(np.array([[cx, cy]]))[0], {"fx": fx, "fy": fy}
+    return make_camera(
+        width=width,
+        height=height,
+        **lens,
+        cx=float(cx),
+        cy=float(cy),
+        distortion=distortion if distortion_model != "none" else (),
+        model=MODELS[distortion_model],
+        T_world_cam=pose,
+        time_offset_ms=offset_ms,
+    )
+
+
+def _rename(cameras: Mapping[str, Camera], entries: Sequence[Mapping[str, Any]]) -> dict[str, Camera]:
+    topics = [str(entry.get("rostopic", "")).strip("/").split("/")[0] for entry in entries]
+    usable = len(set(topics)) == len(topics) and all(topic.isidentifier() for topic in topics)
+    return dict(zip(topics if usable else cameras, cameras.values(), strict=True))
+
+
+def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
+    """Write `camchain.yaml`; return its name.
+
+    Raises:
+        CalibrationError: a lens can't be expressed with k1, k2, p1, p2, or the pixel origin is not OpenCV's.
+    """
+    if origin != FROM_ZERO:
+        raise CalibrationError(
+            "Kalibr counts pixels from 0 at the top left; leave out --first-pixel and --y-up"
+        )
+    chain, before = {}, None
+    placed = len(rig.placed()) == len(rig.cameras)
+    for k, (name, camera) in enumerate(rig.cameras.items()):
+        lens = with_coefficients(name, camera, COEFFICIENTS)[0]
+        entry: dict[str, Any] = {"camera_model": "pinhole", "intrinsics": lens.parameters[:4].tolist()}
+        entry["distortion_model"] = "equidistant" if camera.model == "fisheye" else "radtan"
+        entry |= {"distortion_coeffs": list(lens.distortion), "resolution": [camera.width, camera.height]}
+        entry |= {"rostopic": f"/{name}/image_raw", "timeshift_cam_imu": 1e-3 * camera.time_offset_ms}
+        if placed and before is not None:
+            entry["T_cn_cnm1"] = (invert(camera.matrix()) @ before.matrix()).tolist()
+        chain[f"cam{k}"], before = entry, camera
+    write_atomically(
+        folder / "camchain.yaml", yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+    )
+    return ["camchain.yaml"]

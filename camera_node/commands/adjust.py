@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`camera_node snapshot` and `camera_node settings`: the image and the settings of a camera that runs."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import tyro
+from zenoh import Session
+
+from camera_node.config import require_name
+from camera_node.errors import ConfigError
+from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings, request_snapshot
+from camera_node.protocol.messages import Settings
+from camera_node.protocol.session import open_requester
+from camera_node.terminal import say
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConnection:
+    """Where a camera is reached."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+
+    def open(self) -> Session:
+        """Open a session for requests; raises as `open_requester`."""
+        require_name(self.arena, "an arena")
+        return open_requester(self.connect, self.zenoh)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SaveSnapshot:
+    """Save the current image of a camera that runs, as the page shows it."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """The camera's name."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The JPEG file to write; an existing file is replaced."""
+    draw: bool = False
+    """Draw the detected roundels."""
+    server: Annotated[CameraConnection, tyro.conf.OmitArgPrefixes] = field(default_factory=CameraConnection)
+
+    def run(self) -> None:
+        """Save the image. Raises NetworkError if the camera does not answer, ConfigError for a bad file name."""
+        require_name(self.name, "a camera")
+        with self.server.open() as session:
+            data = request_snapshot(session, self.server.arena, self.name, self.draw)
+        try:
+            self.out.write_bytes(data)
+        except OSError as error:
+            raise ConfigError(
+                f"{self.out} can't be written: {error.strerror}; does its folder exist?"
+            ) from None
+        say(f"wrote {self.out}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeSettings:
+    """Show the settings of a camera that runs, after changing those that are given."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """The camera's name."""
+    exposure_us: float | None = None
+    """Exposure time, microseconds; turns automatic exposure off."""
+    gain: float | None = None
+    """In the driver's units."""
+    min_contrast: float | None = None
+    """Least contrast of a roundel, grey levels."""
+    mask_detected: bool = False
+    """Ignore the places where roundels are detected now: reflections, while no real roundel is in view."""
+    clear_mask: bool = False
+    """Ignore no place."""
+    server: Annotated[CameraConnection, tyro.conf.OmitArgPrefixes] = field(default_factory=CameraConnection)
+
+    def run(self) -> None:
+        """Change the settings and print those in use. Raises NetworkError, RequestError or ConfigError."""
+        require_name(self.name, "a camera")
+        if self.mask_detected and self.clear_mask:
+            raise ConfigError("--mask-detected and --clear-mask exclude each other")
+        with self.server.open() as session:
+            arena = self.server.arena
+            used = request_settings(session, arena, self.name)
+            mask = () if self.clear_mask else None
+            if self.mask_detected:
+                mask = (*(used.mask or ()), *mask_of(next_detections(session, arena, self.name)))
+            wanted = Settings(
+                exposure_us=self.exposure_us, gain=self.gain, min_contrast=self.min_contrast, mask=mask
+            )
+            if wanted != Settings():
+                used = request_settings(session, arena, self.name, wanted)
+        for name, value in msgspec.structs.asdict(used).items():
+            if name not in ("version", "mask"):
+                say(f"{name}: {'-' if value is None else value}")
+        say(f"mask: {len(used.mask or ())} polygons")

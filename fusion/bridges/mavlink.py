@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One robot's poses to an autopilot (PX4, ArduPilot) over MAVLink 2 and UDP: ODOMETRY or VISION_POSITION_ESTIMATE.
+
+The autopilot asks for our time by TIMESYNC; the answer is the server's time, in which the poses are stamped.
+"""
+
+import re
+import select
+import socket
+import time
+from collections import Counter
+from typing import Any, Literal
+
+from camera_node.errors import ConfigError, NetworkError
+from camera_node.extras import require
+from camera_node.geometry.pose import wxyz_from_rotation
+from camera_node.node.clock_sync import ClockSync
+from fusion.bridges.mavlink_frames import FrdFrames, FrdPose, roll_pitch_yaw, upper_triangle
+from fusion.bridges.pose_queue import WAIT_S, PoseQueue
+from fusion.protocol.messages import FusionStatus, RobotPose
+
+ADDRESS = re.compile(r"udp:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
+HEARTBEAT_S = 1.0
+GAP_S = 1.0  # without poses, after which the next one counts as a reset
+MAX_DATAGRAMS = 64  # taken at a time
+
+
+class RateDivider:
+    """Passes poses at most `rate_hz` times a second, in their own time; the rate is exact on average."""
+
+    def __init__(self, rate_hz: float) -> None:
+        """Raises ConfigError where the rate is not within 1 and 200."""
+        if not 1 <= rate_hz <= 200:
+            raise ConfigError(f"--rate-hz {rate_hz:g} is not within 1 and 200; autopilots expect 30 to 50")
+        self._period_ns, self._due_ns = round(1e9 / rate_hz), 0
+
+    def passes(self, t_ns: int) -> bool:
+        """Whether a pose of this time is due."""
+        if abs(t_ns - self._due_ns) > self._period_ns:  # the first one, after a gap, or another server's time
+            self._due_ns = t_ns
+        if t_ns < self._due_ns:
+            return False
+        self._due_ns += self._period_ns
+        return True
+
+
+class ResetCounter:
+    """Counts events after which a pose may differ from the ones before it, modulo 256.
+
+    These are: the robot was lost or silent, and the server uses another calibration.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last_ns: int | None = None
+        self._rig_t_ns: int | None = None
+
+    def add_pose(self, pose: RobotPose) -> None:
+        """Count a robot that was lost or silent before this pose; lost poses are to be left out."""
+        if self._last_ns is not None and not 0 <= pose.t_ns - self._last_ns <= GAP_S * 1e9:
+            self._reset()
+        self._last_ns = pose.t_ns
+
+    def add_loss(self) -> None:
+        """The robot is lost: its next pose counts as a reset."""
+        if self._last_ns is not None:
+            self._last_ns = -(1 << 62)
+
+    def add_status(self, status: FusionStatus) -> None:
+        """Count another calibration."""
+        if self._rig_t_ns is not None and status.rig_t_ns not in (None, self._rig_t_ns):
+            self._reset()
+        self._rig_t_ns = status.rig_t_ns or self._rig_t_ns
+
+    def _reset(self) -> None:
+        self.count = (self.count + 1) % 256
+
+
+class MavlinkVehicle:
+    """An autopilot at a UDP address; a context manager.
+
+    Args:
+        to: `udp:HOST:PORT`.
+        system: MAVLink's number of the vehicle, which is also ours.
+
+    Raises:
+        ConfigError: the address or the number is invalid, or pymavlink is missing.
+        NetworkError: the host is not known.
+
+    Attributes:
+        faults: what was not sent or not understood, by reason.
+    """
+
+    def __init__(self, to: str, system: int = 1) -> None:
+        self.faults: Counter[str] = Counter()
+        if not 1 <= system <= 255:
+            raise ConfigError(f"--system {system} is none of MAVLink; give a number from 1 to 255")
+        self._mavlink = require("pymavlink.dialects.v20.common", "mavlink", "fusion mavlink")
+        self._socket = connect(to)
+        self._encoder = self._mavlink.MAVLink(
+            None, system, self._mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        )
+        self._encoder.robust_parsing = True  # bad bytes become a message of their own kind
+        self._heartbeat_s = 0.0
+
+    def __enter__(self) -> "MavlinkVehicle":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._socket.close()
+
+    def fileno(self) -> int:
+        """Of the socket, for `select`."""
+        return self._socket.fileno()
+
+    def beat(self) -> None:
+        """Send a heartbeat if one is due: routers forward to programs that have one."""
+        if time.monotonic() >= self._heartbeat_s:
+            self._heartbeat_s = time.monotonic() + HEARTBEAT_S
+            m = self._mavlink
+            self._send(
+                m.MAVLink_heartbeat_message(
+                    m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE, 3
+                )
+            )
+
+    def answer(self, now_ns: int) -> None:
+        """Answer the requests for the time that have arrived.
+
+        Args:
+            now_ns: the server's present time.
+        """
+        for _ in range(MAX_DATAGRAMS):
+            try:
+                data = self._socket.recv(2048)
+            except BlockingIOError:
+                return
+            except OSError:  # nothing listens there yet
+                continue
+            for message in self._parse(data):
+                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                    self._send(self._mavlink.MAVLink_timesync_message(now_ns, message.ts1))
+
+    def send_odometry(self, t_ns: int, pose: FrdPose, resets: int) -> None:
+        """Send ODOMETRY in MAV_FRAME_LOCAL_FRD, with the velocity in MAV_FRAME_BODY_FRD."""
+        m = self._mavlink
+        message = m.MAVLink_odometry_message(
+            t_ns // 1000,
+            m.MAV_FRAME_LOCAL_FRD,
+            m.MAV_FRAME_BODY_FRD,
+            *pose.position.tolist(),
+            wxyz_from_rotation(pose.rotation).tolist(),
+            *pose.twist.ravel().tolist(),
+            upper_triangle(pose.pose_covariance),
+            upper_triangle(pose.twist_covariance),
+            resets,
+            m.MAV_ESTIMATOR_TYPE_MOCAP,
+        )
+        self._send(message)
+
+    def send_vision(self, t_ns: int, pose: FrdPose, resets: int) -> None:
+        """Send VISION_POSITION_ESTIMATE, which has no velocity."""
+        angles = roll_pitch_yaw(pose.rotation)
+        message = self._mavlink.MAVLink_vision_position_estimate_message(
+            t_ns // 1000, *pose.position.tolist(), *angles, upper_triangle(pose.pose_covariance), resets
+        )
+        self._send(message)
+
+    def _parse(self, data: bytes) -> list[Any]:
+        try:
+            return self._encoder.parse_buffer(data) or []
+        except self._mavlink.MAVError:
+            self.faults["datagrams that are not MAVLink"] += 1
+            return []
+
+    def _send(self, message: Any) -> None:
+        try:
+            self._socket.send(message.pack(self._encoder))
+            self._encoder.seq = (self._encoder.seq + 1) % 256
+        except OSError:  # nothing listens there, or the network is down: the next one may arrive
+            self.faults["messages that could not be sent"] += 1
+
+
+class MavlinkBridge:
+    """Passes one robot's poses to an autopilot.
+
+    Args:
+        vehicle: the autopilot.
+        frames: MAVLink's frames in the arena.
+        rate: of the poses that are sent.
+        kind: the message.
+    """
+
+    def __init__(
+        self,
+        vehicle: MavlinkVehicle,
+        frames: FrdFrames,
+        rate: RateDivider,
+        kind: Literal["odometry", "vision"] = "odometry",
+    ) -> None:
+        self.resets = ResetCounter()
+        self._vehicle, self._frames, self._rate = vehicle, frames, rate
+        self._send = vehicle.send_odometry if kind == "odometry" else vehicle.send_vision
+
+    def step(self, poses: PoseQueue, clock: ClockSync) -> None:
+        """Wait for poses and requests, at most `WAIT_S`, and pass them on."""
+        select.select([poses, self._vehicle], [], [], WAIT_S)
+        self._vehicle.beat()
+        self._vehicle.answer(clock.now_ns())
+        for pose in poses.take():
+            if pose.state == "lost":
+                self.resets.add_loss()
+                continue
+            self.resets.add_pose(pose)
+            if self._rate.passes(pose.t_ns):
+                self._send(pose.t_ns, self._frames.convert(pose), self.resets.count)
+
+
+def connect(to: str) -> socket.socket:
+    """A UDP socket that sends to `udp:HOST:PORT` and receives from there only.
+
+    Raises:
+        ConfigError: the address is not of this form.
+        NetworkError: the host is not known.
+    """
+    match = ADDRESS.fullmatch(to)
+    if match is None or not 0 < int(match["port"]) < 1 << 16:
+        raise ConfigError(f"--to {to} is no address; give udp:HOST:PORT, such as udp:192.168.4.1:14540")
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            match["host"].strip("[]"), int(match["port"]), type=socket.SOCK_DGRAM
+        )[0]
+    except OSError as error:
+        raise NetworkError(f"--to {to}: the host is not known ({error.strerror}); check its name") from None
+    connection = socket.socket(family, kind)
+    connection.connect(address)
+    connection.setblocking(False)
+    return connection

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What all bridges share: how they connect to an arena and receive its poses."""
+
+import contextlib
+import logging
+import select
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from camera_node.protocol.session import open_client
+from fusion.client.arena import Arena
+from fusion.protocol.messages import RobotPose
+
+log = logging.getLogger("fusion.bridge")
+
+QUEUE_SIZE = 4096  # poses; four frame sets of 1024 robots
+SILENCE_S = 5.0
+WAIT_S = 0.2  # for poses, until a bridge looks whether it was stopped
+
+
+class PoseQueue:
+    """The poses of an arena, from Zenoh's thread to that of a bridge; a full queue loses its oldest poses.
+
+    Logs when no pose arrives for `SILENCE_S`, and when poses arrive again: a bridge outlives its server.
+
+    Args:
+        client: connected to the arena.
+        robot: receive only the poses of this robot.
+
+    Attributes:
+        client: as given.
+        faults: skipped poses, by reason.
+    """
+
+    def __init__(self, client: Arena, robot: str | None = None) -> None:
+        self.client = client
+        self.faults: Counter[str] = Counter()
+        self._poses: deque[RobotPose] = deque(maxlen=QUEUE_SIZE)
+        self._is_signaled = False
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+        self._received_s, self._is_silent = time.monotonic(), False
+        stream = client.poses() if robot is None else client.robot(robot)
+        self._remove = stream.on_message(self._put)
+
+    def close(self) -> None:
+        """Receive no more poses."""
+        self._remove()
+        self._reader.close()
+        self._writer.close()
+
+    def fileno(self) -> int:
+        """A file descriptor that is readable while poses wait, for `select`."""
+        return self._reader.fileno()
+
+    def take(self, timeout_s: float = 0.0) -> list[RobotPose]:
+        """All poses that wait, in order of arrival; the first one is waited for up to `timeout_s`."""
+        if select.select([self._reader], [], [], timeout_s)[0]:
+            with contextlib.suppress(BlockingIOError):
+                self._reader.recv(64)
+            self._is_signaled = False  # before the queue is emptied: a pose that arrives now signals again
+        poses = [self._poses.popleft() for _ in range(len(self._poses))]
+        self._report_silence(bool(poses))
+        return poses
+
+    def _report_silence(self, has_poses: bool) -> None:
+        now_s = time.monotonic()
+        if has_poses:
+            if self._is_silent:
+                log.info("receiving poses again")
+            self._received_s, self._is_silent = now_s, False
+        elif not self._is_silent and now_s - self._received_s >= SILENCE_S:
+            self._is_silent = True
+            message = "no pose %s within %g s; is python -m fusion running there?"
+            log.warning(message, self.client.origin, SILENCE_S)
+
+    def _put(self, pose: RobotPose) -> None:
+        if len(self._poses) == QUEUE_SIZE:
+            self.faults["poses dropped because the bridge is too slow"] += 1
+        self._poses.append(pose)
+        if not self._is_signaled:
+            self._is_signaled = True
+            with contextlib.suppress(BlockingIOError):
+                self._writer.send(b"\0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerAddress:
+    """The arena's server."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """The server's Zenoh endpoints."""
+    arena: str = "arena"
+    """The arena's name."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+
+    @contextlib.contextmanager
+    def receive_poses(self, robot: str | None = None) -> Iterator[PoseQueue]:
+        """The poses of all robots, or of one; what was skipped is logged at the end.
+
+        Raises:
+            NetworkError: an endpoint is invalid.
+            ConfigError: the Zenoh configuration is missing or invalid.
+        """
+        session = open_client(self.connect, self.zenoh)
+        with Arena(session, self.arena, " ".join(self.connect)) as client:
+            poses = PoseQueue(client, robot)
+            try:
+                yield poses
+            finally:
+                poses.close()
+                log_faults(poses.faults + client.faults)
+
+
+Server = Annotated[ServerAddress, tyro.conf.arg(name="")]
+LOCAL = ServerAddress()
+
+
+def log_faults(faults: Counter[str]) -> None:
+    """Log what a bridge skipped."""
+    for reason, count in faults.items():
+        log.warning("%d %s", count, reason)

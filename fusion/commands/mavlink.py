@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion mavlink`: one robot's poses to its autopilot."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from camera_node.config import require_name
+from camera_node.node.clock_sync import ClockSync
+from camera_node.service import stopped_by_signals
+from camera_node.terminal import say
+from fusion.bridges.mavlink import MavlinkBridge, MavlinkVehicle, RateDivider
+from fusion.bridges.mavlink_frames import FrdFrames
+from fusion.bridges.pose_queue import LOCAL, Server, log_faults
+
+
+@dataclass(frozen=True)
+class VehicleOptions:
+    """The vehicle, and MAVLink's frames in the arena."""
+
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The local frame's origin in the arena's world, metres."""
+    heading_deg: float = 0.0
+    """The direction of the local frame's x axis in the arena's world, degrees from x towards y."""
+    forward_deg: float = 0.0
+    """The direction of the vehicle's nose in the robot's body, degrees from x towards y."""
+    system: int = 1
+    """MAVLink's number of the vehicle."""
+
+
+DEFAULTS = VehicleOptions()
+
+
+def mavlink(
+    robot: tyro.conf.Positional[str],
+    *,
+    to: str,
+    server: Server = LOCAL,
+    message: Literal["odometry", "vision"] = "odometry",
+    rate_hz: float = 50.0,
+    vehicle: Annotated[VehicleOptions, tyro.conf.arg(name="")] = DEFAULTS,
+) -> int:
+    """Send a robot's poses to its autopilot (PX4, ArduPilot) over MAVLink, until stopped.
+
+    Args:
+        robot: its name in the arena.
+        to: the autopilot or a MAVLink router, as udp:HOST:PORT.
+        server: the arena's server.
+        message: odometry has velocity; vision is VISION_POSITION_ESTIMATE.
+        rate_hz: messages a second at most.
+        vehicle: its number, and where MAVLink's frames are in the arena.
+    """
+    require_name(robot, "a robot")
+    converter = FrdFrames(vehicle.origin_m, vehicle.heading_deg, vehicle.forward_deg)
+    rate = RateDivider(rate_hz)
+    with (
+        stopped_by_signals() as stop,
+        MavlinkVehicle(to, vehicle.system) as autopilot,
+        server.receive_poses(robot) as poses,
+    ):
+        bridge = MavlinkBridge(autopilot, converter, rate, message)
+        poses.client.status().on_message(bridge.resets.add_status)
+        clock = ClockSync(poses.client.session, poses.client.keys).start()
+        say(f"MAVLink: '{robot}' to {to}")
+        while not stop.is_set():
+            bridge.step(poses, clock)
+        clock.close()
+        log_faults(autopilot.faults)
+    return 0

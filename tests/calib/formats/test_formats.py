@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Files in the layouts of other programs are read as they mean it, and what is written is read back as it was."""
+
+import contextlib
+import re
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from calib.commands.formats import ExportRig, FormatName, ImportData, make_rig
+from calib.errors import CalibrationError
+from calib.formats.data import ForeignData
+from calib.formats.lens_models import with_coefficients
+from calib.formats.registry import FORMATS
+from calib.rig.camera import transform
+from calib.rig.rig import Rig, load_rig, save_rig
+from calib.rig.wand_file import WandBody
+from calib.wand.calibrate import calibrate
+from camera_node.errors import ConfigError
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import invert, rotation_from_wxyz
+from camera_node.sources.observations import read_observations
+from tests.calib.synthetic import camera_errors, ring
+
+EASYWAND_PROFILE = (
+    "1 2857 2336 1728 1168 864 1\n2 2857 2336 1728 1168 864 1\n3 4000 2336 1728 1168 864 1.01\n"
+)
+CLICKER_PROFILE = (
+    "1 890.1 1280 720 640 360 1 -0.28 0.07 0.0004 -0.0001 0\n2 640 1280 720 640 360 1 0 0 0 0 0.1\n"
+)
+XYPTS = """pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y,pt2_cam1_X,pt2_cam1_Y,pt2_cam2_X,pt2_cam2_Y
+NaN,NaN,NaN,NaN,NaN,NaN,NaN,NaN
+101.0,201.0,301.5,401.5,111,211,NaN,NaN
+1,1,1280,720,NaN,NaN,5,6
+"""
+CAMERA_ARRAY = """[cameras.0]
+cam_id = 0
+rotation_count = 0
+error = 0.541
+exposure = -8
+grid_count = 39
+ignore = false
+fisheye = false
+size = [1280, 720]
+matrix = [[903.5, 0.0, 618.3], [0.0, 907.9, 394.2], [0.0, 0.0, 1.0]]
+distortions = [-0.33, 0.046, -0.0043, 0.0041, 0.0666]
+translation = [0.1, -0.2, 0.7]
+rotation = [0.0, 0.0, 1.5707963267948966]
+
+[cameras.1]
+cam_id = 1
+ignore = true
+size = [640, 480]
+matrix = "null"
+
+[cameras.2]
+cam_id = 2
+ignore = false
+size = [640, 480]
+matrix = [[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]]
+distortions = [0.01, 0.0, 0.0, 0.0]
+fisheye = true
+rotation = "null"
+translation = "null"
+"""
+XY = """sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y
+7,0,12,1.25,0,10.5,20.5,0.05,0.05
+7,0,12,1.25,3,11.5,21.5,0.05,0.2
+8,2,14,1.31,3,400.0,300.0,,
+"""
+CAMCHAIN = """cam0:
+  camera_model: pinhole
+  intrinsics: [461.629, 460.152, 362.680, 246.049]
+  distortion_model: radtan
+  distortion_coeffs: [-0.277, 0.067, 0.0009, 0.0001]
+  rostopic: /left/image_raw
+  resolution: [752, 480]
+  timeshift_cam_imu: -0.001
+cam1:
+  camera_model: pinhole
+  intrinsics: [400.0, 401.0, 370.0, 240.0]
+  distortion_model: equidistant
+  distortion_coeffs: [0.01, 0.02, 0.0, 0.0]
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  rostopic: /right/image_raw
+  resolution: [752, 480]
+  timeshift_cam_imu: 0.002
+"""
+OPENCV = """%YAML:1.0
+---
+calibration_time: "Mon 01 Jan 2024"
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 5.2e+02, 0., 320.5, 0., 5.21e+02, 239.5, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -1.2e-01, 4.0e-02, 0., 0., 1.0e-03 ]
+"""
+CAMERA_INFO = """image_width: 640
+image_height: 480
+camera_name: head_left
+camera_matrix: {rows: 3, cols: 3, data: [520.0, 0, 320.5, 0, 521.0, 239.5, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.12, 0.04, 0, 0, 0.001]}
+"""
+
+
+def read(name: FormatName, folder: Path, files: dict[str, str]) -> ForeignData:
+    """Read files of the given contents."""
+    for file, text in files.items():
+        (folder / file).write_text(text)
+    paths = [folder] if name == "multicamselfcal" else [folder / file for file in files]
+    chosen = FORMATS[name]
+    assert chosen.read is not None
+    return chosen.read(paths, chosen.origin)
+
+
+def test_an_easywand_profile_has_a_row_for_each_camera(tmp_path: Path):
+    cameras = read("easywand", tmp_path, {"profile.txt": EASYWAND_PROFILE}).cameras
+    assert list(cameras) == ["cam1", "cam2", "cam3"]
+    assert (cameras["cam3"].fx, cameras["cam3"].fy, cameras["cam3"].width) == (4000, 4040, 2336)
+    assert cameras["cam1"].distortion == ()
+
+
+@pytest.mark.parametrize(("name", "top"), [("dltdv", True), ("argus", False)])
+def test_xypts_count_pixels_from_one_at_the_top_or_at_the_bottom(tmp_path: Path, name: FormatName, top: bool):
+    """The corner pixel of the image is at (1, 1); of 720 rows, row 720 is the opposite one."""
+    data = read(name, tmp_path, {"profile.txt": CLICKER_PROFILE, "xypts.csv": XYPTS})
+    assert data.cameras["cam1"].distortion == (-0.28, 0.07, 0.0004, -0.0001, 0.0)
+    points = data.points
+    assert points is not None
+    rows = list(
+        zip(points.camera, points.frame.tolist(), points.marker.tolist(), points.uv.tolist(), strict=True)
+    )
+    assert ("cam1", 2, 0, [0.0, 0.0 if top else 719.0]) in rows
+    assert ("cam2", 2, 0, [1279.0, 719.0 if top else 0.0]) in rows
+    assert ("cam1", 1, 1, [110.0, 210.0 if top else 509.0]) in rows
+    assert len(rows) == 6
+
+
+def test_a_wand_table_without_names_has_the_cameras_of_the_profile(tmp_path: Path):
+    table = "1,2,3,4,5,6,7,8\nNaN,NaN,13,14,15,16,NaN,NaN\n"
+    points = read("easywand", tmp_path, {"profile.txt": CLICKER_PROFILE, "wandpts.csv": table}).points
+    assert points is not None
+    assert points.camera == ["cam1", "cam2", "cam2", "cam1", "cam1", "cam2"]
+    assert points.marker.tolist() == [0, 0, 0, 1, 1, 1]
+    assert points.uv[2].tolist() == [12.0, 13.0]
+
+
+def test_multicamselfcal_folder(tmp_path: Path):
+    """Points of two cameras in three frames; IdMat marks one as not seen although points.dat has numbers."""
+    truth = ring(2).truth
+    P = [c.K @ invert(c.matrix())[:3] for c in truth.cameras.values()]
+    files = {
+        "points.dat": "1 2 NaN\n11 12 NaN\n1 1 NaN\n5.5 6.5 7.5\n15 16 17\n1 1 1\n",
+        "IdMat.dat": "1 1 0\n1 0 1\n",
+        "Res.dat": "800 600\n800 600\n",
+        "camera1.Pmat.cal": "\n".join(" ".join(map(str, row)) for row in -3.7 * P[0]),
+        "camera2.Pmat.cal": "\n".join(" ".join(map(str, row)) for row in 0.2 * P[1]),
+        "basename1.rad": "K11 = 520.0\nK12 = 0.0\nK13 = 402.0\nK22 = 522.0\nK23 = 297.0\n\nkc1 = -0.1\nkc2 = 0.03\n",
+        "basename2.rad": "K11 = 530.0\nK12 = 0.0\nK13 = 402.0\nK22 = 532.0\nK23 = 297.0\n\nkc1 = -0.1\nkc4 = -0.01\n",
+    }
+    data = read("multicamselfcal", tmp_path, files)
+    points = data.points
+    assert points is not None
+    assert points.camera == ["cam1", "cam1", "cam2", "cam2"]
+    assert points.frame.tolist() == [0, 1, 0, 2]
+    assert points.uv.tolist() == [[1, 11], [2, 12], [5.5, 15], [7.5, 17]]
+    for found, camera in zip(data.cameras.values(), truth.cameras.values(), strict=True):
+        assert found.matrix() == pytest.approx(camera.matrix(), abs=1e-9)
+    assert data.cameras["cam2"].parameters[:4] == pytest.approx([530, 532, 402, 297])
+    assert data.cameras["cam2"].distortion == (-0.1, 0.0, 0.0, -0.01)
+
+
+def test_caliscope_cameras_and_points(tmp_path: Path):
+    """A camera rotated by a quarter turn about its axis; ignored cameras are left out, null means no pose."""
+    data = read("caliscope", tmp_path, {"camera_array.toml": CAMERA_ARRAY, "xy.csv": XY})
+    assert list(data.cameras) == ["cam0", "cam2"]
+    seen = transform(invert(data.cameras["cam0"].matrix()), [[1.0, 0.0, 0.0]])
+    assert seen[0] == pytest.approx([0.1, 0.8, 0.7])
+    assert data.cameras["cam2"].model == "fisheye"
+    assert data.cameras["cam2"].T_world_cam is None
+    points = data.points
+    assert points is not None
+    assert points.t_s is not None
+    assert points.t_s.tolist() == [1.25, 1.25, 1.31]
+    assert points.marker.tolist() == [0, 3, 3]
+    assert points.camera == ["cam0", "cam0", "cam2"]
+
+
+def test_kalibr_chain(tmp_path: Path):
+    """cam1 is 0.11 m to the right of cam0, and its stamps are 3 ms early compared with those of cam0."""
+    cameras = read("kalibr", tmp_path, {"camchain.yaml": CAMCHAIN}).cameras
+    assert list(cameras) == ["left", "right"]
+    assert cameras["right"].matrix()[:3, 3].tolist() == [0.11, 0, 0]
+    assert cameras["right"].model == "fisheye"
+    assert cameras["right"].time_offset_ms == pytest.approx(3.0)
+    assert cameras["left"].distortion == (-0.277, 0.067, 0.0009, 0.0001)
+
+
+def test_opencv_and_ros_files(tmp_path: Path):
+    cameras = read("opencv", tmp_path, {"north.yaml": OPENCV, "other.yaml": CAMERA_INFO}).cameras
+    assert list(cameras) == ["north", "head_left"]
+    assert cameras["north"].parameters.tolist() == cameras["head_left"].parameters.tolist()
+    assert cameras["north"].parameters.tolist() == [520, 521, 320.5, 239.5, -0.12, 0.04, 0, 0, 0.001]
+
+
+BROKEN = {
+    "omnidirectional": ("argus", {"p.txt": "1 2 3 4 5\n"}, "omnidirectional"),
+    "sba profile": ("argus", {"p.txt": " ".join(["1"] * 17)}, "no image sizes"),
+    "no profile for rows from below": ("argus", {"x.csv": XYPTS}, "give the camera profile too"),
+    "a table without names": ("dltdv", {"x.csv": "1,2,3,4\n"}, "give the camera profile too"),
+    "an empty table": ("dltdv", {"x.csv": XYPTS.splitlines()[0] + "\nNaN\n"}, "has no points"),
+    "words in a table": (
+        "dltdv",
+        {"x.csv": XYPTS.splitlines()[0] + "\nfoo\n"},
+        "row 1: a cell is not a number",
+    ),
+    "a wrong column": (
+        "dltdv",
+        {"x.csv": "pt1_cam1_X,pt1_cam1_Z\n1,2\n"},
+        "'pt1_cam1_Z' does not name a column",
+    ),
+    "two tables": ("dltdv", {"x.csv": XYPTS, "y.csv": XYPTS}, "import one after the other"),
+    "lenses without sizes": (
+        "multicamselfcal",
+        {"a1.rad": "K11 = 1\nK13 = 1\nK22 = 1\nK23 = 1\n"},
+        "Res.dat must have",
+    ),
+    "a lens without a centre": ("multicamselfcal", {"a1.rad": "K11 = 1\n", "Res.dat": "9 9\n"}, "lacks K13"),
+    "a missing lens": (
+        "multicamselfcal",
+        {"points.dat": "1\n1\n1\n1\n1\n1\n", "a1.rad": "K11 = 1\n", "Res.dat": "9 9\n9 9\n"},
+        "1 .rad files of 2 cameras",
+    ),
+    "rows of different lengths": ("multicamselfcal", {"points.dat": "1 2\n1\n"}, "not a matrix"),
+    "a singular projection": (
+        "multicamselfcal",
+        {"c1.cal": "0 0 0 0\n" * 3, "Res.dat": "9 9\n"},
+        "no projection",
+    ),
+    "no TOML": ("caliscope", {"a.toml": "[cameras"}, "not valid TOML"),
+    "no cameras": ("caliscope", {"a.toml": "fps = 6\n"}, r"no tables \[cameras.0\]"),
+    "no size": ("caliscope", {"a.toml": "[cameras.0]\nmatrix = [1]\n"}, "camera 0 has no usable"),
+    "other columns": ("caliscope", {"xy.csv": "frame,x,y\n1,2,3\n"}, "lacks the columns"),
+    "another YAML": ("kalibr", {"a.yaml": "cameras: {}\n"}, "is it a camchain"),
+    "an omni model": (
+        "kalibr",
+        {"a.yaml": "cam0: {camera_model: omni, distortion_model: radtan}\n"},
+        "'omni'",
+    ),
+    "no rotation": (
+        "kalibr",
+        {"a.yaml": CAMCHAIN.replace("[1.0, 0.0, 0.0, -0.11]", "[9.0, 0.0, 0.0, 0.0]")},
+        "rotation",
+    ),
+    "no matrix": ("opencv", {"a.yaml": "%YAML:1.0\n---\nimage_width: 3\n"}, "no 3 x 3 camera_matrix"),
+    "no image size": ("opencv", {"a.yaml": OPENCV.replace("image_width: 640\n", "")}, "no image size"),
+    "an impossible lens": ("opencv", {"a.yaml": OPENCV.replace("5.2e+02", "-5")}, "must be above 0"),
+    "another distortion": ("opencv", {"a.yaml": CAMERA_INFO.replace("plumb_bob", "splined")}, "'splined'"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, case: str):
+    name, files, fault = BROKEN[case]
+    with pytest.raises((ConfigError, CalibrationError), match=fault) as caught:
+        read(name, tmp_path, files)  # pyright: ignore[reportArgumentType]
+    assert "\n" not in str(caught.value)
+
+
+SAMPLES: dict[str, tuple[FormatName, str, str]] = {
+    "profile": ("easywand", "profile.txt", CLICKER_PROFILE),
+    "xypts": ("dltdv", "xypts.csv", XYPTS),
+    "camera_array": ("caliscope", "a.toml", CAMERA_ARRAY),
+    "xy": ("caliscope", "xy.csv", XY),
+    "camchain": ("kalibr", "a.yaml", CAMCHAIN),
+    "opencv": ("opencv", "a.yaml", OPENCV),
+    "points": ("multicamselfcal", "points.dat", "1 2\n11 12\n1 1\n5.5 6.5\n15 16\n1 1\n"),
+}
+MUTATIONS = ("nan", "inf", "-1", "1e308", "9" * 30, "", "[", "{}", "null", "x", ",", "\n", "\0", "true")
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_a_mutated_file_is_read_or_refused(tmp_path: Path, sample: str):
+    """Any other exception would be a traceback for the user."""
+    name, file, text = SAMPLES[sample]
+    rng = np.random.default_rng(7)
+    for _ in range(150):
+        words = re.split(r"([ ,\n\[\]:=])", text)
+        for _ in range(rng.integers(1, 3)):
+            words[rng.integers(len(words))] = MUTATIONS[rng.integers(len(MUTATIONS))]
+        with contextlib.suppress(ConfigError, CalibrationError):
+            data = read(name, tmp_path, {file: "".join(words)})
+            if data.cameras:
+                make_rig(data.cameras)
+            if data.points is not None:
+                data.points.write(tmp_path / "o.out")
+
+
+@pytest.mark.parametrize("name", [name for name, form in FORMATS.items() if form.read is not None])
+def test_an_exported_rig_is_read_back(tmp_path: Path, name: FormatName):
+    """Pixels of the markers in all cameras are equal; poses too, where the format has them: Argus has only DLT
+    coefficients."""
+    truth = ring(3).truth
+    save_rig(truth, tmp_path / "rig.yaml")
+    ExportRig(format=name, rig=tmp_path / "rig.yaml", out=tmp_path / "there").execute()
+    folder = tmp_path / "there"
+    files = (
+        (folder,) if name == "multicamselfcal" else tuple(p for p in folder.iterdir() if p.suffix != ".csv")
+    )
+    ImportData(format=name, files=files, out=tmp_path / "back").execute()
+    back = load_rig(tmp_path / "back" / "rig.yaml")
+    assert len(back.cameras) == 3
+    ahead = np.array([[0.3, -0.2, 1.0], [-0.4, 0.3, 1.0], [0.0, 0.0, 1.0]])
+    by_focal = sorted(back.cameras.values(), key=lambda camera: camera.fx)
+    for found, camera in zip(by_focal, truth.cameras.values(), strict=True):
+        assert found.project(ahead) == pytest.approx(camera.project(ahead), abs=1e-3)
+    if name in ("multicamselfcal", "caliscope"):
+        assert camera_errors(back, truth)[0].max() < 1e-9
+        assert by_focal[1].matrix() == pytest.approx(truth.cameras["cam1"].matrix(), abs=1e-9)
+    elif name == "kalibr":
+        assert camera_errors(back, truth)[0].max() < 1e-9
+    else:
+        assert not back.placed()
+
+
+def test_exported_opencv_files_are_read_by_opencv(tmp_path: Path):
+    truth = ring(2).truth
+    FORMATS["opencv"].write(truth, tmp_path, FORMATS["opencv"].origin)
+    storage = cv2.FileStorage(str(tmp_path / "cam1.yaml"), cv2.FILE_STORAGE_READ)
+    K, D, R, T = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients", "R", "T"))
+    uv = cv2.projectPoints(np.array([[0.1, 0.2, 0.9]]), cv2.Rodrigues(R)[0], T, K, D)[0].ravel()
+    assert uv == pytest.approx(truth.cameras["cam1"].project_world([[0.1, 0.2, 0.9]])[0])
+
+
+def test_exported_dlt_coefficients_give_the_undistorted_pixels_of_argus(tmp_path: Path):
+    """u = (L1 x + L2 y + L3 z + L4) / (L9 x + L10 y + L11 z + 1), and the same for v; rows from below, from 1."""
+    truth = ring(2).truth
+    plain = Rig(
+        cameras={
+            n: c.with_parameters(c.parameters * ([1.0] * 4 + [0.0] * 5)) for n, c in truth.cameras.items()
+        }
+    )
+    FORMATS["argus"].write(plain, tmp_path, FORMATS["argus"].origin)
+    L = np.loadtxt(tmp_path / "dltCoefs.csv", delimiter=",")
+    assert L.shape == (11, 2)
+    point = np.array([0.2, -0.1, 0.8, 1.0])
+    for k, camera in enumerate(plain.cameras.values()):
+        scale = L[8:, k] @ point[:3] + 1
+        uv = camera.project_world(point[None, :3])[0]
+        expected = [uv[0] + 1, camera.height - uv[1]]
+        assert [L[:4, k] @ point / scale, L[4:8, k] @ point / scale] == pytest.approx(expected)
+
+
+def test_exported_colmap_model(tmp_path: Path):
+    """The centre of the top-left pixel is (0.5, 0.5), and poses take the world into the camera."""
+    truth = ring(2).truth
+    FORMATS["colmap"].write(truth, tmp_path, FORMATS["colmap"].origin)
+    camera = truth.cameras["cam1"]
+    words = (tmp_path / "cameras.txt").read_text().splitlines()[2].split()
+    assert words[:4] == ["2", "OPENCV", "800", "600"]
+    assert [float(w) for w in words[4:8]] == pytest.approx(
+        [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
+    )
+    pose = (tmp_path / "images.txt").read_text().splitlines()[3].split()
+    assert pose[8:] == ["2", "cam1.png"]
+    q, t = np.array(pose[1:5], float), np.array(pose[5:8], float)
+    point = np.array([0.1, 0.2, 0.3])
+    assert rotation_from_wxyz(q) @ point + t == pytest.approx(transform(invert(camera.matrix()), point)[0])
+
+
+def test_a_lens_with_k3_is_written_with_four_coefficients_where_that_is_near_enough():
+    lens = Lens(
+        width=800, height=600, fx=500, fy=501, cx=400, cy=300, distortion=(-0.28, 0.1, 1e-4, 1e-4, -0.001)
+    )
+    shorter, off = with_coefficients("cam0", lens, 4)
+    assert len(shorter.distortion) == 4
+    assert 0 < off < 0.2
+    wide = msgspec.structs.replace(lens, fx=300.0, fy=300.0, distortion=(-0.2, 0.05, 0.0, 0.0, 0.1))
+    with pytest.raises(CalibrationError, match="camera 'cam0': its lens can't be written with 4"):
+        with_coefficients("cam0", wide, 4)
+
+
+def test_imported_points_calibrate_a_rig(tmp_path: Path):
+    """A stick before three cameras in the tables of DLTdv, with numbers of frames and no diameter: as recorded."""
+    truth, rng, wand = ring(3).truth, np.random.default_rng(1), WandBody(markers=((0, 0, 0), (0.5, 0, 0)))
+    rows = []
+    for _ in range(60):
+        at, along = rng.uniform([-0.6, -0.6, 0.4], [0.6, 0.6, 1.5]), rng.standard_normal(3)
+        ends = np.array([at, at + 0.5 * along / np.linalg.norm(along)])
+        uv = np.array(
+            [c.project_world(ends) + 0.2 * rng.standard_normal((2, 2)) for c in truth.cameras.values()]
+        )
+        seen = np.array([c.sees(uv[k]) for k, c in enumerate(truth.cameras.values())])
+        rows.append(np.where(seen[..., None], uv + 1, np.nan).swapaxes(0, 1).ravel())
+    header = [f"pt{m}_cam{c}_{x}" for m in (1, 2) for c in (1, 2, 3) for x in "XY"]
+    table = tmp_path / "xypts.csv"
+    np.savetxt(table, np.array(rows), delimiter=",", header=",".join(header), comments="")
+    FORMATS["dltdv"].write(ring(3).intrinsics, tmp_path, FORMATS["dltdv"].origin)
+    ImportData(format="dltdv", files=(table, tmp_path / "profile.txt"), out=tmp_path).execute()
+    rig = load_rig(tmp_path / "rig.yaml")
+    messages = read_observations(tmp_path / "observations.csv", fps=100.0)
+    messages = [msgspec.structs.replace(m, width=800, height=600) for m in messages]
+    result = calibrate(rig, wand, messages, synchronous=True)
+    there = Rig(cameras={f"cam{k + 1}": camera for k, camera in enumerate(truth.cameras.values())})
+    assert camera_errors(result.rig, there)[0].max() < 0.01

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command `roundel`: its commands, their help, and mistakes in the command line."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from camera_node.errors import ConfigError
+from web.roundel.command import COMMANDS, execute
+
+MAIN = "from web.roundel.command import main; main()"
+
+
+def roundel(*words: str, folder: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, which is in no checkout."""
+    return subprocess.run(
+        [sys.executable, "-P", "-c", MAIN, *words],
+        cwd=folder,
+        env={**os.environ, **env},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def mistake(*words: str) -> str:
+    """The error of a command line, in this process."""
+    with pytest.raises(ConfigError) as error:
+        execute(*words)
+    assert error.value.exit_code == 2
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_the_list_of_commands_is_complete(tmp_path: Path):
+    """Without a command, all of them in the order of the work, each with a summary."""
+    text = roundel(folder=tmp_path).stdout
+    assert re.findall(r"^  (\w+) +\w", text, re.MULTILINE) == list(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_examples(name: str, capsys: pytest.CaptureFixture[str]):
+    """Each command's help shows its examples, complete and on a line of their own."""
+    with pytest.raises(SystemExit) as end:
+        execute(name, "--help")
+    assert not end.value.code
+    text = capsys.readouterr().out
+    assert f"usage: roundel {name}" in text
+    for example in COMMANDS[name].examples:
+        assert f"\n  {example}\n" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "nearest"),
+    [
+        (("dmeo",), "demo"),
+        (("calibrate", "wandd"), "wand"),
+        (("camera", "--suorce", "0"), "--source"),
+        (("calibrate", "wand", "--wnad", "x"), "--wand"),
+        (("record", "x.mcap", "--second", "3"), "--seconds"),
+        (("view", "--demo-mode"), "--demo"),
+        (("server", "--listne", "tcp/127.0.0.1:7447"), "--listen"),
+    ],
+)
+@pytest.mark.parametrize("columns", ["60", "200"])
+def test_a_typo_is_one_line_with_the_nearest_option(
+    words: tuple[str, ...], nearest: str, columns: str, monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever the width of the terminal."""
+    monkeypatch.setenv("COLUMNS", columns)
+    assert re.fullmatch(rf"there is no .*; did you mean {nearest}\? \(.*--help.*\)", mistake(*words))
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("view", "--port", "x"), "--port: 'x' is not a number"),
+        (("define", "rover"), "--diameter FLOAT is missing"),
+        (("record",), r"PATH \(the MCAP file to write\) is missing"),
+        (("detect", "--draw"), "Missing value for argument '--draw'"),
+        (("detect", "--detector", "eye", "x.png"), "invalid choice 'eye' for argument '--detector'.*chords"),
+        (("demo", "extra"), "'extra' was not expected"),
+        (("--headless",), "--headless needs a command before it"),
+    ],
+)
+def test_an_invalid_value_is_one_line(words: tuple[str, ...], text: str):
+    """The line names the option and the command that lists all of them."""
+    assert re.fullmatch(rf".*{text}.*--help.*", mistake(*words), re.IGNORECASE)
+
+
+def test_a_command_imports_its_own_program_only():
+    """A camera's computer has neither GTSAM nor Viser nor MCAP."""
+    code = (
+        "import sys\n"
+        "for name in ('gtsam', 'viser', 'scipy', 'mcap', 'psutil', 'websockets'): sys.modules[name] = None\n"
+        + MAIN
+    )
+    for words in (["camera", "--help"], ["detect", "--help"], ["print", "--help"], ["--help"]):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stderr
+
+
+def test_opencv_writes_no_warning(tmp_path: Path):
+    """A broken picture and a broken video are one line each, that of this project."""
+    board = ("--board", "chessboard:4x5:0.05", "--out", "rig.yaml")
+    for name, words in (("x.png", ("detect",)), ("x.mp4", ("calibrate", "intrinsics", *board, "--frames"))):
+        (tmp_path / name).write_bytes(b"\x89PNG not a picture")
+        done = roundel(*words, name, folder=tmp_path)
+        assert done.returncode == 2
+        assert re.fullmatch(r"error: .*\n", done.stderr), done.stderr

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The status line names the worst fault and what to do; the next step follows the order of the work."""
+
+import time
+
+import pytest
+
+from fusion.protocol.messages import FusionStatus
+from tests.waiting import wait_for
+from tests.web.arena import LiveArena, four_cameras
+from web.colours import own_colours, robot_colour
+from web.condition import CONNECT_S, assess, next_step
+from web.feed import ArenaState, Feed, TimedMessage
+
+ENDPOINT = "tcp/lab:7447"
+
+
+@pytest.fixture
+def healthy(arena: LiveArena, feed: Feed) -> ArenaState:
+    """The state of an arena that tracks its robot."""
+    token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
+    for name in four_cameras().cameras:
+        arena.camera(name)
+    arena.pose("rover", (0.5, 0.0, 0.1))
+    arena.status(tuple(four_cameras().cameras))
+    arena.rig(four_cameras())
+    wait_for(
+        lambda: (s := feed.state()).rig and s.server_alive and s.poses and s.status and len(s.cameras) == 4
+    )
+    token.undeclare()
+    return feed.state()
+
+
+def with_silent(state: ArenaState, camera: str, seconds: float) -> ArenaState:
+    state.cameras[camera] = TimedMessage(state.cameras[camera].message, state.now_s - seconds)
+    return state
+
+
+def test_a_healthy_arena_is_green(healthy: ArenaState):
+    condition = assess(healthy, ENDPOINT)
+    assert condition.level == "ok"
+    assert condition.text == "4 cameras, 1 robot tracked, 30 poses/s, latency 8 ms"
+    assert next_step(healthy) == "run"
+
+
+def test_a_silent_camera_is_red_and_comes_first(healthy: ArenaState):
+    """Before the advice of another camera; the number of further faults is given."""
+    healthy.poses["rover"] = TimedMessage(healthy.poses["rover"].message, healthy.now_s - 9)
+    condition = assess(with_silent(healthy, "north", 4.2), ENDPOINT)
+    assert condition.level == "bad"
+    assert condition.text == "camera north silent for 4 s: check its cable and its program (and 1 more)"
+
+
+def test_a_robot_that_is_not_found_is_amber_with_its_reason(healthy: ArenaState):
+    status: FusionStatus = healthy.status.message  # pyright: ignore[reportOptionalMemberAccess]
+    status.not_acquired["cart"] = "2 of 4 markers seen"
+    condition = assess(healthy, ENDPOINT)
+    assert (condition.level, condition.text) == ("warn", "robot cart is not found: 2 of 4 markers seen")
+
+
+def test_a_lost_server_hides_all_other_faults(healthy: ArenaState):
+    """Its cameras and robots are silent too."""
+    healthy.now_s += 60.0
+    condition = assess(healthy, ENDPOINT)
+    assert condition.level == "bad"
+    assert condition.text.startswith("the server is silent for 60 s")
+    assert "more" not in condition.text
+
+
+def test_the_absence_of_a_server_is_a_fault_after_a_while():
+    assert assess(ArenaState(now_s=CONNECT_S / 2), ENDPOINT).level == "wait"
+    late = assess(ArenaState(now_s=CONNECT_S + 1), ENDPOINT)
+    assert late.level == "bad"
+    assert ENDPOINT in late.text
+
+
+def test_the_steps_are_in_the_order_of_the_work(arena: LiveArena, feed: Feed):
+    """Cameras first, then their calibration, then robots."""
+    assert next_step(feed.state()) == "cameras"
+    arena.camera("north")
+    wait_for(lambda: feed.state().cameras)
+    assert next_step(feed.state()) == "calibrate"
+    arena.rig(four_cameras())
+    wait_for(lambda: feed.state().rig)
+    state = feed.state()
+    none = FusionStatus(
+        t_ns=time.time_ns(),
+        frame_sets_per_s=1,
+        latency_ms=None,
+        cpu=0,
+        memory_mb=1,
+        cameras={},
+        robots={},
+        faults={},
+    )
+    state.status = TimedMessage(none, state.now_s)
+    assert next_step(state) == "robots"
+
+
+def test_a_robot_s_colour_derives_from_its_name():
+    """The colours of others do not matter, and similar names differ."""
+    names = [f"robot_{k}" for k in range(50)]
+    assert own_colours(names)[7].tolist() == own_colours(["robot_7"])[0].tolist()
+    assert len({robot_colour(name) for name in names}) > 45, "a collision is rare"
+
+
+def test_a_removed_robot_disappears(arena: LiveArena, feed: Feed):
+    """The status no longer lists it; a new robot without a status yet stays."""
+    arena.pose("old", (0, 0, 0))
+    wait_for(lambda: "old" in feed.state().poses)
+
+    def speak() -> None:
+        arena.pose("rover", (0, 0, 0))
+        arena.pose("new", (0, 0, 0))
+        arena.status()
+
+    wait_for(lambda: set(feed.state().poses) == {"rover", "new"}, speak)

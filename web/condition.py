@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The condition of an arena in one line: green, amber or red, with what to do; and the operator's next step."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fusion.protocol.messages import FusionStatus
+from web.feed import ArenaState
+from web.tables import STALE_S, camera_silence_s, describe_silence, tabulate_cameras, tabulate_robots
+
+Level = Literal["ok", "warn", "bad", "wait"]
+Step = Literal["cameras", "calibrate", "robots", "run"]
+CONNECT_S = 5.0  # after the start of the page, while the absence of a server is no fault
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A level (a key of `web.html_tables.COLOURS`) and a sentence."""
+
+    level: Level
+    text: str
+
+
+def assess(state: ArenaState, endpoint: str) -> Condition:
+    """The worst fault of an arena, or its figures if it has none.
+
+    Args:
+        state: of a feed.
+        endpoint: where the server is expected.
+    """
+    faults = [*_server_faults(state, endpoint), *_camera_faults(state), *_robot_faults(state)]
+    for level in ("wait", "bad", "warn"):
+        found = [fault for fault in faults if fault.level == level]
+        if found:
+            more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+            return Condition(level, found[0].text + more)
+    return Condition("ok", _figures(state))
+
+
+def next_step(state: ArenaState) -> Step:
+    """What the operator should do next, in the order of the work."""
+    if not any(camera_silence_s(state, name) is None for name in state.cameras):
+        return "cameras"
+    if state.rig is None or not state.rig.placed():
+        return "calibrate"
+    status: FusionStatus | None = state.status.message if state.status else None
+    return "run" if status is None or status.robots else "robots"
+
+
+def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
+    """At most one: without a server nothing else is known."""
+    age_s = state.age_s(state.status)
+    if state.server_alive and age_s <= STALE_S:
+        return
+    if state.status is None and state.now_s - state.started_s < CONNECT_S:
+        yield Condition("wait", f"connecting to {endpoint} ...")
+    elif state.server_alive and state.status is None:
+        yield Condition("wait", "connected; waiting for the server's first status")
+    elif state.status is None:
+        yield Condition(
+            "bad", f"no server at {endpoint}: start python -m fusion, and check --connect and --arena"
+        )
+    else:
+        yield Condition("bad", f"the server is silent for {age_s:.0f} s: check that it runs at {endpoint}")
+
+
+def _camera_faults(state: ArenaState) -> Iterator[Condition]:
+    if state.age_s(state.status) > STALE_S:
+        return
+    silent = {name: s for name in sorted(state.cameras) if (s := camera_silence_s(state, name)) is not None}
+    for name, seconds in silent.items():
+        yield Condition("bad", f"camera {name} {describe_silence(seconds)}")
+    if not state.cameras:
+        yield Condition("warn", "no camera sends anything: start one with python -m camera_node")
+        return
+    if state.rig is None or not state.rig.placed():
+        yield Condition("warn", "the cameras are not calibrated: open Calibrate and record a wand")
+        return
+    for row in tabulate_cameras(state).rows:
+        if row.note and row.cells[0] not in silent:
+            yield Condition("warn", f"camera {row.cells[0]}: {row.note}")
+
+
+def _robot_faults(state: ArenaState) -> Iterator[Condition]:
+    if state.rig is None or state.age_s(state.status) > STALE_S:
+        return
+    rows = tabulate_robots(state).rows
+    if not rows:
+        yield Condition("warn", "no robot is declared: open Robots and create one")
+    for row in rows:
+        if row.cells[1] != "tracked":
+            reason = f": {row.note}" if row.note else ""
+            yield Condition("warn", f"robot {row.cells[0]} is {row.cells[1]}{reason}")
+        elif row.note:
+            yield Condition("warn", f"robot {row.cells[0]}: {row.note}")
+
+
+def _figures(state: ArenaState) -> str:
+    if state.status is None:
+        return "no data"
+    status: FusionStatus = state.status.message
+    tracked = sum(tracking == "tracked" for tracking in status.robots.values())
+    latency = (
+        f", latency {status.latency_ms:.0f} ms"
+        if status.latency_ms is not None and np.isfinite(status.latency_ms)
+        else ""
+    )
+    cameras = _count(len(state.cameras), "camera")
+    robots = f"{_count(tracked, 'robot')} tracked"
+    return f"{cameras}, {robots}, {status.frame_sets_per_s:.0f} poses/s{latency}"
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"

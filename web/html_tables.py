@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Tables, coloured texts and the style of the page, as HTML. All texts are escaped."""
+
+import html
+from dataclasses import dataclass
+
+COLOURS = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b", "wait": "#9aa0ac"}  # by level
+MARGIN_PX = 10
+CELL = "padding:3px 6px 3px 0"
+# On a phone Viser's panel is 20em wide and covers the scene: it takes the full width and the lower part instead.
+STYLE = """<style>
+@media (max-width: 36em) { [style*="width: 20em"] { width: 100vw !important } }
+th[title] { cursor: help; text-decoration: underline dotted #8886; text-underline-offset: 3px }
+.roundel-pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); gap: 6px }
+.roundel-pictures figure { margin: 0; font-size: 11px }
+.roundel-pictures img { width: 100%; display: block; border-radius: 3px; background: #000; min-height: 60px }
+</style>"""
+READ_ONLY_STYLE = """<style>
+.mantine-Button-root, input, textarea, .mantine-Checkbox-root, .mantine-Slider-root, .mantine-Select-root {
+  opacity: .45; pointer-events: none }
+</style>"""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's title, its unit or "", and an explanation that is shown when the pointer is on the title."""
+
+    title: str
+    unit: str = ""
+    explanation: str = ""
+
+    def html(self) -> str:
+        tip = f' title="{html.escape(self.explanation)}"' if self.explanation else ""
+        unit = f"<br>{html.escape(self.unit)}" if self.unit else ""
+        return f'<th style="{CELL};font-weight:500"{tip}>{html.escape(self.title)}{unit}</th>'
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """The cells of a row, its level (a key of `COLOURS`), a note, or "": a fault or an instruction; and the colour of
+    its dot, if that is not the level's."""
+
+    cells: tuple[str, ...]
+    level: str
+    note: str = ""
+    dot: str = ""
+
+    def html(self) -> str:
+        """Return the row; the note has its own line, because a sentence does not fit beside figures."""
+        cell = f'<td style="{CELL};white-space:nowrap">'
+        texts = f"</td>{cell}".join(html.escape(text) for text in self.cells)
+        dot = f'<span style="color:{self.dot or COLOURS[self.level]}">&#9679;</span> '
+        row = f'<tr style="border-top:1px solid #8883">{cell}{dot}{texts}</td></tr>'
+        style = f"white-space:normal;line-height:1.3;padding:0 0 4px 14px;color:{COLOURS[self.level]}"
+        note = f'<tr><td colspan="{len(self.cells)}" style="{style}">{html.escape(self.note)}</td></tr>'
+        return row + (note if self.note else "")
+
+
+@dataclass(frozen=True)
+class HtmlTable:
+    """Rows under a header; `placeholder` stands for no rows."""
+
+    columns: tuple[Column, ...]
+    rows: list[TableRow]
+    placeholder: str = "none"
+
+    def html(self) -> str:
+        """Return the table, with all texts escaped."""
+        if not self.rows:
+            return small(self.placeholder)
+        head = "".join(column.html() for column in self.columns)
+        body = "".join(row.html() for row in self.rows)
+        size = f"width:calc(100% - {2 * MARGIN_PX}px);margin:0 {MARGIN_PX}px 6px"
+        style = f"{size};border-collapse:collapse;font-size:11px;text-align:left"
+        return (
+            f'<table style="{style}"><tr style="opacity:.65;vertical-align:bottom;line-height:1.2">{head}</tr>'
+            f"{body}</table>"
+        )
+
+
+def small(text: str, level: str = "wait") -> str:
+    """A small line of text."""
+    style = f"margin:2px {MARGIN_PX}px 6px;font-size:11px;line-height:1.4;color:{COLOURS[level]}"
+    return f'<div style="{style}">{html.escape(text)}</div>'
+
+
+def status_line(level: str, text: str) -> str:
+    """The line at the top of the page, in the colour of its level."""
+    colour = COLOURS[level]
+    style = (
+        f"margin:6px {MARGIN_PX}px 10px;padding:6px 10px;border-left:4px solid {colour};background:{colour}22;"
+        "font-size:13px;line-height:1.35;border-radius:2px"
+    )
+    return f'<div role="status" data-level="{level}" style="{style}">{html.escape(text)}</div>'

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`roundel demo`: a whole arena with simulated cameras."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunDemo:
+    """Calibrate four simulated cameras with a simulated wand, track three robots, and show them at
+    http://localhost:8080. The exit code is 0 if the poses are correct.
+    """
+
+    headless: bool = False
+    """Serve no page."""
+    seconds: float | None = None
+    """End this long after the calibration; at Ctrl-C unless given."""
+    host: str = "127.0.0.1"
+    """Address of the page; 0.0.0.0 makes it available to the whole network, with tokens in its addresses."""
+    port: int = 8080
+    """Port of the page."""
+    scene: Path | None = None
+    """Another scene.yaml, with arena.yaml, robots.yaml and wand.yaml beside it."""
+    listen: str | None = None
+    """Zenoh endpoint of the server; tcp/127.0.0.1:7447 unless given, or a free port if that is taken."""
+
+    def run(self) -> int:
+        """Run the demo and return its exit code."""
+        from web.__main__ import Options, play_demo
+
+        return play_demo(
+            Options(
+                demo=True,
+                headless=self.headless,
+                seconds=self.seconds,
+                host=self.host,
+                port=self.port,
+                scene=self.scene,
+                listen=self.listen,
+            )
+        )

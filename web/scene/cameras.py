@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Draws calibrated cameras as frustums that show their live pictures."""
+
+import math
+from typing import Any
+
+import viser
+
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig
+from camera_node.geometry.pose import wxyz_from_rotation
+from web.colours import CAMERA
+
+FRUSTUM_SCALE = 0.25
+LABEL_ABOVE_M = 0.12  # in the image's upward direction
+LABEL_SCALE = 0.8
+
+
+class CameraDrawing:
+    """The frustums of a rig's cameras with their names, below one node of the scene.
+
+    Args:
+        scene: the scene.
+        root: name of that node.
+        colour: of the frustums, displayed.
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, root: str = "/cameras", colour: tuple[int, int, int] = CAMERA
+    ) -> None:
+        self._scene, self._root, self._colour = scene, root, colour
+        self._rig: Rig | None = None
+        self._frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self._labels: list[viser.LabelHandle] = []
+
+    def draw(self, rig: Rig | None) -> None:
+        """Draw the placed cameras of a rig; None removes them."""
+        if rig is self._rig:
+            return
+        for handle in (*self._frustums.values(), *self._labels):
+            handle.remove()
+        self._rig, self._frustums, self._labels = rig, {}, []
+        for name, camera in (rig.placed() if rig else {}).items():
+            self._add(name, camera)
+
+    def show_picture(self, name: str, jpeg: bytes | None) -> None:
+        """Show a live picture in a camera's frustum; None shows none."""
+        if name in self._frustums:
+            show_jpeg(self._frustums[name], jpeg)
+
+    def _add(self, name: str, camera: Camera) -> None:
+        T = camera.matrix()
+        self._frustums[name] = self._scene.add_camera_frustum(
+            f"{self._root}/{name}",
+            fov=2 * math.atan(camera.height / (2 * camera.fy)),
+            aspect=camera.width * camera.fy / (camera.height * camera.fx),
+            scale=FRUSTUM_SCALE,
+            thickness=0.01,
+            color=self._colour,
+            format="jpeg",
+            wxyz=wxyz_from_rotation(T[:3, :3]),
+            position=T[:3, 3],
+        )
+        label = self._scene.add_label(
+            f"{self._root}/{name}/name",
+            name,
+            position=(0.0, -LABEL_ABOVE_M, 0.0),
+            anchor="bottom-center",
+            font_screen_scale=LABEL_SCALE,
+        )
+        self._labels.append(label)
+
+
+def show_jpeg(handle: Any, jpeg: bytes | None) -> None:
+    """Show a JPEG that is not decoded here: Viser's own setter takes pixels and would encode them again."""
+    name = "_image_data" if hasattr(handle, "_image_data") else "_data"
+    if getattr(handle, name) is not jpeg:
+        setattr(handle, name, jpeg)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The floor, the world's axes, the light, and the viewpoint from which the whole arena is visible."""
+
+import math
+
+import numpy as np
+import viser
+
+from calib.rig.rig import Rig
+
+AXES_M = 0.5
+FIELD_OF_VIEW = math.radians(42)
+DISTANCE = 2.5  # of the initial viewpoint, in radii of the rig
+MIN_RADIUS_M = 1.5
+DIRECTION = np.array([-0.45, 0.78, -0.43])  # in which the initial view looks
+
+
+def add_lights(scene: viser.SceneApi) -> None:
+    """Add a sun and ambient light; Viser's default lights wash out colours on a dark ground."""
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(None)
+    scene.add_light_ambient("/lights/sky", intensity=1.2)
+    scene.add_light_directional("/lights/sun", intensity=1.6, position=(2.0, -3.0, 5.0))
+
+
+def add_floor(scene: viser.SceneApi) -> None:
+    """Add the plane z = 0 with lines every metre, and the axes x (red), y (green) and z (blue), half a metre long."""
+    scene.add_grid(
+        "/floor",
+        width=12.0,
+        height=12.0,
+        cell_color=(46, 49, 56),
+        section_color=(72, 77, 88),
+        fade_distance=14.0,
+        fade_strength=2.0,
+        fade_from="origin",
+        cell_size=0.5,
+        section_size=1.0,
+    )
+    scene.add_frame("/origin", axes_length=AXES_M, axes_radius=0.006, origin_radius=0.015)
+
+
+def default_viewpoint(
+    rig: Rig | None,
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return a position and a target, metres, from which the whole rig is visible."""
+    centres = [camera.matrix()[:3, 3] for camera in (rig.placed() if rig else {}).values()]
+    low, high = (np.min(centres, 0), np.max(centres, 0)) if centres else (np.full(3, -2.0), np.full(3, 2.0))
+    distance = DISTANCE * max(MIN_RADIUS_M, float(np.linalg.norm(high - low)) / 2)
+    target = np.array([*(low + high)[:2] / 2, 0.45 * high[2]])
+    return tuple((target - distance * DIRECTION).tolist()), tuple(target.tolist())

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The tab Cameras: what each camera does and sees."""
+
+import base64
+import html
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from camera_node.errors import ConfigError, NetworkError
+from camera_node.protocol.camera_requests import mask_of
+from camera_node.protocol.messages import Preview, Settings
+from web.coverage_picture import montage
+from web.feed import ArenaState
+from web.html_tables import MARGIN_PX
+from web.scene.cameras import CameraDrawing
+from web.subscription import REQUEST_TIMEOUT_S, Subscription
+from web.tables import STALE_S, tabulate_cameras
+from web.widgets import ActionButton, Answer, set_content, set_property
+
+NO_CAMERA = "no camera yet"
+
+
+class CameraTable:
+    """One row for each camera, and until the cameras are calibrated, where each has seen roundels."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._table = gui.add_html("")
+        self._coverage_folder = gui.add_folder("Wand coverage", visible=False)
+        with self._coverage_folder:
+            self._coverage = gui.add_image(montage({}))
+
+    def update(self, state: ArenaState) -> None:
+        """Show the state."""
+        set_content(self._table, tabulate_cameras(state).html())
+        calibrated = state.rig is not None and bool(state.rig.placed())
+        set_property(self._coverage_folder, "visible", bool(state.coverage) and not calibrated)
+        if self._coverage_folder.visible:
+            self._coverage.image = montage(state.coverage)
+
+
+class LivePictures:
+    """The cameras' pictures in a grid and in their frustums, while a browser is open and the box is ticked."""
+
+    def __init__(
+        self, server: viser.ViserServer, subscription: Subscription, frustums: CameraDrawing
+    ) -> None:
+        self._server, self._subscription, self._frustums = server, subscription, frustums
+        self._wanted = server.gui.add_checkbox(
+            "Live pictures", True, hint="each camera sends a small picture about three times a second"
+        )
+        self._grid = server.gui.add_html("")
+
+    def update(self, state: ArenaState) -> None:
+        """Show the recent pictures; those of a silent camera disappear."""
+        is_watched = self._wanted.value and bool(self._server.get_clients())
+        self._subscription.watch_previews(is_watched)
+        recent = {
+            name: timed.message
+            for name, timed in sorted(state.previews.items())
+            if is_watched and state.age_s(timed) < STALE_S
+        }
+        set_content(self._grid, picture_grid(recent, state) if is_watched else "")
+        for name in state.previews:
+            self._frustums.show_picture(name, recent[name].jpeg if name in recent else None)
+
+    def close(self) -> None:
+        """Have the cameras send no pictures."""
+        self._subscription.watch_previews(False)
+
+
+def picture_grid(previews: Mapping[str, Preview], state: ArenaState) -> str:
+    """The pictures as HTML, each with its camera's name and number of roundels."""
+    figures = []
+    for name, preview in previews.items():
+        seen = len(state.detections[name]) if name in state.detections else 0
+        jpeg = base64.b64encode(preview.jpeg).decode()
+        caption = f"{html.escape(name)}: {preview.width} x {preview.height}, {seen} roundels"
+        picture = f'<img alt="{html.escape(name)}" decoding="sync" src="data:image/jpeg;base64,{jpeg}">'
+        figures.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
+    style = f"margin:4px {MARGIN_PX}px 8px"
+    return f'<div class="roundel-pictures" style="{style}">{"".join(figures)}</div>' if figures else ""
+
+
+class CameraSettings:
+    """The settings of one camera, its mask, and its image in full resolution."""
+
+    def __init__(self, gui: viser.GuiApi, subscription: Subscription) -> None:
+        self._gui, self._subscription = gui, subscription
+        self._state = ArenaState()
+        self._folder = gui.add_folder("One camera")
+        with self._folder:
+            self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
+            self._exposure = gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0)
+            self._gain = gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units")
+            self._contrast = gui.add_number(
+                "Contrast",
+                25.0,
+                min=5.0,
+                max=250.0,
+                step=1.0,
+                hint="least contrast of a roundel, grey levels",
+            )
+            answer = Answer(gui)
+            hint = (
+                "ignore the places of all roundels that are detected now: reflections, while none is in view"
+            )
+            self._buttons = (
+                ActionButton(gui, "Read the settings", self.read, answer),
+                ActionButton(gui, "Apply", self.apply, answer, "zero leaves exposure or gain as it is"),
+                ActionButton(gui, "Mask everything detected now", self.mask_detected, answer, hint),
+                ActionButton(gui, "Remove the mask", self.remove_mask, answer),
+                ActionButton(gui, "Take a snapshot", self._show_snapshot, answer),
+            )
+            self._image: viser.GuiImageHandle | None = None
+
+    def update(self, state: ArenaState) -> None:
+        """Offer the cameras that publish."""
+        self._state = state
+        names = tuple(sorted(state.cameras)) or (NO_CAMERA,)
+        if names != tuple(self._camera.options):
+            self._camera.options = names
+        for button in self._buttons:
+            button.show(enabled=bool(state.cameras))
+
+    def read(self) -> str:
+        """Show the settings in use."""
+        return self._show(self._subscription.change_settings(self._name))
+
+    def apply(self) -> str:
+        """Change exposure, gain and contrast."""
+        wanted = Settings(
+            exposure_us=self._exposure.value or None,
+            gain=self._gain.value or None,
+            min_contrast=self._contrast.value,
+        )
+        return self._show(self._subscription.change_settings(self._name, wanted))
+
+    def mask_detected(self) -> str:
+        """Add the places of all roundels that the camera detects now to its mask."""
+        detections = self._state.detections.get(self._name)
+        if detections is None or not len(detections):
+            raise ConfigError(f"{self._name} detects nothing now; there is nothing to mask")
+        used = self._subscription.change_settings(self._name)
+        mask = (*(used.mask or ()), *mask_of(detections))
+        return self._show(self._subscription.change_settings(self._name, Settings(mask=mask)))
+
+    def remove_mask(self) -> str:
+        """Have the camera ignore no place."""
+        return self._show(self._subscription.change_settings(self._name, Settings(mask=())))
+
+    @property
+    def _name(self) -> str:
+        return str(self._camera.value)
+
+    def _show(self, used: Settings) -> str:
+        self._exposure.value, self._gain.value = used.exposure_us or 0.0, used.gain or 0.0
+        self._contrast.value = used.min_contrast or self._contrast.value
+        exposure = "automatic" if used.exposure_us is None else f"{used.exposure_us:.0f} us"
+        return f"{self._name}: exposure {exposure}, {len(used.mask or ())} masked places"
+
+    def _show_snapshot(self) -> str:
+        name = self._name
+        image = decode_jpeg(self._subscription.snapshot(name))
+        if image is None:
+            raise NetworkError(f"{name} sent no image within {REQUEST_TIMEOUT_S:.0f} s")
+        if self._image is not None:
+            self._image.remove()
+        with self._folder:
+            self._image = self._gui.add_image(image, format="jpeg")
+        return f"{name}, {image.shape[1]} x {image.shape[0]}"
+
+
+def decode_jpeg(data: bytes | None) -> NDArray[np.uint8] | None:
+    """Decode a JPEG to (h, w, 3) RGB; return None for anything else."""
+    if not data:
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else np.ascontiguousarray(image[..., ::-1], np.uint8)

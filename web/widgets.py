@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Controls that all tabs use: a line for outcomes, and buttons that run one action at a time."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from camera_node.errors import RoundelError
+from web.html_tables import small
+
+log = logging.getLogger("web")
+GREY, PRIMARY = (58, 63, 74), None  # colours of buttons; None is the theme's primary colour
+
+
+class Answer:
+    """A line of text for the outcome of an action."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._handle = gui.add_html("", visible=False)
+
+    def show(self, text: str, level: str = "wait") -> None:
+        """Show a text in the colour of a level; an empty one hides the line."""
+        set_content(self._handle, small(text, level) if text else "")
+        if self._handle.visible != bool(text):
+            self._handle.visible = bool(text)
+
+
+class ActionButton:
+    """A button that runs an action, shows its outcome, and is disabled while it runs.
+
+    Args:
+        gui: where the button is added.
+        label: of the button.
+        act: returns the outcome as text; a RoundelError is shown, any other exception is logged and shown.
+        answer: the line for the outcome.
+        hint: explanation that is shown when the pointer is on the button.
+    """
+
+    def __init__(
+        self, gui: viser.GuiApi, label: str, act: Callable[[], str], answer: Answer, hint: str | None = None
+    ) -> None:
+        self._act, self._answer = act, answer
+        self._running = threading.Lock()
+        self._enabled = True
+        self.handle = gui.add_button(label, color=GREY, hint=hint)
+        self.handle.on_click(lambda _: self.run())
+
+    def run(self) -> None:
+        """Run the action, unless it runs already or can not act."""
+        if not self._enabled or not self._running.acquire(blocking=False):
+            return
+        self.handle.disabled = True
+        try:
+            self._answer.show(self._act(), "ok")
+        except RoundelError as error:
+            self._answer.show(str(error), "bad")
+        except Exception as error:  # the page must show any failure to its user
+            log.exception("the action %s failed", self.handle.label)
+            self._answer.show(f"this failed: {type(error).__name__}: {error}", "bad")
+        finally:
+            self._running.release()
+            self.handle.disabled = not self._enabled
+
+    def show(self, enabled: bool = True, primary: bool = False, label: str = "") -> None:
+        """Enable the button where it can act, and colour it where it is the operator's next step."""
+        self._enabled = enabled
+        disabled = not enabled or self._running.locked()
+        for name, value in (("disabled", disabled), ("color", PRIMARY if primary else GREY)):
+            set_property(self.handle, name, value)
+        if label:
+            set_property(self.handle, "label", label)
+
+
+def set_content(handle: Any, text: str) -> None:
+    """Set a control's text if it differs."""
+    set_property(handle, "content", text)
+
+
+def set_property(handle: Any, name: str, value: object) -> None:
+    """Set a property of a control if it differs: Viser sends every assignment to all browsers."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
+
+
+def escape_markdown(text: str) -> str:
+    """Escape text from the network so that Markdown shows it literally."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]()#+!|<>~$" else c for c in text)
