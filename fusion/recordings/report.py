@@ -67,7 +67,12 @@ class Summary:
 
 
 def write_poses(path: Path, fused: Iterable[TrackingResult]) -> None:
-    """Write all poses as CSV with `COLUMNS`, atomically.
+    """Write all poses of fused frame sets, as `write_pose_table`."""
+    write_pose_table(path, (pose for frame_set in fused for pose in frame_set.poses))
+
+
+def write_pose_table(path: Path, poses: Iterable[RobotPose]) -> None:
+    """Write poses as CSV with `COLUMNS`, atomically.
 
     Raises:
         ConfigError: the folder can't be written to.
@@ -75,8 +80,7 @@ def write_poses(path: Path, fused: Iterable[TrackingResult]) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS.split(","))
-    for frame_set in fused:
-        writer.writerows(map(_row, frame_set.poses))
+    writer.writerows(map(_row, poses))
     write_atomically(path, text.getvalue())
 
 

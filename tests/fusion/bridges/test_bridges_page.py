@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The commands of docs/bridges.md run as they are written there, with the endpoint and the port of the test."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -9,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from calib.rig.recording import RecordingWriter
+from camera_node.protocol.messages import encode
 from tests.conftest import ROOT, free_port
-from tests.fusion.bridges.pose_server import ARENA, PoseServer, first_line
+from tests.fusion.bridges.pose_server import ARENA, PoseServer, first_line, moving_pose
 from tests.waiting import DEADLINE_S
 
 PAGE = (ROOT / "docs" / "bridges.md").read_text()
@@ -19,11 +22,28 @@ COMMANDS = [
 ]
 
 
+def test_the_page_exports(tmp_path: Path):
+    with RecordingWriter(tmp_path / "monday.mcap") as writer:
+        for k in range(10):
+            pose = moving_pose("rover", 1_790_000_000_000_000_000 + k * 20_000_000)
+            writer.put("x/robot/rover/pose", encode(pose), pose.t_ns)
+    for command in COMMANDS:
+        if " export " in command:
+            python, *words = shlex.split(command)
+            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+            program = subprocess.run(
+                [sys.executable, *words], cwd=tmp_path, env=environment, timeout=DEADLINE_S, check=False
+            )
+            assert python == "python"
+            assert program.returncode == 0
+            assert (tmp_path / words[-1]).exists()
+
+
 def test_the_page_has_commands():
     assert len(COMMANDS) >= 2
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if "export" not in c])
+@pytest.mark.parametrize("command", [c for c in COMMANDS if " export " not in c])
 def test_a_bridge_of_the_page_runs_until_it_is_ended(command: str, endpoint: str, tmp_path: Path):
     python, *words = shlex.split(command)
     assert python == "python"

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion export`: a recording in the formats of other programs."""
+
+from pathlib import Path
+from typing import Literal
+
+from camera_node.errors import ConfigError
+from camera_node.terminal import say
+from fusion.export.files import write_c3d, write_csv, write_rosbag, write_trc, write_tum
+from fusion.export.points import sample_points
+from fusion.export.poses import RecordedPoses
+
+Format = Literal["c3d", "trc", "csv", "tum", "rosbag"]
+FORMATS: dict[str, Format] = {".c3d": "c3d", ".trc": "trc", ".csv": "csv", ".tum": "tum", "": "rosbag"}
+
+
+def export(
+    recording: Path,
+    out: Path,
+    /,
+    *,
+    format: Format | None = None,
+    robots: tuple[str, ...] = (),
+    rate_hz: float | None = None,
+    force: bool = False,
+) -> int:
+    """Write the poses of a recording (MCAP) in the format of another program.
+
+    Args:
+        recording: the MCAP file of fusion record or fusion replay.
+        out: the file to write: .c3d, .trc, .csv or .tum; a name without suffix becomes a ROS 2 bag, a folder.
+        format: the format, if the suffix does not say it.
+        robots: names of the robots to write; all unless given.
+        rate_hz: frames a second (C3D, TRC); the rate of the poses unless given.
+        force: replace what exists.
+    """
+    chosen = format or FORMATS.get(out.suffix)
+    if chosen is None:
+        raise ConfigError(
+            f"{out.name} does not say its format; end it in .c3d, .trc, .csv or .tum, or give --format"
+        )
+    if out.exists() and not force:
+        raise ConfigError(f"{out} exists; give another name, or --force to replace it")
+    poses = RecordedPoses(recording, robots)
+    files = _write(chosen, poses, out, rate_hz)
+    for reason, count in sorted(poses.faults.items()):
+        say(f"skipped: {count} {reason}")
+    for robot, count in sorted(poses.counts.items()):
+        say(f"{count:7} poses of {robot}")
+    for file in files:
+        say(f"wrote {file}")
+    return 0
+
+
+def _write(format: Format, poses: RecordedPoses, out: Path, rate_hz: float | None) -> list[Path]:
+    """Write a file; return what was written."""
+    if format == "tum":
+        return write_tum(poses, out)
+    if format in ("c3d", "trc"):
+        write = write_c3d if format == "c3d" else write_trc
+        write(sample_points(poses, rate_hz), out)
+    else:
+        (write_csv if format == "csv" else write_rosbag)(poses, out)
+    return [out]

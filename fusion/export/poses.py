@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The poses of a recording, read one after the other: an hour of a large arena exceeds the memory."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from calib.rig.recording import read_messages
+from camera_node.errors import ConfigError
+from camera_node.protocol.messages import MessageError, decode
+from fusion.model.robots import Robot
+from fusion.protocol.messages import RobotPose, Robots
+
+
+class RecordedPoses:
+    """The poses of a recording; iterating reads the file.
+
+    Args:
+        path: the MCAP file.
+        robots: names of the robots to read; all unless given.
+
+    Attributes:
+        bodies: the robots' markers, once the file was read; the last ones that were recorded.
+        counts: poses by robot.
+        faults: skipped messages, by reason.
+    """
+
+    def __init__(self, path: Path, robots: Sequence[str] = ()) -> None:
+        self.path = path
+        self.bodies: dict[str, Robot] = {}
+        self.counts: Counter[str] = Counter()
+        self.faults: Counter[str] = Counter()
+        self._robots = frozenset(robots)
+
+    def __iter__(self) -> Iterator[RobotPose]:
+        """Yield the poses of each robot in the order of their times.
+
+        Raises:
+            ConfigError: the file is missing or no recording, or holds no poses of these robots.
+        """
+        self.counts.clear()
+        last_ns: dict[str, int] = {}
+        for key, data, _ in read_messages(self.path, self.faults):
+            if key.endswith("/robots"):
+                self._add_bodies(data)
+            if not key.endswith("/pose") or (pose := self._decode(data)) is None:
+                continue
+            if pose.t_ns <= last_ns.get(pose.robot, -1):
+                self.faults["poses that are not later than the one before"] += 1
+                continue
+            last_ns[pose.robot] = pose.t_ns
+            self.counts[pose.robot] += 1
+            yield pose
+        self._check()
+
+    def _check(self) -> None:
+        if not self.counts and not self._robots:
+            raise ConfigError(
+                f"{self.path} holds no poses; write them with fusion replay {self.path} --out fused.mcap"
+            )
+        if missing := sorted(self._robots - set(self.counts)):
+            raise ConfigError(f"{self.path} holds no poses of {', '.join(missing)}; check --robots")
+
+    def _decode(self, data: bytes) -> RobotPose | None:
+        try:
+            pose = decode(data, RobotPose)
+        except MessageError:
+            self.faults["undecodable poses"] += 1
+            return None
+        return pose if not self._robots or pose.robot in self._robots else None
+
+    def _add_bodies(self, data: bytes) -> None:
+        try:
+            self.bodies = decode(data, Robots).robots
+        except MessageError:
+            self.faults["undecodable robots"] += 1
