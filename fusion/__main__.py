@@ -14,7 +14,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "run": "run",
     "replay": "replay",
     "record": "record",
-    "recordings": "recordings",
+    "recordings": "record",
     "repair": "repair",
     "health": "health",
     "doctor": "doctor",

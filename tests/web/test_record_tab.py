@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from camera_node.protocol.session import open_client
-from fusion.commands.recordings import recordings
+from fusion.commands.record import recordings
 from fusion.recordings.summary import list_recordings
 from tests.fusion.serving import serving_an_unknown_robot
 from tests.waiting import wait_for
@@ -23,7 +23,6 @@ from web.page import add_live_page
 from web.subscription import Subscription
 from web.tabs.record import tabulate_recordings
 from web.view import View
-
 
 EXPORT_MS = 120_000  # on a busy machine: a process starts and fuses the recording
 
