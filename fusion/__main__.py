@@ -25,6 +25,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "ros2": "ros2",
     "vrpn": "vrpn",
     "mavlink": "mavlink",
+    "foxglove": "foxglove",
 }
 
 
