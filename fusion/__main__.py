@@ -22,10 +22,10 @@ COMMANDS = {  # and their modules in fusion.commands
     "undo": "undo",
     "redo": "undo",
     "export": "export",
-    "ros2": "ros2",
-    "vrpn": "vrpn",
-    "mavlink": "mavlink",
-    "foxglove": "foxglove",
+    "ros2": "bridges.ros2",
+    "vrpn": "bridges.vrpn",
+    "mavlink": "bridges.mavlink",
+    "foxglove": "bridges.foxglove",
 }
 
 

@@ -24,7 +24,7 @@ from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.bridges.ros2 import Ros2Node, ros_name
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
 from fusion.client.arena import Arena
-from fusion.commands.ros2 import ros2
+from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.messages import RobotPose
 
 DEADLINE_S = 60.0
