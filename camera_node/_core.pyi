@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 
 class RoundelLimits:
-    """The limits within which a ring counts as a roundel."""
+    """The limits within which a ring counts as a roundel. Without `inner_ratios` the detector finds the prints."""
 
     def __init__(
         self,
@@ -41,4 +41,6 @@ class Detector:
     @property
     def theta(self) -> float | None: ...
     @property
-    def tone_exponent(self) -> float: ...
+    def tone_exponent(self) -> float | None: ...
+    @property
+    def found_ratios(self) -> list[float]: ...

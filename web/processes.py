@@ -41,7 +41,7 @@ class Processes:
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments` until it ends, `stop` is called or this process ends, by whatever cause."""
-        command = [sys.executable, "-m", "web.child", module, *arguments]
+        command = [sys.executable, "-m", "camera_node.child", module, *arguments]
         # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
         environment = os.environ | {
             "PYTHONUNBUFFERED": "1",

@@ -2,7 +2,7 @@
 """`calib wand`: calibrates camera poses from a wand that is waved in front of the cameras."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +14,9 @@ from calib.commands.connection import Connection, Server
 from calib.commands.inputs import WandOptions, require_positive
 from calib.commands.output import check_folder, provenance, save_maps, write_rig
 from calib.commands.report import print_recalibration, print_report, show_progress
+from calib.errors import CalibrationError
+from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
+from calib.live.camera_sizes import running_camera_sizes
 from calib.live.collect import CollectedFrames
 from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
@@ -31,12 +34,29 @@ from camera_node.terminal import console, progress_console, say
 PROGRAM = "calib wand"
 
 
+def add_nominal_lenses(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Rig:
+    """The rig with a nominal lens for each camera that it lacks; prints which ones.
+
+    Raises:
+        CalibrationError: there is no camera at all.
+    """
+    completed, missing = with_nominal_lenses(rig, sizes)
+    if missing:
+        say(
+            f"no lens known of {', '.join(missing)}: starting from a field of view of {FIELD_OF_VIEW_DEG:g} degrees"
+        )
+    if not completed.cameras:
+        raise CalibrationError("no camera publishes; start cameras with roundel camera, or give --rig")
+    return completed
+
+
 @dataclass(frozen=True, kw_only=True)
 class Wand(WandOptions):
     """Calibrate camera poses from a wand that is waved in front of the cameras."""
 
     rig: Path
-    """Intrinsics of every camera; its poses are used with --only."""
+    """Intrinsics of the cameras; its poses are used with --only. With --live or --recording, the lens of a camera that
+    it lacks is found from a nominal one; the file may be missing."""
     out: Path
     """The file for the rig with poses; a previous file is saved as rig.1.yaml, ..."""
     live: bool = False
@@ -53,17 +73,24 @@ class Wand(WandOptions):
         check_folder(self.out)
         self.require_recording(live=self.live)
         require_positive(self.seconds)
-        rig, wand = load_rig(self.rig), load_wand(self.wand)
+        rig, wand = self._load_lenses(), load_wand(self.wand)
         if self.distance is not None and self.only is not None:
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"
             )
-        distance = self.measured_distance(rig)
         if self.live:
-            self._calibrate_live(rig, wand, distance)
-        else:
-            placed = self._calibrate(rig, wand, self.read_recording(rig, wand), distance)
-            self.server.conclude(placed, self.out, PROGRAM, live=False)
+            self._calibrate_live(rig, wand)
+            return
+        messages = self.read_recording(rig, wand)
+        if self.recording is not None:
+            rig = add_nominal_lenses(rig, {m.camera: (m.width, m.height) for m in messages})
+        placed = self._calibrate(rig, wand, messages, self.measured_distance(rig))
+        self.server.conclude(placed, self.out, PROGRAM, live=False)
+
+    def _load_lenses(self) -> Rig:
+        """The rig; without cameras if there is no file, and cameras can be added."""
+        may_be_missing = self.only is None and (self.live or self.recording is not None)
+        return load_known_lenses(self.rig) if may_be_missing else load_rig(self.rig)
 
     def _calibrate(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
@@ -97,8 +124,11 @@ class Wand(WandOptions):
         figures = result.rig.calibration | {"only": {"camera": name, **provenance()}}
         return msgspec.structs.replace(result.rig, calibration=figures)
 
-    def _calibrate_live(self, rig: Rig, wand: Body, distance: Distance | None) -> None:
+    def _calibrate_live(self, rig: Rig, wand: Body) -> None:
         with self.server.open() as session:
+            if self.only is None:
+                rig = add_nominal_lenses(rig, running_camera_sizes(session, self.server.arena))
+            distance = self.measured_distance(rig)
             collected, reason = self._collect(session, rig, wand, distance)
         say(f"the wand session ended: {reason}")
         if collected.invalid:

@@ -34,8 +34,8 @@ class Detect:
     """Draw the roundels on the image and write it to this file; for a single image."""
     detector: Literal["chords", "paper"] = "chords"
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
-    inner_ratio: tuple[float, ...] = (0.6, 0.41)
-    """Inner over outer diameter of the prints in use."""
+    inner_ratios: tuple[float, ...] = ()
+    """Inner over outer diameters of the prints in use, such as 0.6; without any, they are found."""
     rig: Path | None = None
     """A rig.yaml with the camera's lens: adds both poses of each roundel. Requires --name and --diameter."""
     name: str | None = None
@@ -60,7 +60,7 @@ class Detect:
         for path in self.images:
             image = read_grey(path)
             # The images are not a sequence, so each one gets a detector without tracks.
-            detector = Detector(detector=self.detector, inner_ratios=self.inner_ratio)
+            detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
             roundels = detector.detect(image)
             rows = [_describe(roundel) for roundel in roundels]
             if lens is not None and self.diameter is not None:

@@ -4,6 +4,7 @@
 import contextlib
 import signal
 import time
+import typing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,25 +13,32 @@ import tyro
 
 from camera_node.config import example_file, require_name
 from camera_node.errors import CameraError
+from camera_node.protocol.registration import CameraAssignment, CameraRegistration
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.frame import Source, SourceSettings
-from camera_node.sources.replay import FrameFolder, PacedSource, VideoFile
+from camera_node.sources.identity import SourceIdentity, identify, is_simulation
+from camera_node.sources.replay import ArenaTime, FrameFolder, PacedSource, VideoFile
 from camera_node.sources.v4l2 import V4l2Source, find_device
+
+if typing.TYPE_CHECKING:
+    import zenoh
+
+    from camera_node.node.node import Node
 
 
 @dataclass(frozen=True)
 class Publish:
     """Publish every roundel of every frame of one camera over Zenoh, until stopped.
 
-    To detect in single images: python -m camera_node detect IMAGE...
-    To print roundels: python -m camera_node print roundels.svg
+    Without --name the server gives the camera its name and stores its settings.
     """
 
     source: str
-    """A camera by number (0), path (/dev/video2) or name; a video file; a folder of <t_ns>.png|jpg; or sim."""
-    name: str
-    """The camera's name in the arena and in rig.yaml, such as cam0."""
+    """A camera by number (0), path (/dev/video2) or name; a video file; a folder of <t_ns>.png|jpg; or sim, or
+    sim:NAME for a camera of the scene."""
+    name: str | None = None
+    """The camera's name in the arena and in rig.yaml, such as cam0; the server's choice unless given."""
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Zenoh endpoints of the server."""
     arena: str = "arena"
@@ -39,60 +47,112 @@ class Publish:
     """A Zenoh configuration file (JSON5) for TLS, access control or scouting."""
     detector: Literal["chords", "paper"] = "chords"
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
-    inner_ratios: tuple[float, ...] = (0.6, 0.41)
-    """Inner over outer diameters of the roundels in use."""
+    inner_ratios: tuple[float, ...] = ()
+    """Inner over outer diameters of the prints in use, such as 0.6; without any, they are found."""
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> None:
         """Open the source and the session, publish until the source ends or a signal arrives, and close both."""
         import cv2
 
-        from camera_node.detection.detector import Detector
-        from camera_node.node.node import Node
         from camera_node.protocol.session import open_client
 
-        require_name(self.name, "a camera")
         require_name(self.arena, "an arena")
+        if self.name is not None:
+            require_name(self.name, "a camera")
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         cv2.setNumThreads(1)  # a machine runs one process for each of its cameras
-        with contextlib.ExitStack() as stack:
-            source = open_source(self.source, self.settings, self.name)
-            stack.callback(source.close)
-            session = stack.enter_context(open_client(self.connect, self.zenoh))
-            detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
-            keep_stamps = source.is_recording and self.settings.stamps == "recorded"
-            node = Node(self.name, source, detector, session, self.arena, keep_stamps)
-            with contextlib.suppress(KeyboardInterrupt):
-                node.run()
+        with contextlib.suppress(KeyboardInterrupt):
+            if self.name is not None:
+                with contextlib.ExitStack() as stack:
+                    source = open_source(self.source, self.settings, self.name)
+                    stack.callback(source.close)
+                    session = stack.enter_context(open_client(self.connect, self.zenoh))
+                    keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
+                    self._node(self.name, source, session, keeps_stamps).run()
+                return
+            identity, first_t_ns = identify(self.source), first_time(self.source, self.settings)
+            with open_client(self.connect, self.zenoh) as session:
+                self._publish_registered(session, identity, first_t_ns)
+
+    def _publish_registered(
+        self, session: "zenoh.Session", identity: SourceIdentity, first_t_ns: int | None
+    ) -> None:
+        """Publish under the name that the server gives; start again under each new name."""
+        from camera_node.node.registration import RegisteredNode, Registration, camera_id
+
+        request = CameraRegistration(
+            id=camera_id(identity.key),
+            driver=identity.driver,
+            source=identity.label,
+            width=self.settings.width or 0,
+            height=self.settings.height or 0,
+            name=identity.name,
+            first_t_ns=first_t_ns,
+        )
+        registration = Registration(session, self.arena, request)
+        assignment: CameraAssignment | None = registration.ask()
+        arena_time = ArenaTime.of(assignment)
+        with contextlib.closing(registration):
+            registered = RegisteredNode(registration)
+            while assignment is not None:
+                source = open_source(self.source, self.settings, assignment.name, arena_time)
+                with contextlib.closing(source):
+                    node = self._node(assignment.name, source, session, source.is_recording)
+                    assignment = registered.run(node, assignment)
+
+    def _node(self, name: str, source: Source, session: "zenoh.Session", keep_stamps: bool) -> "Node":
+        from camera_node.detection.detector import Detector
+        from camera_node.node.node import Node
+
+        detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
+        return Node(name, source, detector, session, self.arena, keep_stamps)
 
 
-def open_source(text: str, settings: SourceSettings, name: str = "cam0") -> Source:
+def open_source(
+    text: str, settings: SourceSettings, name: str = "cam0", arena_time: ArenaTime | None = None
+) -> Source:
     """Open the source that `--source` names: `sim`, a folder, a video file, or a camera by number, path or name.
 
     Args:
         text: the value of `--source`.
         settings: each kind of source uses those that apply to it.
-        name: the camera's name in a simulated arena.
+        name: the camera's name in a simulated arena, unless `text` has it, as in `sim:north`.
+        arena_time: recordings and simulations play as live cameras in this time, whatever `settings` say.
 
     Raises:
         CameraError: the source does not exist or does not open.
         ConfigError: a setting is invalid, or a simulation has no scene.
     """
     settings.check()
-    if text == "sim":
-        return _open_simulation(settings, name)
+    if is_simulation(text):
+        return _open_simulation(settings, text.partition(":")[2] or name, arena_time)
     if is_url(text):
         raise CameraError(
             f"{without_credentials(text)} is a network stream, which can't be read yet; give a camera"
         )
     if Path(text).is_dir():
-        return PacedSource(FrameFolder(Path(text)), settings)
+        return PacedSource(FrameFolder(Path(text)), settings, arena_time)
     if Path(text).is_file():
-        return PacedSource(VideoFile(Path(text), settings.fps), settings)
+        return PacedSource(VideoFile(Path(text), settings.fps), settings, arena_time)
     return V4l2Source(find_device(text), settings)
 
 
-def _open_simulation(settings: SourceSettings, name: str) -> Source:
+def first_time(text: str, settings: SourceSettings) -> int | None:
+    """The time of a recording's or a simulation's first frame by its own clock, ns; None for cameras."""
+    if is_simulation(text):
+        return 0
+    if Path(text).is_dir():
+        return int(FrameFolder(Path(text)).files[0].stem)
+    if Path(text).is_file():
+        times = VideoFile(Path(text), settings.fps).times
+        return times[0] if times else 0
+    return None
+
+
+def _open_simulation(settings: SourceSettings, name: str, arena_time: ArenaTime | None) -> Source:
     scene = settings.scene or example_file("demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
+    if arena_time is not None:
+        epoch_ns = arena_time.shift_ns - arena_time.ahead_ns
     return SimulatedCamera(scene, name, epoch_ns)

@@ -14,13 +14,17 @@ from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.errors import ConfigError
 
+MAX_RATIOS = 16
+
 
 @dataclass(frozen=True)
 class DetectorSettings:
     """Settings of a detector that can be changed while it runs.
 
     Attributes:
-        inner_ratios: inner over outer diameters of the prints in use.
+        inner_ratios: inner over outer diameters of the prints in use. Without any, the detector finds them: rings of
+            0.26 to 0.74 count as roundels until three of one ratio are in a frame, then only those of that ratio and
+            the usual ones (0.6 and 0.41).
         ratio_tolerance: largest difference between a measured ratio and that of a print.
         min_diameter_px, max_diameter_px: limits on the major axis of the outer ellipse.
         min_contrast: least difference of the bright and the dark level, grey levels. A lower value finds more in poor
@@ -35,7 +39,7 @@ class DetectorSettings:
         ConfigError: a setting is out of its range.
     """
 
-    inner_ratios: Sequence[float] = (0.6, 0.41)
+    inner_ratios: Sequence[float] = ()
     ratio_tolerance: float = 0.08
     min_diameter_px: float = 8.0
     max_diameter_px: float = 400.0
@@ -45,9 +49,9 @@ class DetectorSettings:
 
     def __post_init__(self) -> None:
         smallest, largest = self.min_diameter_px, self.max_diameter_px
-        if not self.inner_ratios or not all(0.1 <= ratio <= 0.95 for ratio in self.inner_ratios):
+        if len(self.inner_ratios) > MAX_RATIOS or not all(0.1 <= r <= 0.95 for r in self.inner_ratios):
             raise ConfigError(
-                f"inner_ratios are {self.inner_ratios}; give one or more numbers in [0.1, 0.95]"
+                f"inner_ratios are {self.inner_ratios}; give up to {MAX_RATIOS} numbers in [0.1, 0.95], or none"
             )
         if not 0 < self.ratio_tolerance <= 0.5:
             raise ConfigError(f"ratio_tolerance is {self.ratio_tolerance}; give a number in (0, 0.5]")
@@ -119,9 +123,17 @@ class Detector:
         return self._core.theta
 
     @property
-    def tone_exponent(self) -> float:
-        """The exponent that makes this camera's levels proportional to light, learned from roundels; 1 at first."""
+    def tone_exponent(self) -> float | None:
+        """The exponent that makes this camera's levels proportional to light; None before roundels determine it.
+
+        A known print determines it, or roundels of one print and several sizes.
+        """
         return self._core.tone_exponent
+
+    @property
+    def found_ratios(self) -> tuple[float, ...]:
+        """The ratios of the prints that recur in this camera's frames; empty if `inner_ratios` is given."""
+        return tuple(self._core.found_ratios)
 
     def adjusted(self, **changes: Any) -> "Detector":
         """A detector with other settings, by the names of the constructor.

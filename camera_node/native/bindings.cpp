@@ -53,14 +53,26 @@ NB_MODULE(_core, m) {
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
     nb::class_<roundel::RoundelLimits>(m, "RoundelLimits")
-        .def(nb::init<std::vector<double>, double, double, double, double>(), nb::arg("inner_ratios"),
-             nb::arg("ratio_tolerance"), nb::arg("min_diameter"), nb::arg("max_diameter"),
-             nb::arg("min_contrast"));
+        .def(
+            "__init__",
+            [](roundel::RoundelLimits* limits, const std::vector<double>& ratios, double ratio_tolerance,
+               double min_diameter, double max_diameter, double min_contrast) {
+                new (limits) roundel::RoundelLimits{.ratio_tolerance = ratio_tolerance,
+                                                    .min_diameter = min_diameter,
+                                                    .max_diameter = max_diameter,
+                                                    .min_contrast = min_contrast};
+                limits->any_print = ratios.empty();
+                if (!ratios.empty()) limits->prints.clear();
+                for (const double ratio : ratios) limits->prints.push_back({ratio});
+            },
+            nb::arg("inner_ratios"), nb::arg("ratio_tolerance"), nb::arg("min_diameter"),
+            nb::arg("max_diameter"), nb::arg("min_contrast"));
     nb::class_<roundel::Detector>(m, "Detector")
         .def(nb::init<roundel::RoundelLimits, double, bool>(), nb::arg("limits"), nb::arg("search_share"),
              nb::arg("by_paper"))
         .def("detect", &detect, nb::arg("image").noconvert())
         .def("take_over", &roundel::Detector::take_over, nb::arg("other"))
+        .def_prop_ro("found_ratios", &roundel::Detector::found_ratios)
         .def_prop_ro("theta", &roundel::Detector::theta)
         .def_prop_ro("tone_exponent", &roundel::Detector::tone_exponent);
 }

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <span>
 
 #include "search/ray_fit.hpp"
 #include "verify/level_check.hpp"
@@ -17,8 +18,13 @@ constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are sear
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
 constexpr int kMaxFailures = 3;        // of which so many may fail
 
+// Least contrast of the further rings of a bullseye: blur makes thin rings, and paper between them, grey. Both
+// are tried for a ring of no known print, which is more often one of a bullseye.
+constexpr double kRingDepths[] = {0.3, 0.5};
+
 constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
 constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
+constexpr int kExploreInterval = 128;   // frames in which it is searched for any print once
 constexpr double kMaxPartsShare = 0.5;  // of a frame: beyond it the whole frame is searched
 constexpr double kMinChange = 1 / 8.0;  // of the least contrast: change of a tile's mean
 // Noise alone spans 8 standard deviations in 10,000 pixels, and 9 in the widest tile of a frame.
@@ -27,18 +33,26 @@ constexpr double kNoiseSpan = 9.5;
 }  // namespace
 
 Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
-    : limits_(std::move(limits)), search_share_(search_share), chords_(limits_), matcher_(limits_) {
+    : limits_(std::move(limits)),
+      any_limits_(limits_),
+      search_share_(search_share),
+      chords_(limits_, false),
+      matcher_(limits_) {
     if (by_paper) paper_.emplace();
+    if (!limits_.any_print) return;
+    print_ratios_.emplace();
+    limits_.prints = any_limits_.prints = print_ratios_->prints();
 }
 
-Detector::FrameState::FrameState(const ImageView& view)
-    : image(view), noise(noise_level(view)), suppression(view.width, view.height) {}
+Detector::FrameState::FrameState(const ImageView& view, const RoundelLimits& those)
+    : image(view), limits(those), noise(noise_level(view)), suppression(view.width, view.height) {}
 
 FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    FrameState frame(linear);
+    const bool any = explores();
+    FrameState frame(linear, any ? any_limits_ : limits_);
     fit_tracked(frame);
     if (paper_)
         search_by_paper(frame);
@@ -51,6 +65,7 @@ FrameResult Detector::detect(const ImageView& image) {
         update_theta(frame);
     else
         mark_searched(frame);
+    learn_prints(frame);
     learn_response(frame);
     return {std::move(frame.found), n_postponed_};
 }
@@ -62,6 +77,17 @@ void Detector::fit_tracked(FrameState& frame) const {
         if (!(expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) &&
             !fit_and_accept(fit_rays(frame.image, expected.seed, limits_), expected.track, frame))
             frame.lost.push_back(expected);
+}
+
+/// Whether this frame is searched for any print, as the second one is and one in 128 thereafter: twice the
+/// clutter looks like rings of any ratio as of two.
+bool Detector::explores() {
+    any_chords_.reset();
+    if (!print_ratios_ || explore_in_-- > 0) return false;
+    explore_in_ = kExploreInterval - 1;
+    any_chords_.emplace(any_limits_, true);
+    n_frames_ = kSearchInterval;
+    return true;
 }
 
 void Detector::search_by_chords(FrameState& frame) {
@@ -106,10 +132,11 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
 /// Collects the seeds and streaks of a part.
 void Detector::search_part(const Box& part, FrameState& frame) {
     const ImageView view = window(frame.image, part);
-    chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
+    ChordSearch& chords = any_chords_ ? *any_chords_ : chords_;
+    chords.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
     const float left = float(part.left), top = float(part.top);
-    for (Seed seed : chords_.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
-    for (Streak streak : chords_.streaks())
+    for (Seed seed : chords.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
+    for (Streak streak : chords.streaks())
         streak.x += left, streak.y += top, frame.streaks.push_back(streak);
 }
 
@@ -172,12 +199,31 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
     }
 }
 
+/// Learns which prints are in use; once some are known, other rings no longer count as roundels.
+void Detector::learn_prints(const FrameState& frame) {
+    if (!print_ratios_) return;
+    std::vector<PrintSample> samples;
+    for (const TrackedFit& roundel : frame.found)
+        if (roundel.fit.unoccluded) samples.push_back({&roundel.fit, roundel.track});
+    for (const RoundelFit& fit : frame.unknown)
+        if (fit.unoccluded) samples.push_back({&fit, -1});
+    if (print_ratios_->learn(samples)) use_prints();
+}
+
+void Detector::use_prints() {
+    limits_.prints = print_ratios_->prints(), limits_.any_print = !print_ratios_->decided();
+    any_limits_.prints = limits_.prints;
+    chords_ = ChordSearch(limits_, false), matcher_ = MotionBlurMatcher(limits_);
+}
+
 /// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
 void Detector::learn_response(const FrameState& frame) {
     std::vector<const RoundelFit*> fits;
     for (const TrackedFit& roundel : frame.found)
         if (roundel.fit.unoccluded) fits.push_back(&roundel.fit);
-    if (response_.learn(fits, limits_)) change_mask_.invalidate(), tracks_.forget_models();
+    if (!response_.learn(fits, limits_)) return;
+    change_mask_.invalidate(), tracks_.forget_models();
+    if (print_ratios_) print_ratios_->forget_measurements();
 }
 
 /// Section III-B of the paper: theta follows the mean levels of the roundels.
@@ -205,8 +251,16 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
 
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
-    if (frame.suppression.contains(fit->outer.x, fit->outer.y) || is_bullseye(frame.image, *fit))
+    if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
+    const bool known = has_known_ratio(*fit, limits_);
+    const auto depths = std::span(kRingDepths).first(known ? 1 : std::size(kRingDepths));
+    if (std::any_of(depths.begin(), depths.end(),
+                    [&](double depth) { return is_bullseye(frame.image, *fit, depth); }))
         return false;
+    if (!known && !limits_.any_print) {
+        frame.unknown.push_back(*fit);
+        return false;
+    }
     frame.suppression.add(fit->outer);
     frame.found.push_back({*fit, track});
     return true;
@@ -217,7 +271,12 @@ std::optional<double> Detector::theta() const {
     return paper_ ? std::optional(paper_->theta()) : std::nullopt;
 }
 
-double Detector::tone_exponent() const {
+std::vector<double> Detector::found_ratios() const {
+    const std::lock_guard lock(mutex_);
+    return print_ratios_ ? print_ratios_->recurring() : std::vector<double>();
+}
+
+std::optional<double> Detector::tone_exponent() const {
     const std::lock_guard lock(mutex_);
     return response_.exponent();
 }
@@ -226,6 +285,7 @@ void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
     tracks_ = from.tracks_, response_ = from.response_;
+    if (print_ratios_ && from.print_ratios_) print_ratios_ = from.print_ratios_, use_prints();
     if (paper_ && from.paper_) paper_ = from.paper_;
 }
 

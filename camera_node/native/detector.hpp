@@ -14,6 +14,7 @@
 #include "search/suppression.hpp"
 #include "tracks.hpp"
 #include "verify/camera_response.hpp"
+#include "verify/print_ratios.hpp"
 
 namespace roundel {
 
@@ -39,17 +40,21 @@ class Detector {
     std::optional<double> theta() const;
     /// Continues another detector's tracks and theta with this one's settings.
     void take_over(Detector& from);
-    /// The exponent of the camera's tone curve; 1 if it is linear.
-    double tone_exponent() const;
+    /// The exponent of the camera's tone curve, 1 if it is linear; none before the roundels determine it.
+    std::optional<double> tone_exponent() const;
+    /// The ratios of the prints that recur, if they were not given.
+    std::vector<double> found_ratios() const;
 
   private:
     /// The state of one frame's detection.
     struct FrameState {
-        explicit FrameState(const ImageView& view);
+        FrameState(const ImageView& view, const RoundelLimits& limits);
         const ImageView& image;
+        const RoundelLimits& limits;
         double noise;  // grey levels
         Suppression suppression;
         std::vector<TrackedFit> found;
+        std::vector<RoundelFit> unknown;  // of no print in use
         std::vector<ExpectedRoundel> lost;
         std::vector<Box> parts;  // of the image, that are searched
         std::vector<Seed> seeds;
@@ -68,17 +73,22 @@ class Detector {
     void fit_moving_streaks(FrameState& frame) const;
     void update_theta(const FrameState& frame);
     void mark_searched(const FrameState& frame);
+    bool explores();
+    void learn_prints(const FrameState& frame);
+    void use_prints();
     void learn_response(const FrameState& frame);
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const {
-        return {limits_, frame.noise, response_.edge_noise(), response_.shading_sigma()};
+        return {frame.limits, frame.noise, response_.edge_noise(), response_.shading_sigma()};
     }
 
-    RoundelLimits limits_;
+    RoundelLimits limits_, any_limits_;
+    std::optional<PrintRatios> print_ratios_;  // if they were not given
     double search_share_;
     ChordSearch chords_;
+    std::optional<ChordSearch> any_chords_;  // for any print
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
     CameraResponse response_;
@@ -88,6 +98,7 @@ class Detector {
     double begin_at_ = 0;     // share of the seeds at which the next frame begins
     int n_postponed_ = 0;     // in the last frame
     int n_frames_ = 0;        // since all of the image counted as changed
+    int explore_in_ = 1;      // frames until the next search for any print
     mutable std::mutex mutex_;
 };
 

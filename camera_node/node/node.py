@@ -45,7 +45,10 @@ ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the rou
 
 
 class Node:
-    """Publishes the detections and the status of one camera, and answers requests for snapshots and settings."""
+    """Publishes the detections and the status of one camera, and answers requests for snapshots and settings.
+
+    `on_settings` is called with the settings that a request has changed, in Zenoh's thread.
+    """
 
     def __init__(
         self,
@@ -72,6 +75,7 @@ class Node:
         self._clock = ClockSync(session, self._keys)
         self._statistics = NodeStatistics(name)
         self._keep_stamps = keep_stamps
+        self.on_settings: Callable[[Settings], object] = lambda wanted: None
         self._changing = threading.Lock()  # of the detector, by requests
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
@@ -100,6 +104,15 @@ class Node:
         self._closed.set()
         self._source.close()
 
+    def adjust(self, wanted: Settings) -> None:
+        """Apply the settings that are not None, all of them or none; callable from any thread.
+
+        Raises:
+            ConfigError: the source or the detector does not have a setting or refuses its value.
+        """
+        with self._changing:
+            self._detector = apply_settings(wanted, self._source, self._detector)
+
     def _detect(self, frame: Frame) -> DetectedFrame:
         begun_ns = time.perf_counter_ns()
         roundels = self._detector.detect(frame.image)
@@ -125,6 +138,7 @@ class Node:
             clock_error_us=clock_error_us,
             width=width,
             height=height,
+            found_ratios=self._detector.found_ratios,
         )
         return encode(message)
 
@@ -186,15 +200,24 @@ class Node:
 
     def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
+        announced = False
         while not self._closed.wait(STATUS_S):
             try:
                 watch.report_absence()
                 status = self._summarize()
                 publisher.put(encode(status))
+                if status.fps > 0 and not announced:
+                    announced = True
+                    self._announce(status)
                 service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
             except Exception:  # the next status is another
                 log.exception("the status could not be published")
         publisher.undeclare()
+
+    def _announce(self, status: CameraStatus) -> None:
+        """Log once that frames are published: success must not be silent."""
+        text = "camera %s publishes %.1f frames/s of %d x %d pixels in arena '%s'"
+        log.info(text, self.name, status.fps, status.width, status.height, self._keys.arena)
 
     def _summarize(self) -> CameraStatus:
         now_ns = self._clock.to_server(time.time_ns())
@@ -230,4 +253,5 @@ class Node:
                     sender_of(query) or "unknown",
                     wanted,
                 )
+                self.on_settings(wanted)
             return encode_reply(payload, read_settings(self._source, self._detector))

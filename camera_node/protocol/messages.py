@@ -14,6 +14,7 @@ from camera_node.protocol.jpeg import jpeg_size
 VERSION = 1
 MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
+MAX_RATIOS = 16  # kinds of prints of one camera
 MAX_PREVIEW_BYTES, MAX_PREVIEW_SIDE = 1 << 16, 1024  # of a small picture; its side in pixels
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
@@ -92,6 +93,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     clock_error_us: float = 0.0  # bound of the clock error in `t_ns`; NaN before the server's first answer
     width: int
     height: int
+    found_ratios: tuple[float, ...] = ()  # of the prints that recur, if the detector was given none
     uv: bytes
     cov: bytes
     axes_px: bytes
@@ -133,16 +135,21 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             size = len(getattr(self, name))
             if size != n * width * dtype.itemsize:
                 raise MessageError(f"column {name} of {size} bytes for {n} roundels")
+        self._check_header()
+        uu, uv, vv = self._column("cov").T  # comparisons with NaN are False
+        valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
+        if not (valid.all() and (np.abs(self._column("uv")) < 1e5).all()):
+            raise MessageError("a centre or a covariance is NaN or out of range")
+
+    def _check_header(self) -> None:
         if not (is_name(self.camera) and 0 < self.width <= 32768 and 0 < self.height <= 32768):
             raise MessageError("an invalid camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
-        uu, uv, vv = self._column("cov").T  # comparisons with NaN are False
-        valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
-        if not (valid.all() and (np.abs(self._column("uv")) < 1e5).all()):
-            raise MessageError("a centre or a covariance is NaN or out of range")
+        if len(self.found_ratios) > MAX_RATIOS or not all(0 < ratio < 1 for ratio in self.found_ratios):
+            raise MessageError("found_ratios are too many or not in (0, 1)")
 
 
 class Preview(msgspec.Struct, frozen=True, kw_only=True):

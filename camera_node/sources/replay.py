@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 
 from camera_node.arrays import Grey
 from camera_node.errors import CameraError
+from camera_node.protocol.registration import CameraAssignment
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import to_grey
 
@@ -113,16 +115,54 @@ def read_timestamps(video: Path) -> list[int] | None:
     return sorted(times)
 
 
+@dataclass(frozen=True, slots=True)
+class ArenaTime:
+    """When the frames of a recording count as captured, so that several recordings play together.
+
+    Attributes:
+        shift_ns: added to a frame's time, it gives the server's time.
+        ahead_ns: the server's time minus this machine's.
+    """
+
+    shift_ns: int
+    ahead_ns: int
+
+    @classmethod
+    def of(cls, assignment: CameraAssignment) -> "ArenaTime | None":
+        """The time of a recording that just received its assignment; None for a camera."""
+        if assignment.recording_shift_ns is None:
+            return None
+        return cls(assignment.recording_shift_ns, assignment.t_ns - time.time_ns())
+
+
 class PacedSource(Source):
     """Replays a recording at its recorded rate or as fast as possible, with its own times or shifted to now."""
 
     is_recording = True
 
-    def __init__(self, recording: Iterable[Frame], settings: SourceSettings) -> None:
-        self._recording, self._settings = recording, settings
+    def __init__(
+        self, recording: Iterable[Frame], settings: SourceSettings, arena_time: "ArenaTime | None" = None
+    ) -> None:
+        """Replay as `settings` say, or as a live camera in `arena_time`."""
+        self._recording, self._settings, self._arena_time = recording, settings, arena_time
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
+        return self._paced() if self._arena_time is None else self._live(self._arena_time)
+
+    def _live(self, arena_time: "ArenaTime") -> Iterator[Frame]:
+        """Frames when they are due; those that were due before the start are skipped, as a live camera's would be."""
+        begun_ns = time.time_ns() + arena_time.ahead_ns
+        for frame in self._recording:
+            due_ns = frame.t_ns + arena_time.shift_ns
+            if due_ns < begun_ns:
+                continue
+            wait_s = (due_ns - time.time_ns() - arena_time.ahead_ns) / 1e9
+            if self._closed.wait(max(0.0, wait_s)):
+                return
+            yield Frame(frame.image, due_ns, frame.exposure_us)
+
+    def _paced(self) -> Iterator[Frame]:
         begun_ns, shift_ns = time.time_ns(), None
         for frame in self._recording:
             if shift_ns is None:

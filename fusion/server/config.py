@@ -22,6 +22,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             restart the newer of this file and `rig` is used. Nothing is saved unless given.
         robots: robots.yaml.
         saved_robots: the same for robots that were defined, renamed or removed while the server ran.
+        cameras: the folder for names and settings of cameras that register; nothing is saved unless given.
         audit: the file to which a line is appended for every change of rig and robots over the network.
         rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
@@ -35,6 +36,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     saved_rig: str | None = None
     robots: str = "robots.yaml"
     saved_robots: str | None = None
+    cameras: str | None = None
     audit: str | None = None
     rate_hz: float | None = None
     limits: Limits = Limits()
@@ -58,7 +60,7 @@ def load_arena(path: Path) -> ArenaConfig:
     config = load_yaml(path, ArenaConfig)
     paths = {
         name: str(path.parent / value)
-        for name in ("rig", "saved_rig", "robots", "saved_robots", "audit", "zenoh")
+        for name in ("rig", "saved_rig", "robots", "saved_robots", "cameras", "audit", "zenoh")
         if (value := getattr(config, name))
     }
     return override(config, **paths)

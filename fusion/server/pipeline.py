@@ -13,7 +13,7 @@ from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
 from fusion.model.corrections import corrected_camera
 from fusion.model.frames import CalibratedFrame
-from fusion.model.robots import changed, load_robots, load_saved_robots, save_robots
+from fusion.model.robots import Robot, changed, load_robots, load_saved_robots, save_robots
 from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
@@ -46,8 +46,7 @@ class TrackingPipeline:
         rig, saved_rig = (Path(file) if file else None for file in (config.rig, config.saved_rig))
         self.active_rig = ActiveRig(rig, saved_rig)
         self._saved_robots = PersistedFile("robots", config.saved_robots, load_saved_robots, save_robots)
-        saved = self._saved_robots.load_if_newer(Path(config.robots))
-        self.robots = load_robots(Path(config.robots)) if saved is None else saved
+        self.robots = self._load_robots()
         self._durable_robots = self.robots  # those that a restart would load
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
@@ -55,6 +54,14 @@ class TrackingPipeline:
         self._is_wand_recorded = False
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
+
+    def _load_robots(self) -> dict[str, Robot]:
+        """The newer of the given and the saved robots; if both are one file, it may be missing or empty."""
+        given = Path(self._config.robots)
+        if self._config.saved_robots == self._config.robots:
+            return load_saved_robots(given) if given.exists() else {}
+        saved = self._saved_robots.load_if_newer(given)
+        return load_robots(given) if saved is None else saved
 
     @property
     def cameras(self) -> dict[str, Camera]:

@@ -7,6 +7,7 @@ import msgspec
 
 from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys
+from camera_node.protocol.registration import CameraAssignment, assigned_key
 from fusion.model.frames import FrameSet
 from fusion.protocol.messages import (
     FusedFrames,
@@ -60,6 +61,12 @@ class ArenaPublisher:
     def publish_rig(self, rig: RigMessage) -> None:
         """Publish a corrected rig."""
         self._transport.publish(self._keys.rig, rig)
+
+    def publish_assignment(self, assignment: CameraAssignment) -> None:
+        """Send a camera its new name and settings."""
+        key = assigned_key(self._keys.arena, assignment.id)
+        self._transport.publish(key, assignment)
+        self._transport.undeclare(key)
 
     def publish_status(self, status: FusionStatus) -> None:
         """Publish this shard's status."""

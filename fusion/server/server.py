@@ -9,6 +9,7 @@ import gc
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from calib.rig.messages import RigMessage
 from camera_node.logs import about
@@ -21,6 +22,7 @@ from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.health import describe_status
 from fusion.protocol.messages import FusionStatus, ShardPoses, TrackingState, shard_key
 from fusion.protocol.shards import Shard
+from fusion.server.camera_requests import CameraRequests
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
@@ -31,6 +33,7 @@ from fusion.server.requests import RequestHandlers
 from fusion.server.server_clock import clock_of
 from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.server.storage.audit import AuditLog
+from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
 from fusion.tracking.result import latency_of
 from fusion.tracking.tracker import Tracker
@@ -115,6 +118,9 @@ class Server:
         requests.declare(transport, audit)
         if self.shard.leads:
             requests.declare_rig(transport, audit)
+            registry = CameraRegistry(Path(self.config.cameras) if self.config.cameras else None)
+            cameras = CameraRequests(keys.arena, registry, self.pipeline, self._publisher, self.clock)
+            cameras.declare(transport, audit)
             transport.declare_alive(keys.fusion_alive)
         else:
             transport.subscribe(keys.rig, self._follow_rig)

@@ -66,6 +66,15 @@ def _view(prog: str, arguments: Sequence[str], examples: Sequence[str]) -> int:
 
 
 COMMANDS = {
+    "up": Command(
+        "run an arena: the server, its page and the cameras of this machine",
+        _class_or_function("web.roundel.up:RunArena"),
+        (
+            "roundel up",
+            "roundel up lab --source 0 /dev/video2",
+            "roundel up lab --headless --source recording/north",
+        ),
+    ),
     "demo": Command(
         "calibrate and track a simulated arena, and show it",
         _class_or_function("web.roundel.demo:RunDemo"),
@@ -73,11 +82,22 @@ COMMANDS = {
         logging.WARNING,
     ),
     "camera": Command(
-        "publish the roundels that one camera sees",
-        _class_or_function("camera_node.commands.publish:Publish"),
+        "add the cameras of this machine to an arena",
+        _class_or_function("camera_node.commands.camera:JoinArena"),
         (
-            "roundel camera --source 0 --name north --connect tcp/server:7447 --exposure-us 4000",
-            "roundel camera --source recording/north --name north --stamps now",
+            "roundel camera",
+            "roundel camera --source 0 --connect tcp/server:7447",
+            "roundel camera --source recording/north recording/east",
+        ),
+    ),
+    "cameras": Command(
+        "list, rename and forget cameras, set exposure, gain and masks",
+        _class_or_function("fusion.commands.cameras:cameras"),
+        (
+            "roundel cameras list",
+            "roundel cameras rename camera-1 north",
+            "roundel cameras set north --exposure-us 4000",
+            "roundel cameras set north --mask 0 0 640 0 640 80 0 80",
         ),
     ),
     "detect": Command(

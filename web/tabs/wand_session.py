@@ -10,6 +10,8 @@ from typing import Any
 
 import viser
 
+from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
+from calib.live.camera_sizes import running_camera_sizes
 from calib.live.rig_requests import set_rig
 from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
@@ -44,7 +46,7 @@ class CalibrationFiles:
 
     def check(self) -> None:
         """Raise ConfigError or CalibrationError if a file is missing or invalid."""
-        load_rig(self.rig)
+        load_known_lenses(self.rig)
         load_yaml(self.wand, Body)
 
 
@@ -103,7 +105,8 @@ class WandSessionPanel:
 
     def _calibrate(self) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
-        rig, wand = load_rig(files.rig), load_yaml(files.wand, Body)
+        wand = load_yaml(files.wand, Body)
+        rig, _ = with_nominal_lenses(load_known_lenses(files.rig), running_camera_sizes(session, arena))
         settings = WandSession(rig=rig, wand=wand)
         collected, reason = run_wand_session(session, arena, settings, self._show, self._end_requested)
         self._button.disabled = True

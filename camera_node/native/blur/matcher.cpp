@@ -89,8 +89,8 @@ bool is_symmetric(const ImageView& image, const Streak& s, float min_contrast) {
 
 MotionBlurMatcher::MotionBlurMatcher(const RoundelLimits& limits)
     : min_contrast_(float(limits.min_contrast)) {
-    for (const double ratio : limits.inner_ratios)
-        for (const double length : kLengths) templates_.emplace_back(ratio, length);
+    for (const Print& print : limits.prints)
+        for (const double length : kLengths) templates_.emplace_back(print.ratio, length);
 }
 
 std::vector<MovingMatch> MotionBlurMatcher::match_known(const ImageView& image, const InitialGuess& predicted,

@@ -37,7 +37,6 @@ constexpr double kStrict = 0.5;    // lower bound of the scale over that of the 
 constexpr double kSlack = 1.3;     // upper bound: tolerance of a median of few residuals
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
-constexpr double kPrintSigma = 0.002;                // of the ratios of prints of one kind
 constexpr double kMaxPrintError = 3;                 // standard deviations
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
 constexpr float kPlateau = 235;        // level that compression leaves of clipped paper
@@ -89,12 +88,12 @@ class PhotometricFitter : GaussNewton<kCount> {
     }
 
     double ratio() const { return p_[kRatio]; }
-    void use_print(double print_ratio);
+    void use_print(const Print& print);
     void allow_shading();
     RoundelFit fit() const;
 
   private:
-    bool condition_on_print(double print_ratio);
+    bool condition_on_print(const Print& print);
     Parameters covariance_with_ratio() const;
     PoseCovariance pose_covariance() const;
 
@@ -199,7 +198,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     Parameters linearized_at_{};
     PoseCovariance shading_effect_{};    // on the covariance, in units of the noise
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
-    double print_ratio_ = 0;             // that the estimate is conditioned on; 0 if no print is known
+    double posterior_ratio_ = 0;         // given the print; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
     bool resumed_, clipped_ = false;
     double shading_sigma_;
@@ -213,29 +212,29 @@ Parameters PhotometricFitter::covariance_with_ratio() const {
 }
 
 /// Conditions the Gaussian posterior on the print's ratio; false if that ratio is unlikely.
-bool PhotometricFitter::condition_on_print(double print_ratio) {
+bool PhotometricFitter::condition_on_print(const Print& print) {
     const Parameters with = covariance_with_ratio();
-    const double off = print_ratio - p_[kRatio], variance = with[kRatio] + square(kPrintSigma);
+    const double off = print.ratio - p_[kRatio], variance = with[kRatio] + square(print.sigma);
     if (square(off) > square(kMaxPrintError) * variance) return false;
     for (int i = 0; i < kCount; ++i)
         if (i != kRatio) p_[i] += with[i] * off / variance;  // the measured ratio is kept for the tests
     for (int i = 0; i < kPoseCount; ++i) print_effect_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
-    print_ratio_ = print_ratio;
+    posterior_ratio_ = p_[kRatio] + with[kRatio] * off / variance;
     return true;
 }
 
 /// Conditions the estimate on a print. If its ratio is unlikely, tries again at the constrained estimate: the
 /// ratio's variance there and at the free one differ for small and blurred roundels (a score test after
 /// Wald's test).
-void PhotometricFitter::use_print(double print_ratio) {
-    if (condition_on_print(print_ratio)) return;
+void PhotometricFitter::use_print(const Print& print) {
+    if (condition_on_print(print)) return;
     const auto saved = std::tuple(p_, factor_, sums_, noise_, scale_);
     const Parameters with = covariance_with_ratio();
-    const double off = print_ratio - p_[kRatio];
+    const double off = print.ratio - p_[kRatio];
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kLimits)) {
         equations_.linearize(pixels_, p_), linearized_at_ = p_;
-        if (solve(scale_) && (advance(scale_), is_sane(kLimits)) && condition_on_print(print_ratio)) return;
+        if (solve(scale_) && (advance(scale_), is_sane(kLimits)) && condition_on_print(print)) return;
     }
     std::tie(p_, factor_, sums_, noise_, scale_) = saved;
 }
@@ -280,7 +279,7 @@ PoseCovariance PhotometricFitter::pose_covariance() const {
 
 RoundelFit PhotometricFitter::fit() const {
     RoundelFit fit = make_fit(p_, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
-    if (print_ratio_ > 0) fit.p[kRatio] = print_ratio_;
+    if (posterior_ratio_ > 0) fit.p[kRatio] = posterior_ratio_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = scale_, fit.shading = shading_, fit.clipped = clipped_;
@@ -293,7 +292,7 @@ RoundelFit PhotometricFitter::fit() const {
 std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess) {
     PhotometricFitter fitter(image, guess);
     if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
-    if (!guess.print_ratios.empty()) fitter.use_print(nearest_ratio(guess.print_ratios, fitter.ratio()));
+    if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
     if (guess.shading_sigma > 0) fitter.allow_shading();
     return fitter.fit();
 }

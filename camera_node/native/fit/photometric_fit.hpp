@@ -6,6 +6,7 @@
 #include <span>
 
 #include "fit/occlusion.hpp"
+#include "fit/roundel_limits.hpp"
 #include "numeric/ellipse.hpp"
 #include "numeric/image.hpp"
 
@@ -15,7 +16,7 @@ namespace roundel {
 struct InitialGuess {
     Ellipse outer;
     double ratio, dark, bright;
-    std::span<const double> print_ratios{};  // ratios of the prints in use, if they are known
+    std::span<const Print> prints{};         // in use, if they are known
     OcclusionMask occlusion{};               // sectors that the fit leaves out
     std::optional<Parameters> model{};       // in the image's frame, within a third of a pixel, if known
     double noise = 0;                        // noise that the fit of `model` estimated
@@ -49,7 +50,7 @@ struct RoundelFit {
     double blur;              // standard deviation of the edges' spread including the pixel's width, pixels
     double edge_residual;     // RMS over the ring's edges, each pixel weighted by its squared slope
     double support;           // share of the ring's edges that is in the image and agrees with the model
-    Parameters p;             // of the model, in the image's frame; the ratio is that of a known print
+    Parameters p;             // of the model, in the image's frame; the ratio is that given a known print
     bool unoccluded = false;  // the fit uses the unmodified image, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
@@ -74,8 +75,8 @@ struct RoundelFit {
 /// for a final step on all pixels to be efficient (Le Cam's one-step estimator). At most 6144 pixels are
 /// used.
 ///
-/// The ratios of known prints are exact to 0.002. The fit uses the one nearest to the measured ratio unless
-/// it is more than three standard deviations away. This prior contributes most of the information on the size
+/// The fit uses the ratio of the known print that is nearest to the measured one unless it is more than three
+/// standard deviations away. This prior contributes most of the information on the size
 /// of small roundels.
 ///
 /// The covariance is that of the M-estimate. Its noise is estimated from the residuals and is at least one

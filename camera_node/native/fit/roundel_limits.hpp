@@ -9,27 +9,55 @@
 
 namespace roundel {
 
-/// The element of `ratios` (at least one) that is nearest to `measured`.
-inline double nearest_ratio(std::span<const double> ratios, double measured) {
-    return *std::min_element(ratios.begin(), ratios.end(), [&](double a, double b) {
-        return std::abs(a - measured) < std::abs(b - measured);
+/// A kind of print: inner over outer diameter, and the standard deviation of that number. Whether it is in
+/// use is given, measured, or only `assumed`.
+struct Print {
+    static constexpr double kPaper = 0.002;  // standard deviation of printed paper
+
+    double ratio, sigma = kPaper;
+    bool assumed = false;
+    bool is_exact() const { return !assumed && sigma <= kPaper; }
+};
+
+/// The print (of at least one) whose ratio is nearest to the measured one.
+inline const Print& nearest_print(std::span<const Print> prints, double measured) {
+    return *std::min_element(prints.begin(), prints.end(), [&](const Print& a, const Print& b) {
+        return std::abs(a.ratio - measured) < std::abs(b.ratio - measured);
     });
 }
 
 /// The limits within which a ring counts as a roundel.
 struct RoundelLimits {
-    std::vector<double> inner_ratios{0.6, 0.41};  // inner over outer diameter of the prints in use
+    std::vector<Print> prints{{0.6}, {0.41}};  // in use
+    bool any_print = false;                    // other rings may be roundels, too
     double ratio_tolerance = 0.08;
     double min_diameter = 8, max_diameter = 400;  // major axis of the outer ellipse, pixels
     double min_contrast = 25;                     // bright minus dark level, grey levels
 
-    /// The smallest and the largest ratio of the prints in use.
-    std::pair<double, double> ratio_range() const {
-        const auto [low, high] = std::minmax_element(inner_ratios.begin(), inner_ratios.end());
-        return {*low, *high};
+    // Prints that are not known in advance: least and greatest ratio, the tolerance of a measured one, and the
+    // least diameter, pixels, at which it tells a print from a letter.
+    static constexpr std::pair kAnyPrint{0.3, 0.7};
+    static constexpr double kAnyTolerance = 0.05, kMinAnyPrint = 14;
+
+    /// The smallest and the largest ratio that a search must find, of `any` print or of those in use.
+    std::pair<double, double> ratio_range(bool any) const {
+        const auto [low, high] =
+            std::minmax_element(prints.begin(), prints.end(),
+                                [](const Print& a, const Print& b) { return a.ratio < b.ratio; });
+        const double least = low->ratio - ratio_tolerance, most = high->ratio + ratio_tolerance;
+        if (!any) return {least, most};
+        return {std::min(least, kAnyPrint.first), std::max(most, kAnyPrint.second)};
     }
-    double ratio_error(double measured) const {
-        return std::abs(nearest_ratio(inner_ratios, measured) - measured);
+    /// The difference of a measured ratio from that of the nearest known print, beyond its uncertainty.
+    double print_error(double measured) const {
+        const Print& print = nearest_print(prints, measured);
+        return std::max(0.0, std::abs(print.ratio - measured) - 2 * (print.sigma - Print::kPaper));
+    }
+    /// Whether a ring may be a print that is not known.
+    bool may_be_print(double measured, double major) const {
+        const auto [least, most] = kAnyPrint;
+        return any_print && major >= kMinAnyPrint && measured > least - kAnyTolerance &&
+               measured < most + kAnyTolerance;
     }
 };
 

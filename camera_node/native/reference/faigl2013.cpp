@@ -70,7 +70,8 @@ bool are_concentric(const Moments& disc, const Moments& inner) {
 bool has_area_ratio(const Moments& disc, const Moments& inner, const RoundelLimits& limits) {
     const double ratio = std::sqrt(inner.n / disc.n);
     const double tolerance = limits.ratio_tolerance + 1 / covariance_ellipse(disc).minor;
-    return limits.ratio_error(ratio) < tolerance;
+    return limits.print_error(ratio) < tolerance ||
+           limits.may_be_print(ratio, covariance_ellipse(disc).major);
 }
 
 /// All pairs of segments that pass Section III-B. Segments that touch the image's border are excluded.

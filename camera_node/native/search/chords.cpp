@@ -124,10 +124,9 @@ int darkest(const Level& level, int begin, int end) {
 
 }  // namespace
 
-ChordSearch::ChordSearch(const RoundelLimits& limits) {
-    const auto [low, high] = limits.ratio_range();
-    const double r = std::max(0.05, low - limits.ratio_tolerance);
-    const double R = std::min(0.95, high + limits.ratio_tolerance);
+ChordSearch::ChordSearch(const RoundelLimits& limits, bool any) {
+    const auto [low, high] = limits.ratio_range(any);
+    const double r = std::max(0.05, low), R = std::min(0.95, high);
     // The shortest chord through the centre is the minor axis.
     const int thick = int(std::lround(16 * (1 - r) / (2 * r))),
               thin = int(std::lround(16 * (1 - R) / (2 * R)));

@@ -44,7 +44,8 @@ struct Proportions {
 /// A moving roundel has such chords only across its motion, within 45 degrees of the lines.
 class ChordSearch {
   public:
-    explicit ChordSearch(const RoundelLimits& limits);
+    /// Searches for the prints in use, or for `any` print.
+    ChordSearch(const RoundelLimits& limits, bool any);
     void run(const ImageView& image, const ThresholdMap& threshold);
     /// The seeds of the last image; a roundel may have several.
     const std::vector<Seed>& seeds() const { return seeds_; }

@@ -21,9 +21,9 @@ struct RatioRange {
 };
 
 RatioRange ratios_near_centre(const RoundelLimits& limits) {
-    const auto [low, high] = limits.ratio_range();
-    const double slack = limits.ratio_tolerance + 0.1;  // for a quarter of a radius off the centre
-    return {std::max(0.1, low - slack), std::min(0.95, high + slack)};
+    const auto [low, high] = limits.ratio_range(limits.any_print);
+    constexpr double kSlack = 0.1;  // for a quarter of a radius off the centre
+    return {std::max(0.1, low - kSlack), std::min(0.95, high + kSlack)};
 }
 
 /// The order of the rays: diagonals first, then those between. The search has tested row and column already,
@@ -81,8 +81,8 @@ std::optional<InitialGuess> cast_and_fit(const ImageView& image, const Seed& see
 }
 
 bool is_plausible(const InitialGuess& guess, const RoundelLimits& limits) {
-    const double slack = limits.ratio_tolerance + 1 / guess.outer.minor;
-    return limits.ratio_error(guess.ratio) < slack && guess.outer.major > 0.8 * limits.min_diameter &&
+    const bool is_print = limits.print_error(guess.ratio) < limits.ratio_tolerance + 1 / guess.outer.minor;
+    return (is_print || limits.may_be_print(guess.ratio, guess.outer.major)) && guess.outer.major > 0.8 * limits.min_diameter &&
            guess.outer.major < 1.2 * limits.max_diameter && guess.outer.minor > 3 &&
            guess.bright - guess.dark > limits.min_contrast / 2;
 }

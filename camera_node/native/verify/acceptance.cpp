@@ -78,15 +78,9 @@ bool passes(const ImageView& image, const RoundelFit& fit, const AcceptanceConte
            has_small_residuals(fit, context.noise, tolerance) && has_levels(image, fit);
 }
 
-/// Whether the ratio is that of a print, within the tolerance and the uncertainty of the smallest roundels.
-bool has_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
-    const double chance = fit.outer.major < kTiny ? 2 * std::min(fit.ratio_sigma, kMaxRatioSigma) : 0;
-    return limits.ratio_error(fit.ratio) <= std::hypot(limits.ratio_tolerance, chance);
-}
-
 /// Whether ragged edges may be the reason that a fit was rejected.
 bool may_be_ragged(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast / 2 &&
+    return has_known_ratio(fit, limits) && fit.contrast() >= limits.min_contrast / 2 &&
            fit.support >= kRaggedSupport;
 }
 
@@ -111,15 +105,21 @@ void claim_misfit(RoundelFit& fit, double noise) {
 
 }  // namespace
 
+bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
+    const double chance = fit.outer.major < kTiny ? 2 * std::min(fit.ratio_sigma, kMaxRatioSigma) : 0;
+    return limits.print_error(fit.ratio) <= std::hypot(limits.ratio_tolerance, chance);
+}
+
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_ratio(fit, limits) && fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
+    return (has_known_ratio(fit, limits) || limits.may_be_print(fit.ratio, fit.outer.major)) &&
+           fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
            fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) &&
            fit.outer.major >= limits.min_diameter && fit.outer.major <= limits.max_diameter;
 }
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.print_ratios = context.limits.inner_ratios, guess.shading_sigma = context.shading_sigma;
+    guess.prints = context.limits.prints, guess.shading_sigma = context.shading_sigma;
     auto fit = fit_photometric(image, guess);
     if (!fit) return std::nullopt;
     const double at_edges = std::max(context.noise, context.edge_noise);

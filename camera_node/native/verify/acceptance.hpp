@@ -8,6 +8,10 @@
 
 namespace roundel {
 
+/// Whether the ratio is that of a known print, within the tolerance and the uncertainty of the smallest
+/// roundels.
+bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits);
+
 /// Whether contrast, ratio and size are within their limits, and the grey levels within a camera's range.
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 

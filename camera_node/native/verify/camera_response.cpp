@@ -5,16 +5,19 @@
 #include <cmath>
 #include <numbers>
 
+#include "verify/print_ratios.hpp"
+
 namespace roundel {
 
 namespace {
 
-constexpr double kPrintSigma = 0.002;             // of a print's ratio
 constexpr double kMinDiameter = 12;               // pixels: ratio and blur of smaller roundels are correlated
 constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
 constexpr double kMaxCurvature = 1.4;             // of a tone curve between ink and paper
 constexpr double kMaxLogExponent = 1.2;           // 3.3
 constexpr int kHalvings = 16;                     // of the interval of exponents
+// A print that is only assumed or estimated: smaller roundels and more negative curvatures may be those of another print.
+constexpr double kMaxByCurvature = 0.06, kMinAssumed = -0.3;
 constexpr double kMinTone = 0.1;                  // logarithm of an exponent: smaller ones count as linear
 constexpr double kMaxLinear = 0.1;      // logarithm, up to which a measurement is exact to a hundredth
 constexpr double kMinChange = 0.02;     // of the logarithm
@@ -24,10 +27,6 @@ constexpr double kLeastShading = 2e-5;
 constexpr double kMaxShadingSigma = 2e-3;  // of one measurement
 constexpr size_t kMaxMeasured = 8;         // roundels of a frame
 constexpr double kMemory = 0.2;            // weight of a new frame
-
-/// Edge displacement in blurs for each unit of curvature: with s = Phi(x), the least squares fit of the shift
-/// of an edge to s (1 - s), which is the integral of s (1 - s) ds over that of phi(x)^2 dx.
-const double kShift = (1 / 6.0) / (0.5 / std::sqrt(std::numbers::pi));
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255.
@@ -55,7 +54,9 @@ T& median_by(std::vector<T>& values, const Key& key) {
 
 CameraResponse::CameraResponse() : shading_(square(kFirstShading)) { set_exponent(0); }
 
-double CameraResponse::exponent() const { return std::exp(log_exponent_); }
+std::optional<double> CameraResponse::exponent() const {
+    return knows_tone_ ? std::optional(std::exp(log_exponent_)) : std::nullopt;
+}
 
 ImageView CameraResponse::linearize(const ImageView& image) {
     if (log_exponent_ == 0) return image;
@@ -81,12 +82,12 @@ bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const Rou
 std::optional<CameraResponse::ToneEstimate> CameraResponse::measure(const RoundelFit& fit,
                                                                     const RoundelLimits& limits) const {
     if (fit.outer.major < kMinDiameter || fit.dark < kDarkest || fit.bright > kBrightest) return std::nullopt;
-    const double print = nearest_ratio(limits.inner_ratios, fit.ratio);
-    const double radius = std::sqrt(fit.outer.major * fit.outer.minor) / 2;
-    const double by_ratio = radius / ((1 + print) * fit.blur * kShift);
-    const double curvature = (fit.ratio - print) * by_ratio;
-    const double sigma = std::hypot(fit.ratio_sigma, kPrintSigma) * by_ratio;
+    const Print& print = nearest_print(limits.prints, fit.ratio);
+    const double by_curvature = ratio_by_curvature(fit, print.ratio);
+    const double curvature = (fit.ratio - print.ratio) / by_curvature;
+    const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
     if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
+    if (!print.is_exact() && (by_curvature > kMaxByCurvature || curvature < kMinAssumed)) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
     return ToneEstimate{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)};
@@ -125,6 +126,7 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
     mean_ += gain * (middle - mean_), sigma_ += gain * (sigma - sigma_);
     const double change = std::abs(mean_ - log_exponent_);
     const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
+    knows_tone_ |= sigma_ <= kMaxSigma;
     if (sigma_ > kMaxSigma || change < enough) return false;
     edge_noise_ = 0;
     if (change > kMaxLinear) sigma_ = 0;  // the next frame measures the rest: this one was not linear
@@ -135,7 +137,7 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
 void CameraResponse::set_exponent(double log_exponent) {
     log_exponent_ = log_exponent;
     for (int level = 0; level < 256; ++level)
-        linear_[size_t(level)] = uint8_t(std::lround(255 * std::pow(level / 255.0, exponent())));
+        linear_[size_t(level)] = uint8_t(std::lround(255 * std::pow(level / 255.0, std::exp(log_exponent))));
 }
 
 }  // namespace roundel

@@ -24,8 +24,8 @@ class CameraResponse {
     /// Learns from fits without occlusion to a linearized image. The caller must discard models of earlier
     /// frames if this returns true: the tone curve changed.
     bool learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
-    /// 1 for a linear camera, 2.2 for a usual tone curve.
-    double exponent() const;
+    /// 1 for a linear camera, 2.2 for a usual tone curve; nothing before the roundels have determined it.
+    std::optional<double> exponent() const;
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
     double edge_noise() const { return edge_noise_; }
     /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
@@ -47,7 +47,7 @@ class CameraResponse {
     double sigma_ = 0;         // of the mean; 0 before the first measurement
     double edge_noise_ = 0;
     double shading_;  // variance
-    bool knows_shading_ = false;
+    bool knows_shading_ = false, knows_tone_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;
 };

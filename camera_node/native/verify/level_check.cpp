@@ -27,9 +27,8 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     return samples;
 }
 
-bool is_bullseye(const ImageView& image, const RoundelFit& fit) {
-    // Blur makes thin rings less dark.
-    const float theta = float(fit.bright - 0.3 * fit.contrast());
+bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
+    const float theta = float(fit.bright - depth * fit.contrast());
     const Ellipse& e = fit.outer;
     float least = 1e9f, most = 0;
     for (int k = 0; k < kRays; k += 2) {

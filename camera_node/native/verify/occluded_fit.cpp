@@ -117,8 +117,8 @@ bool masks_too_much(const OcclusionMask& mask) {
 
 /// Whether the ratio is that of a print. Of a new roundel nothing else is known in advance. An occlusion that
 /// the residuals do not show biases the ratio as well as the position.
-bool has_print_ratio(const RoundelFit& fit, std::span<const double> ratios) {
-    return ratios.empty() || std::abs(nearest_ratio(ratios, fit.ratio) - fit.ratio) <
+bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints) {
+    return prints.empty() || std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
                                  std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma));
 }
 
@@ -146,7 +146,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
                  .ratio = fit.ratio,
                  .dark = fit.dark,
                  .bright = fit.bright,
-                 .print_ratios = guess.print_ratios,
+                 .prints = guess.prints,
                  .occlusion = mask,
                  .shading_sigma = guess.shading_sigma};
         const auto rest = fit_photometric(image, guess);
@@ -156,7 +156,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     if (input.known) return fit;
     const SectorView view(image, fit);
-    if (!has_print_ratio(fit, guess.print_ratios)) return std::nullopt;
+    if (!has_print_ratio(fit, guess.prints)) return std::nullopt;
     const bool accepted = has_round_card(view) || !is_letter(view, fit, guess.occlusion, input.noise);
     return accepted ? std::optional(fit) : std::nullopt;
 }

@@ -20,6 +20,7 @@ FONTS = (
     cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
     cv2.FONT_HERSHEY_SCRIPT_COMPLEX,
 )
+COMMON = (0.6, 0.41)  # inner ratios of the usual prints
 OTHER_RATIOS = (0.15, 0.2, 0.8, 0.85, 0.9)  # more than the tolerance of 0.1 away from 0.6 and 0.41
 
 
@@ -133,7 +134,9 @@ def measure(run: Run, console: Console) -> list[Verdict]:
         "photographs": (photographs, 1000 if run.thorough else 300),
     }
     counts = {
-        what: [len(run.make().detect(image)) for image in make(number)]
+        what: [len(run.make().adjusted(inner_ratios=COMMON).detect(image)) for image in make(number)]
+        if make is rings  # which no other print has
+        else [len(run.make().detect(image)) for image in make(number)]
         for what, (make, number) in kinds.items()
     }
     rows = [(what, len(found), sum(found), sum(k > 0 for k in found)) for what, found in counts.items()]

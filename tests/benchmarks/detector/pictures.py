@@ -39,12 +39,13 @@ def flat(size: tuple[int, int], level: float) -> Array:
 
 @dataclass(frozen=True)
 class Card:
-    """A card to render: the image of its disc's centre, its frontal diameter, both in pixels, and its orientation."""
+    """A card to render: its disc's centre and frontal diameter in pixels, its orientation, and the print's ratio."""
 
     uv: tuple[float, float]
     diameter: float
     tilt: float = 0.0
     turn: float = 0.0
+    ratio: float = 0.6
 
 
 def paste(
@@ -73,7 +74,7 @@ def sight_of(card: Card, size: tuple[int, int], focal: float = F) -> Sight:
     w, h = size
     lens = Lens(width=w, height=h, fx=focal, fy=focal, cx=(w - 1) / 2, cy=(h - 1) / 2)
     distance = pixels_across(lens, 0.1, card.diameter)
-    return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0)
+    return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, ratio=card.ratio)
 
 
 def _bound(sight: Sight, blur: float) -> tuple[int, int, int, int]:

@@ -200,7 +200,7 @@ def test_any_image_gives_finite_results(height: int, width: int, seed: int, leve
     "wrong",
     [
         {"detector": "napa"},
-        {"inner_ratios": ()},
+        {"inner_ratios": (0.6,) * 17},
         {"inner_ratios": (1.2,)},
         {"ratio_tolerance": 0.0},
         {"min_diameter_px": 50.0, "max_diameter_px": 40.0},

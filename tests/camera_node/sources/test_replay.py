@@ -147,7 +147,7 @@ def test_an_error_names_the_source_that_does_not_open(tmp_path: Path):
             open_source(text, SourceSettings())
     with pytest.raises(CameraError, match="is not a folder"):
         FrameFolder(tmp_path / "none")
-    with pytest.raises(ConfigError, match="--scene"):
+    with pytest.raises(ConfigError, match="no camera 'cam0'"):
         open_source("sim", SourceSettings())
 
 

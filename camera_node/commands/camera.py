@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`roundel camera`: all cameras of this machine, or those given, in the arena of this network."""
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from camera_node.config import require_name
+from camera_node.errors import CameraAbsentError, ConfigError
+from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
+from camera_node.service import ServiceManager, stopped_by_signals
+from camera_node.sources.address import without_credentials
+from camera_node.sources.frame import SourceSettings
+from camera_node.sources.v4l2 import camera_names
+from camera_node.supervisor import Supervisor
+from camera_node.terminal import say
+
+TICK_S = 0.25
+LOOK_S = 3.0  # between looks for cameras that were plugged in
+
+
+@dataclass(frozen=True)
+class JoinArena:
+    """Publish the cameras of this machine in an arena, until stopped.
+
+    The server is found by scouting, or given by --connect. It names each camera once, and stores its name and settings.
+    """
+
+    source: tuple[str, ...] = ()
+    """Cameras by number (0), path (/dev/video2) or name; videos; folders of <t_ns>.png|jpg; or sim:NAME. All cameras of
+    this machine unless given, also those that are plugged in later."""
+    name: str | None = None
+    """A fixed name for a single source; the server neither names it nor stores its settings."""
+    connect: tuple[str, ...] = ()
+    """Zenoh endpoints of the server, such as tcp/server:7447; found by scouting unless given."""
+    arena: str | None = None
+    """The arena's name; the only one of the server unless given."""
+    zenoh: Path | None = None
+    """A Zenoh configuration file (JSON5) for TLS, access control or scouting; requires --connect."""
+    settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
+
+    def run(self) -> int:
+        """Run one node per camera until stopped, or until all recordings ended."""
+        self._check()
+        with stopped_by_signals() as stop:
+            found = self._find(stop)
+            if found is None:
+                return 0
+            cameras = LocalCameras(self.source, self._options(found))
+            return cameras.run(stop)
+
+    def _check(self) -> None:
+        if self.arena is not None:
+            require_name(self.arena, "an arena")
+        if self.name is not None:
+            require_name(self.name, "a camera")
+            if len(self.source) != 1:
+                raise ConfigError("--name names one camera: give one --source with it")
+        if self.zenoh is not None and not self.connect:
+            raise ConfigError("--zenoh needs --connect: a protected server is not found by scouting")
+        if not self.source and not camera_names():
+            raise CameraAbsentError("this machine has no camera; plug one in, or give --source")
+
+    def _find(self, stop: threading.Event) -> FoundArena | None:
+        """The arena to join; None if this program is stopped first."""
+        if self.connect:
+            return FoundArena(self.arena or "arena", self.connect)
+        waited = False
+        while not stop.is_set():
+            if found := choose_arena(find_arenas(), self.arena):
+                say(f"found arena '{found.arena}' at {found.endpoints[0]}")
+                return found
+            if not waited:
+                say(
+                    "no server found in this network yet; looking. Start one with roundel up, or give --connect"
+                )
+                waited = True
+        return None
+
+    def _options(self, found: FoundArena) -> list[str]:
+        options = ["--connect", *found.endpoints, "--arena", found.arena, *given_options(self.settings)]
+        if self.name is not None:
+            options += ["--name", self.name]
+        return options + (["--zenoh", str(self.zenoh)] if self.zenoh else [])
+
+
+def given_options(settings: SourceSettings) -> list[str]:
+    """The options that differ from their defaults."""
+    values, defaults = asdict(settings), asdict(SourceSettings())
+    return [
+        word
+        for name, value in values.items()
+        if value != defaults[name]
+        for word in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+class LocalCameras:
+    """One node for each source, or for each camera of this machine, in processes of their own.
+
+    Args:
+        sources: as `--source`; empty for all cameras of this machine.
+        options: of `python -m camera_node`, without `--source`.
+        supervisor: runs the nodes; one of its own unless given.
+    """
+
+    def __init__(
+        self, sources: Sequence[str], options: Sequence[str], supervisor: Supervisor | None = None
+    ) -> None:
+        self._sources, self._options = tuple(sources), tuple(options)
+        self._supervisor = supervisor or Supervisor(self._ended)
+        self._code = 0
+        self._next_look_s = 0.0
+        self._seen: set[str] = set()
+
+    def start(self) -> None:
+        """Start a node for each source that has none yet."""
+        self._next_look_s = time.monotonic() + LOOK_S
+        present = self._sources or tuple(str(device) for device in camera_names())
+        self._seen &= set(present)  # a camera that was unplugged may come back
+        for source in present:
+            if source not in self._seen:
+                self._seen.add(source)
+                options = ["--source", source, *self._options]
+                self._supervisor.start(f"camera {without_credentials(source)}", "camera_node", options)
+
+    def run(self, stop: threading.Event) -> int:
+        """Run the nodes until `stop`, or until all sources ended; return 0, or the code of one that failed."""
+        with self._supervisor as supervisor, ServiceManager() as service:
+            self.start()
+            service.ready()
+            while not stop.wait(TICK_S) and (len(supervisor) or not self._sources):
+                supervisor.tend()
+                service.progress()
+                self.look()
+        return self._code
+
+    def look(self) -> None:
+        """Start nodes for cameras that were plugged in; called a few times a second."""
+        if not self._sources and time.monotonic() >= self._next_look_s:
+            self.start()
+
+    def _ended(self, name: str, code: int) -> None:
+        if code:
+            self._code = code
+        else:
+            say(f"{name}: ended")

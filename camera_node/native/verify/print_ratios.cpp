@@ -1,0 +1,193 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "verify/print_ratios.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numbers>
+
+namespace roundel {
+
+namespace {
+
+constexpr double kMinDiameter = 12;      // pixels: ratio and blur of smaller roundels are correlated
+constexpr double kMaxRatioSigma = 0.02;  // of a measurement
+constexpr double kModelSigma = 0.003;    // of the print and of the model, common to all views of a roundel
+constexpr double kSecondOrder = 0.1;     // share of the tone curve's effect that the model leaves out
+constexpr double kCurvaturePrior = 0.6;  // standard deviation; 0.7 is a gamma of 2.2
+constexpr double kMinCurvature = -0.25;  // of the tone curves of cameras
+constexpr double kMaxCurvature = 1.4;
+constexpr double kSameKind = 0.04;       // difference of ratios from the regression
+constexpr size_t kMaxKinds = 8;
+constexpr int kRecurring = 3;          // roundels of a kind in one frame
+constexpr int kMaxCount = 512;         // measurements that a regression remembers
+constexpr double kMinZoom = 0.05;      // relative change of the distance after which a roundel counts again
+constexpr double kContradiction = 3;   // standard deviations
+constexpr double kExact = 0.01;        // standard deviation, from which an assigned print may change
+constexpr double kReplaced = 0.15;     // distance at which a print that recurs replaces a usual one
+constexpr size_t kUsed = 256;
+const std::vector<Print> kUsual{{0.6}, {0.41}};
+
+std::vector<Print> assumed_prints() {
+    std::vector<Print> prints = kUsual;
+    for (Print& print : prints) print.assumed = true;
+    return prints;
+}
+
+}  // namespace
+
+// With s = Phi(x), the least squares fit of the shift of an edge to s (1 - s): the integral of s (1 - s) ds
+// over that of phi(x)^2 dx.
+const double kEdgeShift = (1 / 6.0) / (0.5 / std::sqrt(std::numbers::pi));
+
+double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
+    const double radius = std::sqrt(fit.outer.major * fit.outer.minor) / 2;
+    return (1 + print_ratio) * fit.blur * kEdgeShift / radius;
+}
+
+double PrintRatios::Kind::print() const {
+    return (information.yy * by_print - information.xy * by_curvature) / information.det();
+}
+
+double PrintRatios::Kind::curvature() const {
+    return (information.xx * by_curvature - information.xy * by_print) / information.det();
+}
+
+double PrintRatios::Kind::curvature_with(double print_ratio) const {
+    return (by_curvature - information.xy * print_ratio) / information.yy;
+}
+
+double PrintRatios::Kind::sigma() const {
+    return std::max(Print::kPaper, std::sqrt(information.yy / information.det()));
+}
+
+PrintRatios::PrintRatios() : prints_(assumed_prints()) {}
+
+PrintRatios::Kind PrintRatios::make_kind(double ratio) {
+    return {{0, 0, 1 / square(kCurvaturePrior)}, 0, 0, ratio};
+}
+
+void PrintRatios::include(Kind& kind, double ratio, double by_curvature, double sigma) {
+    const double weight = 1 / square(sigma);
+    Symmetric& A = kind.information;
+    A.xx += weight, A.xy += weight * by_curvature, A.yy += weight * square(by_curvature);
+    kind.by_print += weight * ratio, kind.by_curvature += weight * by_curvature * ratio;
+    if (++kind.count <= kMaxCount) return;
+    kind.count /= 2;
+    for (double* sum : {&A.xx, &A.xy, &A.yy, &kind.by_print, &kind.by_curvature}) *sum /= 2;
+}
+
+/// The kind whose regression is nearest to a measurement; a new one, in place of the rarest, if none is near.
+PrintRatios::Kind& PrintRatios::kind_of(double ratio, double by_curvature) {
+    Kind* best = nullptr;
+    double least = kSameKind;
+    for (Kind& kind : kinds_) {
+        const double expected =
+            kind.count ? kind.print() + kind.curvature() * by_curvature : kind.first_ratio;
+        if (const double off = std::abs(expected - ratio); off < least) least = off, best = &kind;
+    }
+    if (best) return *best;
+    if (kinds_.size() < kMaxKinds) return kinds_.emplace_back(make_kind(ratio));
+    const auto rarest = std::min_element(kinds_.begin(), kinds_.end(), [](const Kind& a, const Kind& b) {
+        return std::pair(a.recurs, a.count) < std::pair(b.recurs, b.count);
+    });
+    return *rarest = make_kind(ratio);
+}
+
+/// Whether a roundel was not measured yet, or not at this distance.
+bool PrintRatios::is_new(int track, double by_curvature) {
+    if (track < 0) return true;
+    const auto used =
+        std::find_if(used_.begin(), used_.end(), [&](const Used& u) { return u.track == track; });
+    if (used != used_.end()) {
+        if (std::abs(by_curvature / used->by_curvature - 1) < kMinZoom) return false;
+        used->by_curvature = by_curvature;
+        return true;
+    }
+    if (used_.size() >= kUsed) used_.erase(used_.begin());
+    used_.push_back({track, by_curvature});
+    return true;
+}
+
+/// Chooses the print of a kind that recurs: a usual one unless the regression contradicts it.
+void PrintRatios::assign(Kind& kind) {
+    const double measured = kind.print(), sigma = kind.sigma();
+    if (kind.assigned && sigma > kExact) return;
+    const Print& usual = nearest_print(kUsual, measured);
+    const double curvature = kind.curvature_with(usual.ratio);
+    const bool contradicts = std::abs(usual.ratio - measured) > kContradiction * sigma ||
+                             curvature < kMinCurvature || curvature > kMaxCurvature;
+    const Print print = contradicts ? Print{measured, sigma} : usual;
+    if (!kind.assigned || std::abs(print.ratio - kind.assigned->ratio) > sigma) kind.assigned = print;
+}
+
+/// Collects the prints in use; returns whether they changed.
+bool PrintRatios::collect() {
+    std::vector<Print> prints;
+    const auto is_new = [&](const Print& print) {
+        return std::none_of(prints.begin(), prints.end(),
+                            [&](const Print& p) { return p.ratio == print.ratio; });
+    };
+    for (const Kind& kind : kinds_)
+        if (kind.assigned && is_new(*kind.assigned)) prints.push_back(*kind.assigned);
+    std::vector<Print> own;
+    std::copy_if(prints.begin(), prints.end(), std::back_inserter(own), [](const Print& print) {
+        return nearest_print(kUsual, print.ratio).ratio != print.ratio;
+    });
+    for (const Print& usual : kUsual)
+        if (is_new(usual) &&
+            (own.empty() || std::abs(nearest_print(own, usual.ratio).ratio - usual.ratio) > kReplaced))
+            prints.push_back({usual.ratio, usual.sigma, true});
+    const auto is_equal = [](const Print& a, const Print& b) {
+        return a.ratio == b.ratio && a.assumed == b.assumed;
+    };
+    const bool same =
+        std::is_permutation(prints.begin(), prints.end(), prints_.begin(), prints_.end(), is_equal);
+    prints_ = std::move(prints);
+    return !same;
+}
+
+bool PrintRatios::learn(const std::vector<PrintSample>& roundels) {
+    std::array<int, kMaxKinds> seen{};
+    for (const auto& [fit, track] : roundels) {
+        if (fit->outer.major < kMinDiameter || fit->clipped || fit->ratio_sigma > kMaxRatioSigma) continue;
+        const double by_curvature = ratio_by_curvature(*fit, fit->ratio);
+        Kind& kind = kind_of(fit->ratio, by_curvature);
+        ++seen[size_t(&kind - kinds_.data())];
+        if (is_new(track, by_curvature))
+            include(kind, fit->ratio, by_curvature,
+                    std::hypot(fit->ratio_sigma, kModelSigma, kSecondOrder * by_curvature));
+    }
+    const bool was_decided = decided();
+    for (size_t k = 0; k < kinds_.size(); ++k) {
+        kinds_[k].recurs |= seen[k] >= kRecurring;
+        if (kinds_[k].recurs && kinds_[k].count) assign(kinds_[k]);
+    }
+    return collect() || decided() != was_decided;
+}
+
+bool PrintRatios::decided() const {
+    return std::any_of(kinds_.begin(), kinds_.end(), [](const Kind& kind) { return kind.recurs; });
+}
+
+std::vector<double> PrintRatios::recurring() const {
+    std::vector<double> ratios;
+    for (const Print& print : prints_)
+        for (const Kind& kind : kinds_)
+            if (kind.assigned && kind.assigned->ratio == print.ratio) {
+                ratios.push_back(print.ratio);
+                break;
+            }
+    return ratios;
+}
+
+void PrintRatios::forget_measurements() {
+    for (Kind& kind : kinds_) {
+        Kind empty = make_kind(kind.assigned ? kind.assigned->ratio : kind.first_ratio);
+        empty.recurs = kind.recurs, empty.assigned = kind.assigned;
+        kind = empty;
+    }
+    used_.clear();
+}
+
+}  // namespace roundel

@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <optional>
+#include <vector>
+
+#include "fit/photometric_fit.hpp"
+#include "fit/roundel_limits.hpp"
+
+namespace roundel {
+
+/// The displacement in blurs of an edge in a picture whose tone curve brightens the levels s between ink and
+/// paper by curvature s (1 - s), for each unit of curvature (docs/detector_model.md, section 3a).
+extern const double kEdgeShift;
+
+/// How much a tone curve enlarges the measured ratio of a roundel with this print, for each unit of its
+/// curvature.
+double ratio_by_curvature(const RoundelFit& fit, double print_ratio);
+
+/// A roundel of a frame without occlusion, and the number of its track.
+struct PrintSample {
+    const RoundelFit* fit;
+    int track;
+};
+
+/// Finds the ratios of the prints that a camera sees, from those that recur.
+///
+/// A tone curve enlarges the measured ratio by curvature / diameter, so the ratio of one roundel does not
+/// determine that of its print. Roundels of several sizes do: each kind has a linear regression
+///   measured = print + curvature * ratio_by_curvature.
+/// It decides once several roundels of a frame are of its kind. A usual print is assumed unless the
+/// regression contradicts it; else the kind is a print of its own, as exact as the regression.
+class PrintRatios {
+  public:
+    PrintRatios();
+    /// Includes the roundels of a frame. The caller must use `prints` from now on if this returns true.
+    bool learn(const std::vector<PrintSample>& roundels);
+    /// The prints in use: the usual ones, of which some may be replaced, and others that recur.
+    const std::vector<Print>& prints() const { return prints_; }
+    /// Whether any kind recurs.
+    bool decided() const;
+    /// The prints that recur.
+    std::vector<double> recurring() const;
+    /// Discards the measurements, which hold no longer, but not what they decided.
+    void forget_measurements();
+
+  private:
+    /// A kind of roundels: the normal equations of its regression.
+    struct Kind {
+        Symmetric information;
+        double by_print, by_curvature;  // right hand side
+        double first_ratio;             // of its first roundel
+        int count = 0;                  // of measurements
+        bool recurs = false;
+        std::optional<Print> assigned{};  // the print in use, after it recurs
+        double print() const;
+        double curvature() const;
+        double curvature_with(double print_ratio) const;  // if that is the print
+        double sigma() const;                             // of `print`
+    };
+    static Kind make_kind(double ratio);
+    static void include(Kind& kind, double ratio, double by_curvature, double sigma);
+    Kind& kind_of(double ratio, double by_curvature);
+    bool is_new(int track, double by_curvature);
+    void assign(Kind& kind);
+    bool collect();
+
+    std::vector<Print> prints_;
+    std::vector<Kind> kinds_;
+    struct Used {
+        int track;
+        double by_curvature;
+    };
+    std::vector<Used> used_;  // measurements of the roundels in view
+};
+
+}  // namespace roundel

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Runs programs as child processes, and starts those again that fail."""
+
+import logging
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from camera_node.errors import USER_ERROR
+
+log = logging.getLogger("roundel")
+
+GRACE_S = 6.0  # between SIGTERM and SIGKILL; camera_node.child ends its program after 5 s
+FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 30.0  # before a program is started again; doubles with each failure
+STEADY_S = 60.0  # a program that ran for this long starts with the first delay again
+# One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+
+
+@dataclass
+class _Program:
+    """A program, its process, and when it is to be started again if the process ended."""
+
+    module: str
+    arguments: tuple[str, ...]
+    process: subprocess.Popen
+    since_s: float
+    delay_s: float = FIRST_DELAY_S
+    due_s: float | None = None
+
+
+class Supervisor:
+    """Children by name, which write to this program's stdout and stderr. Leaving the `with` block stops all of them.
+
+    A child that ends with exit code 0 has done its work. One that ends with 2 needs a user and is not started again;
+    after any other end it is started again, later after each failure. All end when this process ends, by any cause.
+
+    Args:
+        on_end: called with the name and the exit code of a child that ended and is not started again.
+    """
+
+    def __init__(self, on_end: Callable[[str, int], object] = lambda name, code: None) -> None:
+        self._programs: dict[str, _Program] = {}
+        self._on_end = on_end
+
+    def __enter__(self) -> "Supervisor":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._programs
+
+    def __len__(self) -> int:
+        return len(self._programs)
+
+    def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
+        """Run `python -m module arguments` under a name."""
+        arguments = tuple(arguments)
+        self._programs[name] = _Program(module, arguments, _spawn(module, arguments), time.monotonic())
+
+    def tend(self) -> None:
+        """Look at all children, and start those again that are due; called a few times a second."""
+        for name, program in list(self._programs.items()):
+            code = program.process.poll()
+            if code is None:
+                continue
+            if code in (0, USER_ERROR):
+                _close(self._programs.pop(name).process)
+                self._on_end(name, code)
+            elif program.due_s is None:
+                self._schedule(name, program, code)
+            elif time.monotonic() >= program.due_s:
+                program.process = _spawn(program.module, program.arguments)
+                program.since_s, program.due_s = time.monotonic(), None
+
+    def stop(self) -> None:
+        """Terminate all children, the newest first; kill those that do not end in time."""
+        processes = [program.process for program in reversed(self._programs.values())]
+        for process in processes:
+            if process.poll() is None:
+                process.terminate()
+        deadline_s = time.monotonic() + GRACE_S
+        for process in processes:
+            try:
+                process.wait(max(0.0, deadline_s - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            _close(process)
+        self._programs.clear()
+
+    def _schedule(self, name: str, program: _Program, code: int) -> None:
+        _close(program.process)
+        now_s = time.monotonic()
+        if now_s - program.since_s >= STEADY_S:
+            program.delay_s = FIRST_DELAY_S
+        program.due_s = now_s + program.delay_s
+        log.warning("%s ended with code %d; starting it again in %g s", name, code, program.delay_s)
+        program.delay_s = min(2 * program.delay_s, LONGEST_DELAY_S)
+
+
+def _spawn(module: str, arguments: Sequence[str]) -> subprocess.Popen:
+    """A child in a session of its own, so that Ctrl-C reaches its parent only; it ends with its standard input."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "camera_node.child", module, *arguments],
+        stdin=subprocess.PIPE,
+        env=os.environ | ENVIRONMENT,
+        start_new_session=True,
+    )
+
+
+def _close(process: subprocess.Popen) -> None:
+    if process.stdin is not None:
+        process.stdin.close()

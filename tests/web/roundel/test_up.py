@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`roundel up` and `roundel camera`: real processes on loopback, simulated images."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+
+from fusion.client import Arena
+from tests.conftest import free_port
+from tests.waiting import wait_for
+
+WAND_S = 60.0
+MAIN = "from web.roundel.command import main; main()"
+
+
+class Program:
+    """A `roundel` command and the lines that it printed so far."""
+
+    def __init__(self, *words: object, folder: Path) -> None:
+        command = [sys.executable, "-P", "-c", MAIN, *map(str, words)]
+        env = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        self.process = subprocess.Popen(
+            command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line)
+
+    def until(self, pattern: str) -> str:
+        """Wait for a line that matches, and return it."""
+
+        def find() -> str | None:
+            assert self.process.poll() is None or self._reader.is_alive(), self.text
+            return next((line for line in list(self.lines) if re.search(pattern, line)), None)
+
+        return wait_for(find) or ""
+
+    @property
+    def text(self) -> str:
+        return "".join(self.lines)
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        code = self.process.wait(30)
+        self._reader.join(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator:
+    """`start(*words)` runs a command in `tmp_path` until the test ends."""
+    programs: list[Program] = []
+
+    def run(*words: object) -> Program:
+        programs.append(Program(*words, folder=tmp_path))
+        return programs[-1]
+
+    yield run
+    for program in reversed(programs):
+        program.stop()
+
+
+def roundel(*words: object, folder: Path, expected: int = 0) -> str:
+    """Run a command to its end; return what it printed."""
+    command = [sys.executable, "-P", "-c", MAIN, *map(str, words)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == expected, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow  # the wand is waved for as long as all programs need to start on a loaded machine
+def test_from_unknown_cameras_to_poses_with_two_commands(start, scene: Path, tmp_path: Path):
+    """Two programs with two cameras each, none of them known, become poses in a Python program.
+
+    `up` has one pair and `camera` the other, as on another machine. Nothing is edited, and no lens is calibrated with a
+    board: the wand finds them. The robots are those of the scene, declared in the arena's folder beforehand.
+    """
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    folder, simulation = tmp_path / "lab", ("--scene", scene)
+    scene.write_text(re.sub(r"(?m)^wave_s: .*", f"wave_s: {WAND_S}", scene.read_text()))
+    folder.mkdir()
+    (folder / "robots.yaml").write_text((scene.parent / "robots.yaml").read_text())
+    up = start(
+        "up", folder, "--headless", "--listen", endpoint, *simulation, "--source", "sim:north", "sim:east"
+    )
+    up.until("server of arena")
+    camera = start("camera", "--connect", endpoint, *simulation, "--source", "sim:south", "sim:west")
+    for name in ("south", "west"):
+        camera.until(f"camera {name} publishes")
+    connect = ("--connect", endpoint)
+    wand = ("--wand", scene.parent / "wand.yaml", "--rig", folder / "rig.yaml", "--out", folder / "rig.yaml")
+    text = roundel("calibrate", "wand", "--live", "--seconds", 12, *wand, *connect, folder=tmp_path)
+    assert "no lens known of east, north, south, west" in text
+    assert "in force on the server" in text
+    with Arena.connect(endpoint, arena="arena") as arena:
+        poses = arena.robot("rover", timeout_s=60.0)
+        assert wait_for(lambda: (pose := poses.next()).state == "tracked" and pose, deadline_s=2 * WAND_S)
+    assert {path.stem for path in (folder / "cameras").glob("*.yaml")} == {"north", "east", "south", "west"}
+    children = psutil.Process(up.process.pid).children(recursive=True)
+    assert camera.stop() == 0
+    assert up.stop() == 0
+    assert not psutil.wait_procs(children, timeout=10.0)[1]
+
+
+def test_a_camera_keeps_its_name_and_its_settings(start, tmp_path: Path):
+    """Renamed and masked while it runs, it has both after a restart of all programs; so has an edited file."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    up = ("up", "lab", "--headless", "--listen", endpoint, "--source")
+    arena = start(*up, "sim:north")
+    arena.until("camera north publishes")
+    connect = ("--connect", endpoint)
+    roundel("cameras", "rename", "north", "door", *connect, folder=tmp_path)
+    arena.until("camera door publishes")
+    set_mask = ("cameras", "set", "door", "--mask", *["0", "0", "64", "0", "64", "48"])
+    assert "door: sim sim:north" in roundel(*set_mask, *connect, folder=tmp_path)
+    assert "there are: door" in roundel("cameras", "forget", "dor", *connect, folder=tmp_path, expected=2)
+    stored = tmp_path / "lab" / "cameras" / "door.yaml"
+    assert yaml.safe_load(stored.read_text())["settings"]["mask"] == [[[0, 0], [64, 0], [64, 48]]]
+    assert arena.stop(signal.SIGTERM) == 0
+    again = start(*up, "sim:north")
+    again.until("camera door is here again")
+    again.until("camera door publishes")
+    assert [path.name for path in stored.parent.glob("*.yaml")] == ["door.yaml"]
+
+
+def test_a_server_that_can_not_start_ends_the_command(start, tmp_path: Path):
+    """Exit code and error are the server's: a broken file needs a user."""
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "robots.yaml").write_text("robots: {rover: {diameter_m: wide}}")
+    listen = ("--listen", f"tcp/127.0.0.1:{free_port()}")
+    up = start("up", "lab", "--headless", *listen, "--source")
+    assert up.process.wait(60) == 2
+    up.stop()
+    assert re.search(r"error: .*robots.yaml.*diameter_m", up.text)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("up", "x/y", "--arena", "a/b"), "'a/b' can't name an arena"),
+        (("camera", "--name", "a"), "--name names one camera"),
+        (("camera", "--zenoh", "x.json5", "--source", "0"), "--zenoh needs --connect"),
+        (("cameras", "rename", "a"), "use roundel cameras rename OLD NEW"),
+        (("cameras", "set", "a"), "needs one of them"),
+        (("cameras", "set", "a", "--mask", "1", "2"), "three corners"),
+    ],
+)
+def test_mistakes_are_one_line(words: tuple[str, ...], says: str, tmp_path: Path):
+    text = roundel(*words, folder=tmp_path, expected=2)
+    assert re.fullmatch(rf"error: .*{re.escape(says)}.*\n", text)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`roundel up`: the server, its page and the cameras of this machine.
+
+Read `ArenaUp.run` first: it lists the steps.
+"""
+
+import contextlib
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from camera_node.commands.camera import LocalCameras, given_options
+from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
+from camera_node.service import ServiceManager, stopped_by_signals
+from camera_node.sources.frame import SourceSettings
+from camera_node.supervisor import Supervisor
+from camera_node.terminal import say
+from fusion.server.config import ArenaConfig, load_arena
+from web.page_access import PageAccess, is_loopback
+from web.roundel.folder import ArenaFolder
+from web.view import check_port
+
+TICK_S = 0.25
+START_S = 120.0  # for the server to listen, on a loaded machine
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunArena:
+    """Run an arena on this machine: the server, its page, and one node for each of its cameras.
+
+    All that it learns is stored in the folder: names and settings of cameras, rig, robots, recordings. Cameras of other
+    machines join with roundel camera. The network must be trusted, or protected as docs/security.md describes.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional] = Path("arena")
+    """The arena's folder; created if it does not exist."""
+    source: tuple[str, ...] | None = None
+    """Sources of this machine, as in roundel camera; all its cameras unless given. Without a value: none."""
+    arena: str | None = None
+    """The arena's name, for a new folder; arena unless given."""
+    listen: str | None = None
+    """The server's Zenoh endpoint; that of arena.yaml unless given, in a new folder tcp/0.0.0.0:7447."""
+    local: bool = False
+    """For a new folder: serve programs of this machine only."""
+    headless: bool = False
+    """Serve no page."""
+    host: str = "127.0.0.1"
+    """Address of the page; 0.0.0.0 makes it available to the whole network, with tokens in its addresses."""
+    port: int = 8080
+    """Port of the page."""
+    settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
+
+    def run(self) -> int:
+        """Run until stopped; return the exit code."""
+        folder = ArenaFolder(self.folder)
+        is_new = folder.create(self.arena or "arena", self.listen, self.local)
+        if not self.headless:
+            check_port(self.host, self.port)
+        config = load_arena(folder.config)
+        if self.arena not in (None, config.arena):
+            raise ConfigError(
+                f"the arena in {self.folder} is called {config.arena}; change its name in {folder.config}, or name "
+                "another folder"
+            )
+        say(f"{'created' if is_new else 'using'} the arena in {self.folder.resolve()}")
+        with stopped_by_signals() as stop:
+            return ArenaUp(folder, config, stop).run(self)
+
+
+class ArenaUp:
+    """Runs the programs of an arena until `stop` is set."""
+
+    def __init__(self, folder: ArenaFolder, config: ArenaConfig, stop: threading.Event) -> None:
+        self._folder, self._config, self._stop = folder, config, stop
+        self._failed: dict[str, int] = {}
+
+    def run(self, options: RunArena) -> int:
+        """Start the server, then the page and the cameras, and watch them; return the exit code."""
+        with contextlib.ExitStack() as stack:
+            supervisor = stack.enter_context(Supervisor(self._note_end))
+            service = stack.enter_context(ServiceManager())
+            endpoint = self._start_server(supervisor, options.listen)
+            if endpoint is None:
+                return self._failed.get("server", 0)
+            connect = ["--connect", endpoint, "--arena", self._config.arena]
+            if not options.headless:
+                self._start_page(supervisor, options, connect)
+            words = [*connect, *given_options(options.settings)]
+            cameras = LocalCameras(options.source or (), words, supervisor)
+            if options.source is None or options.source:
+                cameras.start()
+            service.ready()
+            return self._watch(supervisor, service, cameras.look if options.source is None else None)
+
+    def _start_server(self, supervisor: Supervisor, listen: str | None) -> str | None:
+        """Start the server; return the endpoint for programs of this machine, None if it ended or was stopped."""
+        with tempfile.TemporaryDirectory(prefix="roundel-up-") as temporary:
+            path, end_s = Path(temporary) / "endpoints", time.monotonic() + START_S
+            words = ["--config", str(self._folder.config), "--endpoints-file", str(path)]
+            words += ["--listen", listen] if listen else []
+            supervisor.start("server", "fusion", words)
+            while not path.exists():
+                supervisor.tend()
+                if "server" not in supervisor or time.monotonic() > end_s or self._stop.wait(0.05):
+                    return None
+            endpoints = path.read_text().splitlines()
+        say(f"server of arena '{self._config.arena}' at {' '.join(endpoints)}")
+        if any("127.0.0.1" not in endpoint for endpoint in endpoints):
+            say("cameras of other machines in this network join with: roundel camera")
+        return endpoints[0].replace("0.0.0.0", "127.0.0.1")
+
+    def _start_page(self, supervisor: Supervisor, options: RunArena, connect: list[str]) -> None:
+        tokens = None if is_loopback(options.host) else self._folder.path / "page_tokens.yaml"
+        words = [*connect, "--host", options.host, "--port", str(options.port)]
+        words += ["--tokens", str(tokens)] if tokens else []
+        words += ["--rig", str(self._folder.rig), "--wand", str(self._folder.wand)]
+        PageAccess.create(options.host, options.port, tokens)  # writes the tokens before the page reads them
+        supervisor.start("page", "web", words)
+
+    def _watch(
+        self, supervisor: Supervisor, service: ServiceManager, look: Callable[[], object] | None
+    ) -> int:
+        """Keep the programs running until this one is stopped, or until the server needs a user."""
+        while not self._stop.wait(TICK_S):
+            supervisor.tend()
+            service.progress()
+            if look is not None:
+                look()
+            if "server" not in supervisor:
+                return self._failed.get("server", TEMPORARY_FAILURE)
+        return 0
+
+    def _note_end(self, name: str, code: int) -> None:
+        self._failed[name] = code
+        needs_user = "needs a correction, see its error above" if code == USER_ERROR else "ended"
+        say(f"{name}: {needs_user}")
