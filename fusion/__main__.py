@@ -19,7 +19,6 @@ COMMANDS = {  # and their modules in fusion.commands
     "doctor": "doctor",
     "define": "define",
     "robots": "robots",
-    "cameras": "cameras",
     "undo": "undo",
     "redo": "undo",
     "export": "export",
