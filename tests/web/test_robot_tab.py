@@ -60,7 +60,7 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
         page.get_by_text("New name").locator("xpath=ancestor::*[.//input][1]").locator("input").fill("cart")
         page.get_by_role("button", name="Rename").click()
         page.get_by_text("a is cart now").wait_for()
-        choose(page, "cart")
+        choose(page, "cart")  # the field of the new name is empty again
         page.get_by_role("button", name="Save all robots").click()
         page.get_by_text("wrote 1 robots").wait_for()
         assert load_robots(tmp_path / "robots.yaml") == {"cart": turn_heading(TRIANGLE, 90.0)}

@@ -82,9 +82,9 @@ class RobotEditor:
     def rename(self) -> str:
         """Rename the robot; it stays tracked."""
         old, new = str(self._robot.value), require_name(self._name.value, "a robot")
-        return self._describe(
-            self._subscription.change_robots(RobotsRequest(rename={old: new})), f"{old} is {new} now"
-        )
+        robots = self._subscription.change_robots(RobotsRequest(rename={old: new}))
+        self._name.value = ""
+        return self._describe(robots, f"{old} is {new} now")
 
     def delete(self) -> str:
         """Remove the robot, with the second click."""
