@@ -19,13 +19,13 @@ COMMANDS = {  # and their modules in fusion.commands
     "doctor": "doctor",
     "define": "define",
     "robots": "robots",
-    "cameras": "cameras",
     "undo": "undo",
     "redo": "undo",
     "export": "export",
-    "ros2": "ros2",
-    "vrpn": "vrpn",
-    "mavlink": "mavlink",
+    "ros2": "bridges.ros2",
+    "vrpn": "bridges.vrpn",
+    "mavlink": "bridges.mavlink",
+    "foxglove": "bridges.foxglove",
 }
 
 
