@@ -14,6 +14,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "run": "run",
     "replay": "replay",
     "record": "record",
+    "recordings": "record",
     "repair": "repair",
     "health": "health",
     "doctor": "doctor",
@@ -22,9 +23,10 @@ COMMANDS = {  # and their modules in fusion.commands
     "undo": "undo",
     "redo": "undo",
     "export": "export",
-    "ros2": "ros2",
-    "vrpn": "vrpn",
-    "mavlink": "mavlink",
+    "ros2": "bridges.ros2",
+    "vrpn": "bridges.vrpn",
+    "mavlink": "bridges.mavlink",
+    "foxglove": "bridges.foxglove",
 }
 
 

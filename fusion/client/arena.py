@@ -145,9 +145,16 @@ class RobotStream(Stream[RobotPose]):
 
 
 class Arena:
-    """A connection to an arena's server. `faults` counts undecodable messages, by kind."""
+    """A connection to an arena's server. `faults` counts undecodable messages, by kind.
 
-    def __init__(self, session: zenoh.Session, arena: str, endpoints: str) -> None:
+    Args:
+        session: an open session; it is closed with the arena.
+        arena: its name.
+        endpoints: of the server, for messages.
+        robot: receive the poses of this robot only; "*" for all.
+    """
+
+    def __init__(self, session: zenoh.Session, arena: str, endpoints: str, robot: str = "*") -> None:
         self.keys = Keys(arena)
         self.faults: Counter[str] = Counter()
         self._session, self._origin = session, f"from arena '{arena}' at {endpoints}"
@@ -156,7 +163,7 @@ class Arena:
         self._streams: dict[str, Stream] = {}
         self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
         self._known: set[str] = set()
-        poses = session.declare_subscriber(self.keys.robot_pose(), guarded("a pose", self._take_pose))
+        poses = session.declare_subscriber(self.keys.robot_pose(robot), guarded("a pose", self._take_pose))
         self._subscribers: list[Any] = [poses]
 
     @property
