@@ -90,6 +90,7 @@ def test_printing_and_detecting(folder: Path):
     shutil.copy(min((folder / "frames" / "north").iterdir()), folder / "picture.png")
     output = run(find("roundel detect"), folder).stdout
     assert re.search(r"picture.png: \d+ roundels", output)
+    assert "wrote seen.png" in output
     assert cv2.imread(str(folder / "seen.png")) is not None
 
 
