@@ -50,6 +50,11 @@ def record(
     for reason, count in recorder.lost.items():
         say(f"not written: {count} {reason}")
     say(f"wrote {writer.path}")
+    if not writer.counts:
+        say(
+            f"warning: the recording is empty: no message of arena '{arena}' arrived from {' '.join(connect)}"
+        )
+        return 1
     return 0
 
 
