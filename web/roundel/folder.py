@@ -29,7 +29,7 @@ audit: audit.jsonl
 """
 ZENOH = """\
 // Written by `roundel up`; edit it freely. By multicast scouting, `roundel camera` on other machines finds the server.
-// TLS and access rights: docs/security.md.
+// docs/security.md describes how to protect the arena.
 {{ scouting: {{ multicast: {{ enabled: {scouting} }} }} }}
 """
 PORT = 7447
