@@ -100,6 +100,7 @@ def test_server_and_recorder_survive_hostile_messages(tmp_path: Path):
             wait_for(lambda: client.status(DEADLINE_S).next().faults.get("undecodable detections"))
             rig = wait_for(lambda: client.rig(1.0))
             growth_mb = [(m.memory_info().rss - b) * 1e-6 for m, b in zip(meters, before, strict=True)]
+        assert rig is not None
         assert rig.cameras == ARENA.cameras
         assert max(growth_mb) < MAX_GROWTH_MB
         assert server.poll() is None
