@@ -86,6 +86,8 @@ class Detect:
         if self.draw:
             to = self.draw if one_of == 1 else self.draw / f"{path.parent.name}_{path.stem}.png"
             _draw(image, roundels, refused, to)
+            if not self.json:  # whose output has JSON only
+                say(f"wrote {to}")
 
     def _detect(self, image: Grey) -> tuple[Detector, Roundels]:
         """The roundels of an image. The images are not a sequence, so each one gets a detector without tracks."""

@@ -26,6 +26,8 @@ from fusion.tracking.tracker import AssociatedFrames, Tracker
 
 log = logging.getLogger("fusion")
 
+NOT_CALIBRATED = "the cameras are not calibrated"
+
 
 class TrackingPipeline:
     """The state of tracking: the active rig and robots, the frame synchronizer, and the tracker.
@@ -217,7 +219,7 @@ class TrackingPipeline:
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""
-        return self.tracker.not_acquired() if self.tracker else {}
+        return self.tracker.not_acquired() if self.tracker else dict.fromkeys(self.robots, NOT_CALIBRATED)
 
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""

@@ -172,6 +172,11 @@ COMMANDS = {
         _class_or_function("fusion.commands.robots:robots"),
         ("roundel robots list", "roundel robots rename robot-1 rover", "roundel robots save robots.yaml"),
     ),
+    "simulate": Command(
+        "render a simulated recording into a folder",
+        _class_or_function("camera_node.simulation.__main__:simulate"),
+        ("roundel simulate configs/demo/scene.yaml recording --seconds 15",),
+    ),
     "doctor": Command(
         "check this machine, the files of an arena and a running server",
         _class_or_function("fusion.commands.doctor:doctor"),
