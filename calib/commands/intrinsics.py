@@ -2,7 +2,7 @@
 """`calib intrinsics`: calibrates lenses from views of a board."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.live import Live
@@ -10,6 +10,7 @@ from rich.live import Live
 from calib.commands.connection import Connection, Server
 from calib.commands.inputs import require_one
 from calib.commands.output import check_folder, provenance, save_image, write_rig
+from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
 from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
 from calib.intrinsics.calibrated_lens import CalibratedLens
@@ -46,20 +47,34 @@ class Intrinsics:
     server: Server = field(default_factory=Connection)
 
     def execute(self) -> None:
-        """Calibrate and write the rig; nothing is written unless all lenses are good."""
+        """Calibrate, and write the lenses that are good; of the other cameras, the reasons are given.
+
+        Raises:
+            CalibrationError: a lens can't be calibrated; nothing is written if that is so for all.
+        """
         check_folder(self.out)
         require_one({"--frames FOLDER": self.frames, "--live": self.live})
         if self.live and self.camera is None:
             raise ConfigError("--live needs --camera NAME, as the camera was started with --name")
         rig = load_rig(self.out) if self.out.exists() else None
-        lenses = {}
+        lenses, faults = {}, []
         for views in self._collect_views():
-            lenses[views.camera] = lens = views.solve(self.model)
+            suggested = views.compare_models(self.model)
+            try:
+                lens = replace(views.solve(self.model), better_model=suggested)
+            except CalibrationError as error:
+                faults.append(f"{error}; {suggested}" if suggested else str(error))
+                continue
+            lenses[views.camera] = lens
             print_lens(views.camera, lens)
             if self.maps:
                 image = draw_residuals(views.camera, lens.camera, lens.observed(), lens.residuals())
                 save_image(self.maps / f"{views.camera}.png", image)
-        write_rig(merge_lenses(rig, lenses, {**provenance(), "board": self.board}), self.out)
+        if lenses:
+            write_rig(merge_lenses(rig, lenses, {**provenance(), "board": self.board}), self.out)
+        if faults:
+            written = f"; written without it: {', '.join(lenses)}" if lenses else ""
+            raise CalibrationError("; ".join(faults) + written)
 
     def _collect_views(self) -> Iterator[BoardViews]:
         finder = make_finder(self.board)

@@ -16,6 +16,7 @@ from camera_node.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
 CLEAR = 3.0  # standard deviations, from which a clock drift is printed
+MAX_GROSS = 0.15  # share of gross errors, above which a recording contradicts itself
 MAX_OUTLIERS = 5  # that are listed one by one
 
 
@@ -104,6 +105,7 @@ def _remarks(report: WandReport) -> list[str]:
             for o in report.outliers[:MAX_OUTLIERS]
         )
         lines.append(f"{len(report.outliers)} marker centres rejected as outliers; the worst: {worst}")
+    lines += _exchange_remarks(report)
     lines += [f"warning: camera '{name}' is not placed: {why}" for name, why in report.unplaced.items()]
     lines.append(
         "world: z up for cameras that are mounted upright, origin below the median of the wand's positions, z = 0 at "
@@ -119,6 +121,11 @@ def _validation_remarks(report: WandReport) -> list[str]:
             f"all {given.count} detections that two cameras or more saw: residual {given.all_px:.2f} px; without the "
             f"{given.gross:.1%} that are gross errors {given.residual_px:.2f} px"
         )
+        if given.gross > MAX_GROSS:
+            lines.append(
+                f"warning: {given.gross:.0%} of the detections contradict the rig, for a reason that was not found: do "
+                "not trust it before you know why; see the outliers below"
+            )
     if (held_out := report.held_out) is not None:
         unit = (
             f"{1e3 * held_out.error_m:.2f} mm"
@@ -131,6 +138,16 @@ def _validation_remarks(report: WandReport) -> list[str]:
             f"{held_out.residual_px:.2f} px"
         )
     return lines
+
+
+def _exchange_remarks(report: WandReport) -> list[str]:
+    if not report.exchanges:
+        return []
+    who = ", ".join(f"'{e.shown}' has those of '{e.of}' in {e.share:.0%}" for e in report.exchanges)
+    return [
+        f"warning: the recording has points under the wrong camera: {who} of its detections; they are left out; check "
+        "the order of cameras or columns in the recording"
+    ]
 
 
 def _scale_remarks(report: WandReport) -> list[str]:

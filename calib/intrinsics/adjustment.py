@@ -19,11 +19,12 @@ from camera_node.geometry.pose import rotation_from_vector
 CAUCHY = 2.3849  # scale of the Cauchy loss, in standard deviations: 95 % efficient on normal residuals
 MAX_ITERATIONS = 100
 MAX_DAMPING = 1e10
+POSE_STEPS = 5
 # The prior of a lens, 1 sigma; it matters only where the views leave a parameter open.
 CORNER_SIGMA_PX = 0.2  # of a detected corner: the weight of views against the prior
 TERM_SIGMA = 0.2  # of each radial distortion term at the image's corner, as a fraction of the corner's radius
 TANGENTIAL_SIGMA = 0.02  # the same, of tangential terms
-ASPECT_SIGMA = 0.003  # of fx / fy from 1
+SQUARE_SIGMA, ANY_SIGMA = 0.003, 0.3  # of fx / fy from 1: of square pixels, and of any
 CENTRE_SIGMA = 0.05  # of the principal point from the image's centre, as a fraction of the longer side
 RADIAL_POWERS = {"pinhole": [2, 4, 1, 1, 6], "fisheye": [2, 4, 6, 8]}  # of each coefficient; 1: tangential
 FOCAL_STARTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.5, 4.0)  # of the image's longer side
@@ -52,8 +53,8 @@ class LensPrior:
     information: Array
 
     @classmethod
-    def of(cls, lens: Lens) -> "LensPrior":
-        """The prior of lenses with about the focal length of `lens`."""
+    def of(cls, lens: Lens, aspect_sigma: float) -> "LensPrior":
+        """The prior of lenses with about the focal length of `lens`, and fx / fy near 1."""
         size = max(lens.width, lens.height)
         mean = np.array([0, 0, (lens.width - 1) / 2, (lens.height - 1) / 2, *[0.0] * len(lens.distortion)])
         weights = np.zeros(len(mean))
@@ -63,7 +64,7 @@ class LensPrior:
         terms = np.where(powers == 1, TANGENTIAL_SIGMA, TERM_SIGMA) / corner**powers
         weights[4 : 4 + len(terms)] = (terms**-2)[: len(lens.distortion)]
         aspect = np.zeros(len(mean))
-        aspect[:2] = 1 / (ASPECT_SIGMA * lens.fx), -1 / (ASPECT_SIGMA * lens.fx)
+        aspect[:2] = 1 / (aspect_sigma * lens.fx), -1 / (aspect_sigma * lens.fx)
         return cls(mean, CORNER_SIGMA_PX**2 * (np.diag(weights) + np.outer(aspect, aspect)))
 
     def cost(self, lens: Lens) -> float:
@@ -99,13 +100,21 @@ class AdjustedLens:
         return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in self.residuals]))))
 
 
-def adjust_lens(lens: Lens, views: Sequence[BoardView], robust: bool = False) -> AdjustedLens:
+def adjust_lens(
+    lens: Lens, views: Sequence[BoardView], robust: bool = False, aspect_sigma: float = SQUARE_SIGMA
+) -> AdjustedLens:
     """Adjust from `lens` by Levenberg-Marquardt; with `robust`, under the Cauchy loss.
+
+    Args:
+        lens: the start.
+        views: of the board.
+        robust: whether corners may be wrong.
+        aspect_sigma: prior standard deviation of fx / fy.
 
     Raises:
         ValueError: the board can't be located in a view with this lens.
     """
-    state, prior = _State(lens, _locate_all(lens, views)), LensPrior.of(lens)
+    state, prior = _State(lens, _locate_all(lens, views)), LensPrior.of(lens, aspect_sigma)
     damping, residuals = 1e-3, _residuals(state, views)
     for _ in range(MAX_ITERATIONS):
         scale = CAUCHY * _robust_sigma(residuals) if robust else np.inf
@@ -121,6 +130,21 @@ def adjust_lens(lens: Lens, views: Sequence[BoardView], robust: bool = False) ->
         if not before - after > 1e-9 * before + 1e-15:
             break
     return AdjustedLens(state.lens, state.poses, residuals, _covariance(state, views, prior, residuals))
+
+
+def held_out_rms(lens: Lens, views: Sequence[BoardView]) -> float:
+    """RMS reprojection error, pixels, of views that a lens was not adjusted to: only the board's poses are adjusted."""
+    known = [view for view in views if locate_board(lens, view) is not None]
+    if not known:
+        return float("inf")
+    state, prior = _State(lens, _locate_all(lens, known)), LensPrior.of(lens, ANY_SIGMA)
+    still = np.zeros(len(lens.parameters))
+    for _ in range(POSE_STEPS):
+        normal = _linearize(state, known, prior, np.inf)
+        steps = np.linalg.solve(normal.H_vv, normal.g_v[:, :, None])[:, :, 0]
+        state = state.moved(still, np.asarray(steps, float))
+    squares = np.concatenate([(r**2).sum(axis=1) for r in _residuals(state, known)])
+    return float(np.sqrt(np.nan_to_num(squares, nan=BAD_PX**2).mean()))
 
 
 def _locate_all(lens: Lens, views: Sequence[BoardView]) -> Array:

@@ -9,14 +9,16 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.intrinsics.adjustment import (
+    ANY_SIGMA,
     AdjustedLens,
     BoardView,
     adjust_lens,
     choose_focal_length,
+    held_out_rms,
     locate_board,
 )
-from calib.intrinsics.board import BoardFinder
-from calib.intrinsics.calibrated_lens import CalibratedLens, projection_sigma_px
+from calib.intrinsics.board import BoardFinder, CharucoFinder
+from calib.intrinsics.calibrated_lens import CalibratedLens, aspect_ratio, projection_sigma_px
 from calib.rig.camera import Camera
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.rig import Rig
@@ -32,6 +34,9 @@ MIN_TILT_DEG = 10.0  # between views: parallel views leave the focal length open
 MAX_SIGMA = (
     0.005  # median projection uncertainty, as a fraction of the longer side: beyond, a lens is useless
 )
+NOT_SQUARE = 3.0  # standard deviations of fx / fy from 1, from which pixels are not square
+CLEARLY_BETTER = 0.8  # ratio of held-out residuals, below which the other lens model is suggested
+MAX_EXAMINED = 6  # images without a board, in which a mirrored one is looked for
 MAX_VIEW_RMS = 3.0  # of a view, in medians over views: beyond, it is an outlier (motion blur, a bent board)
 TILT = "tilt the board by 30 degrees in all directions, and show it in every part of the image"
 
@@ -44,6 +49,7 @@ class BoardViews:
         self.views: list[BoardView] = []
         self.size: tuple[int, int] | None = None
         self.frames = 0
+        self._without: list[Grey] = []
 
     def add(self, name: str, image: Grey, accept: Callable[[BoardView], bool] = lambda view: True) -> bool:
         """Find the board in an image (h, w); returns whether there was a view that `accept` accepts.
@@ -58,7 +64,10 @@ class BoardViews:
                 f"before: {self.size[0]} x {self.size[1]}); use one size"
             )
         self.size, self.frames = size, self.frames + 1
-        if (found := self.finder.find(image)) is None or not accept(view := BoardView(*found, name)):
+        found = self.finder.find(image)
+        if found is None and len(self._without) < MAX_EXAMINED:
+            self._without.append(image)
+        if found is None or not accept(view := BoardView(*found, name)):
             return False
         self.views.append(view)
         return True
@@ -74,6 +83,11 @@ class BoardViews:
         Raises:
             CalibrationError: too few views, or views that can't fix a lens; the message says what to show.
         """
+        if self._is_mirrored():
+            raise CalibrationError(
+                f"camera '{self.camera}': its images show the board mirrored, as from behind; disable the flip of the "
+                "camera, or of the driver"
+            )
         if self.size is None or len(self.views) < MIN_VIEWS:
             raise CalibrationError(
                 f"camera '{self.camera}': the board is in {len(self.views)} of {self.frames} frames, {MIN_VIEWS} are "
@@ -83,6 +97,7 @@ class BoardViews:
         try:
             start, views = _start(choose_views(self.views, self.size), self.size, model)
             adjusted, views, rejected = _adjust_without_outliers(start, views)
+            adjusted = _free_aspect(adjusted, views)
             coverage = Coverage.of(np.concatenate([view.area for view in views]), *self.size)
             sigma_px = projection_sigma_px(adjusted, coverage.counts.shape)
             _check_lens(adjusted, coverage, sigma_px)
@@ -91,6 +106,55 @@ class BoardViews:
         lens_sigma = tuple(float(x) for x in np.sqrt(np.diag(adjusted.covariance)))
         camera = Camera(**msgspec.structs.asdict(adjusted.lens), lens_sigma=lens_sigma)
         return CalibratedLens(camera, adjusted, views, self.frames, rejected, coverage, sigma_px)
+
+    def _is_mirrored(self) -> bool:
+        """Whether most views show the board from behind, or it is found in most images without it once mirrored.
+
+        A chessboard looks the same in a mirror: only boards with numbered corners show it.
+        """
+        behind = sum(is_from_behind(view) for view in self.views)
+        if 2 * behind > len(self.views):
+            return True
+        if len(self.views) >= MIN_VIEWS:
+            return False
+        found = sum(
+            self.finder.find(np.ascontiguousarray(image[:, ::-1])) is not None for image in self._without
+        )
+        return isinstance(self.finder, CharucoFinder) and 2 * found > max(len(self._without), 1)
+
+    def compare_models(self, model: Model) -> str:
+        """A sentence for the user where the other model of a lens fits held-out views better; else empty.
+
+        Both models are adjusted to every other view; the rest is held out.
+        """
+        if self.size is None or len(self.views) < 2 * MIN_VIEWS:
+            return ""
+        views = choose_views(self.views, self.size)
+        other: Model = "fisheye" if model == "pinhole" else "pinhole"
+        rms = {kind: _held_out(views, self.size, kind) for kind in (model, other)}
+        if not rms[other] < CLEARLY_BETTER * rms[model]:
+            return ""
+        return (
+            f"held-out views fit the {other} model better: residual {rms[other]:.2f} px, with the {model} model "
+            f"{rms[model]:.2f} px; run again with --model {other}"
+        )
+
+
+def _held_out(views: Sequence[BoardView], size: tuple[int, int], model: Model) -> float:
+    """RMS residual of every other view, of a lens adjusted to the rest; infinite where none can be."""
+    try:
+        start, fitted = _start(views[::2], size, model)
+        return held_out_rms(adjust_lens(start, fitted, robust=True).lens, views[1::2])
+    except (CalibrationError, ValueError, np.linalg.LinAlgError):
+        return float("inf")
+
+
+def is_from_behind(view: BoardView) -> bool:
+    """Whether the corners are in the order of a board that is seen from behind: the board's x and y axes are that of
+    the image, turned by any angle but not mirrored, where it is seen from the front."""
+    board = np.column_stack([view.corners[:, :2], np.ones(len(view.corners))])
+    M = np.linalg.lstsq(board, view.pixels)[0]
+    return float(np.linalg.det(M[:2])) < 0
 
 
 def choose_views(views: Sequence[BoardView], size: tuple[int, int], most: int = MAX_VIEWS) -> list[BoardView]:
@@ -139,6 +203,13 @@ def _adjust_without_outliers(
         adjusted = adjust_lens(adjusted.lens, views)
         if good.all():
             return adjusted, views, rejected
+
+
+def _free_aspect(adjusted: AdjustedLens, views: Sequence[BoardView]) -> AdjustedLens:
+    """The lens adjusted without the prior of square pixels, where the views show that they are not square."""
+    free = adjust_lens(adjusted.lens, views, aspect_sigma=ANY_SIGMA)
+    ratio, sigma = aspect_ratio(free)
+    return free if abs(ratio - 1) > NOT_SQUARE * sigma else adjusted
 
 
 def _check_lens(adjusted: AdjustedLens, coverage: Coverage, sigma_px: Array) -> None:

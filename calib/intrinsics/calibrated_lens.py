@@ -12,6 +12,7 @@ from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_o
 from camera_node.arrays import Array
 
 BIG_RESIDUAL_PX = 1.0
+CLEARLY_NOT_SQUARE = 0.005  # of fx / fy from 1: lenses of good cameras differ by less
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class CalibratedLens:
         rejected: RMS residual, pixels, of the rejected views, by name.
         coverage: corners of the used views, by cells of the image.
         sigma_px: (rows, columns) projection uncertainty, 1 sigma, at the centre of each cell.
+        better_model: a sentence for the user where the other lens model fits better.
     """
 
     camera: Camera
@@ -35,6 +37,7 @@ class CalibratedLens:
     rejected: dict[str, float]
     coverage: Coverage
     sigma_px: Array
+    better_model: str = ""
 
     @property
     def rms_px(self) -> float:
@@ -67,6 +70,14 @@ class CalibratedLens:
             warnings.append(
                 f"the lens has no inverse in the {enumerate_words(corners)} corner; show the board there"
             )
+        ratio, sigma = aspect_ratio(self.adjusted)
+        if abs(ratio - 1) > max(CLEARLY_NOT_SQUARE, 3 * sigma):
+            warnings.append(
+                f"its pixels are not square: fx / fy = {ratio:.4f} +- {sigma:.4f}; check that the driver does not "
+                "scale the image"
+            )
+        if self.better_model:
+            warnings.append(self.better_model)
         return warnings
 
     def _corners_without_ray(self) -> list[str]:
@@ -90,6 +101,13 @@ class CalibratedLens:
             },
             "rejected": {name: round(rms, 2) for name, rms in self.rejected.items()},
         }
+
+
+def aspect_ratio(adjusted: AdjustedLens) -> tuple[float, float]:
+    """fx / fy, and its standard deviation."""
+    fx, fy = adjusted.lens.fx, adjusted.lens.fy
+    J = np.array([1 / fy, -fx / fy**2])
+    return fx / fy, float(np.sqrt(J @ adjusted.covariance[:2, :2] @ J))
 
 
 def projection_sigma_px(adjusted: AdjustedLens, cells: tuple[int, ...]) -> Array:

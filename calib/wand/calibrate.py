@@ -23,12 +23,16 @@ from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
 from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO, TwoViewGeometry
 from calib.wand.labeling import WandRecording
 from calib.wand.quality.checks import check_motion
-from calib.wand.result import NOT_RECORDED, WandCalibration
+from calib.wand.quality.exchanges import FoundExchanges, find_exchanges
+from calib.wand.result import NOT_RECORDED, Exchange, WandCalibration
 from calib.wand.scale import Distance
 from calib.wand.synchrony import label_by_timing
 from camera_node.arrays import Index
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+
+MIN_REJECTED = 0.01  # share of rejected observations, from which they are explained
+MAX_EXCHANGE_PASSES = 3  # each finds more, because the rig and the motion are better
 
 
 def calibrate(
@@ -62,7 +66,7 @@ def calibrate(
         raise CalibrationError(_explain_no_wand(recording))
     check_motion(recording.detections, recording.names, recording.lenses)
     pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
-    placement, solution = _solve_majority(recording, pairs, distance)
+    placement, solution = _solve_without_exchanged(recording, pairs, distance)
     absent = {name: NOT_RECORDED for name in rig.cameras if name not in recording.names}
     return conclude(rig, solution, replace(placement, unplaced=placement.unplaced | absent, timing=timing))
 
@@ -125,6 +129,40 @@ def _solve_majority(
                 raise CalibrationError(
                     explain_disagreement(recording.names, pairs, excluded.reasons)
                 ) from None
+
+
+def _solve_without_exchanged(
+    recording: WandRecording, pairs: TwoViewGeometry, distance: Distance | None
+) -> tuple[Placement, Solution]:
+    """Solve, leave out detections that are under the wrong camera, and solve again, until there are few or none.
+
+    Raises:
+        CalibrationError: as in `_solve_majority`.
+    """
+    shares: Counter[tuple[str, str]] = Counter()
+    placement, solution = _solve_majority(recording, pairs, distance)
+    for _ in range(MAX_EXCHANGE_PASSES):
+        placed = [recording.names.index(name) for name in placement.names]
+        found = _find_exchanges(recording, pairs, placed, solution)
+        if found is None:
+            break
+        shares.update({(pair.shown, pair.of): pair.share for pair in found.pairs})
+        mine = np.flatnonzero(np.isin(recording.detections.camera, placed))
+        detections = recording.detections.select(mine[found.tested & ~found.wrong])
+        recording, pairs = replace(recording, detections=detections), pairs.with_detections(detections)
+        placement, solution = _solve_majority(recording, pairs, distance)
+    exchanges = tuple(Exchange(*names, share) for names, share in shares.most_common())
+    return replace(placement, exchanges=exchanges), solution
+
+
+def _find_exchanges(
+    recording: WandRecording, pairs: TwoViewGeometry, placed: list[int], solution: Solution
+) -> FoundExchanges | None:
+    """Find the detections of cameras that are under the wrong one; None if the adjustment used nearly all."""
+    if solution.adjusted.used.mean() > 1 - MIN_REJECTED and not recording.timing.synchronous:
+        return None
+    labeled = LabeledRecording.of(recording, pairs, placed)
+    return find_exchanges(labeled, solution.adjusted, solution.observations)
 
 
 def _place(

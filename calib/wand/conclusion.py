@@ -17,7 +17,7 @@ from calib.wand.bundle_adjustment.problem import State, WandObservations
 from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lenses import find_lens_changes
-from calib.wand.result import CameraReport, Outlier, WandCalibration, WandReport
+from calib.wand.result import CameraReport, Exchange, Outlier, WandCalibration, WandReport
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
 from calib.world.world_frame import move_rig, upright_frame
 from camera_node.arrays import Array
@@ -37,6 +37,7 @@ class Placement:
         scaled_by: the measured distance that gives the scale.
         compared_with: a measured distance to compare with the wand.
         timing: whether cameras are taken as synchronous, and why.
+        exchanges: cameras that show points of others, which were left out.
     """
 
     names: list[str]
@@ -47,6 +48,7 @@ class Placement:
     scaled_by: Distance | None
     compared_with: Distance | None
     timing: str = ""
+    exchanges: tuple[Exchange, ...] = ()
 
 
 def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibration:
@@ -133,6 +135,7 @@ def _build_report(solution: Solution, covariance: CameraCovariance, placement: P
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },
+        exchanges=list(placement.exchanges),
     )
 
 

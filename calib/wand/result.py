@@ -47,6 +47,21 @@ class Outlier:
 
 
 @dataclass(frozen=True, slots=True)
+class Exchange:
+    """A camera under whose name a part of the recording has the points of another camera.
+
+    Attributes:
+        shown: the camera whose name the detections have.
+        of: the camera that made them.
+        share: their part of all detections of `shown`.
+    """
+
+    shown: str
+    of: str
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class ClockJump:
     """A jump of a camera's timestamps by `ms` with standard deviation `sigma_ms`, at `at_s`, seconds after the first
     frame of the recording."""
@@ -111,6 +126,7 @@ class WandReport:
         compared: a measured distance compared with the wand.
         timing: whether the cameras are taken as synchronous, and why.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
+        exchanges: cameras under whose names there are points of others; these were left out.
     """
 
     cameras: list[CameraReport]
@@ -127,6 +143,7 @@ class WandReport:
     compared: DistanceComparison | None
     timing: str
     adjusted_lenses: dict[str, Any]
+    exchanges: list[Exchange]
 
     @property
     def residual_px(self) -> float:
@@ -161,6 +178,7 @@ class WandReport:
             },
             "left_out": dict(self.left_out()),
             "unplaced": dict(self.unplaced),
+            **self._exchanged(),
         }
 
     def _validation(self) -> dict[str, Any]:
@@ -178,6 +196,12 @@ class WandReport:
         if self.length_mean_mm is None or self.length_std_mm is None:
             return None
         return {"mean": round(self.length_mean_mm, 3), "std": round(self.length_std_mm, 3)}
+
+    def _exchanged(self) -> dict[str, Any]:
+        if not self.exchanges:
+            return {}
+        rows = [{"camera": e.shown, "shows": e.of, "share": round(e.share, 4)} for e in self.exchanges]
+        return {"exchanged_points": rows}
 
     def _distance(self) -> dict[str, Any]:
         compared = {"by_wand_m": round(self.compared.by_wand_m, 5)} if self.compared else {}

@@ -105,14 +105,15 @@ def triangulate(
     return np.swapaxes(points, 0, 1), agreeing.T
 
 
-def intersect(ray: Array, centre: Array, known: Mask) -> tuple[Array, Array]:
+def intersect(ray: Array, centre: Array, known: Mask, rounds: int = ROUNDS) -> tuple[Array, Array]:
     """Return points (M, K, 3) nearest to `known` (C, M, K) rays (C, M, K, 3) through centres (C, 3), and the rays'
-    angles (C, M, K) to them; points are NaN where fewer than two rays are known, or they are nearly parallel."""
+    angles (C, M, K) to them; points are NaN where fewer than two rays are known, or they are nearly parallel.
+    The first of the rounds weighs all rays alike."""
     across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
     toward = np.einsum("cmkij,cj->cmki", across, centre)
     weight = known.astype(float)
     points, angle = np.full((*known.shape[1:], 3), np.nan), np.zeros(known.shape)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         A, b = np.einsum("cmk,cmkij->mkij", weight, across), np.einsum("cmk,cmki->mki", weight, toward)
         spread = np.linalg.eigvalsh(A)
         solvable = (known.sum(axis=0) >= 2) & (spread[..., 0] > MIN_ANGLE * spread[..., 2])

@@ -16,6 +16,7 @@ import pytest
 
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.sources.observations import write_observations
+from tests.calib.boards import SPEC, board_poses, render
 from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
 from tests.truth import true_camera
@@ -222,3 +223,18 @@ def test_intrinsics_refuse_invalid_boards_and_images(tmp_path: Path):
     done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_one_bad_camera_does_not_discard_the_other_lenses(tmp_path: Path):
+    """Exit code 2 with the reason for the bad one; the lens of the good one is written."""
+    for k, pose in enumerate(board_poses(0.6)):
+        for name in ("good", "bad"):
+            (tmp_path / "frames" / name).mkdir(parents=True, exist_ok=True)
+            image = render(*pose) if name == "good" else np.zeros((480, 640), np.uint8)
+            cv2.imwrite(str(tmp_path / "frames" / name / f"{k}.png"), image)
+    out = tmp_path / "rig.yaml"
+    done = calib("intrinsics", "--frames", tmp_path / "frames", "--board", SPEC, "--out", out)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "camera 'bad': the board is in 0 of 16 frames" in done.stderr
+    assert "written without it: good" in done.stderr
+    assert list(load_rig(out).cameras) == ["good"]

@@ -22,7 +22,7 @@ from calib.intrinsics.board import (
     make_finder,
 )
 from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, merge_lenses
-from calib.intrinsics.calibrated_lens import CalibratedLens
+from calib.intrinsics.calibrated_lens import CalibratedLens, aspect_ratio
 from calib.intrinsics.guided_capture import capture_views
 from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
@@ -247,6 +247,90 @@ def test_lenses_of_webcams(shared_data: Callable[[str], Path]):
 def test_merging_keeps_other_cameras():
     other = Camera(width=10, height=10, fx=9.0, fy=9.0, cx=5.0, cy=5.0)
     assert list(merge_lenses(Rig(cameras={"cam9": other}), {}, {}).cameras) == ["cam9"]
+
+
+def test_a_chessboard_under_uneven_light_is_found_as_precisely():
+    """Twelve poses, in light that is too bright on one side of the image and dark on the other: the finder by sectors
+    misses some, the fallback finds all of these, with corners as precise as its own on the others."""
+    finder, errors = ChessboardFinder(8, 6, 0.05), {"sectors": [], "quadrangles": []}
+    for k in range(12):
+        image, truth = render_chessboard(finder, k)
+        by_sectors = cv2.findChessboardCornersSB(
+            image, (8, 6), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        )[0]
+        found = finder.find(image)
+        assert found is not None
+        either = (truth, truth[::-1])  # the board looks the same turned by half a turn
+        rms = min(np.sqrt(((found[0] - corners) ** 2).sum(axis=1).mean()) for corners in either)
+        errors["sectors" if by_sectors else "quadrangles"].append(rms)
+    assert len(errors["quadrangles"]) >= 2
+    assert np.median(errors["quadrangles"]) < np.median(errors["sectors"])
+
+
+def render_chessboard(finder: ChessboardFinder, k: int) -> tuple[NDArray[np.uint8], NDArray]:
+    """A chessboard on grey under light from one side, 640 x 480, and its corners (48, 2), pixels."""
+    turn = 0.6 * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.2])
+    shift = np.array([0.16 * np.cos(k), 0.12 * np.sin(1.7 * k), 0.8])
+    R, focal, per_metre = rotation_from_vector(turn), 520.0, 1200.0
+    picture = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.full((60, 60), 255)).astype(np.uint8)
+    K = np.array([[2 * focal, 0, 639.5], [0, 2 * focal, 479.5], [0, 0, 1]])
+    picture = cv2.copyMakeBorder(picture, 24, 24, 24, 24, 0, value=255)
+    to_board = np.array([[1, 0, 0.5 - 294], [0, 1, 0.5 - 234], [0, 0, per_metre]]) / per_metre
+    H = K @ np.column_stack([R[:, :2], shift]) @ to_board
+    big = cv2.warpPerspective(picture, H, (1280, 960), borderValue=128)
+    light = np.linspace(0.05, 1.95, 640)
+    noise = np.random.default_rng(k).normal(0, 1.5, (480, 640))
+    image = (
+        cv2.GaussianBlur(cv2.resize(big, (640, 480), interpolation=cv2.INTER_AREA), (0, 0), 0.7) * light
+        + noise
+    )
+    corners = (finder.corners - finder.corners.mean(axis=0)) @ R.T + shift
+    return np.clip(image, 0, 255).astype(np.uint8), corners[:, :2] / corners[:, 2:] * focal + [319.5, 239.5]
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.02])
+def test_pixels_that_are_not_square_are_found_where_the_views_show_it(ratio: float):
+    """fx / fy is within 4 standard deviations of the truth, and only pixels that are not square are warned of."""
+    truth = see_through("pinhole")
+    truth = truth.with_parameters(truth.parameters * [ratio, *[1.0] * 8])
+    views = BoardViews("cam0", BOARD)
+    views.views, views.size, views.frames = look(truth, SIDES, 0.1), (truth.width, truth.height), 24
+    lens = views.solve()
+    found, sigma = aspect_ratio(lens.adjusted)
+    assert abs(found - truth.fx / truth.fy) < 4 * sigma
+    assert any("not square" in warning for warning in lens.warnings()) == (ratio != 1.0)
+
+
+@pytest.mark.parametrize("model", COEFFICIENTS)
+def test_the_better_lens_model_is_suggested(model: Model):
+    """Views through a very wide fisheye lens suggest it, and never the other."""
+    lens = Lens(
+        width=800, height=600, fx=280.0, fy=280.0, cx=400.0, cy=300.0, distortion=(0.0,) * 4, model="fisheye"
+    )
+    wide = [(turn, shift * [2.6, 2.6, 0.7]) for turn, shift in SIDES]
+    views = BoardViews("cam0", BOARD)
+    views.views, views.size = look(lens, wide, 0.1), (lens.width, lens.height)
+    suggested = views.compare_models(model)
+    assert ("run again with --model fisheye" in suggested) == (model == "pinhole")
+    assert suggested == "" or model == "pinhole"
+    views.views = look(see_through("pinhole"), SIDES, 0.1)
+    assert views.compare_models("pinhole") == ""
+
+
+def test_a_mirrored_board_is_reported():
+    """By images in which the board is found only once they are mirrored, and by the order of its corners."""
+    finder = CharucoFinder(make_charuco_board(SPEC))
+    mirrored = [np.ascontiguousarray(render(*pose)[:, ::-1]) for pose in board_poses(0.6, 4)]
+    with pytest.raises(CalibrationError, match="camera 'cam0': its images show the board mirrored"):
+        calibrate_lens("cam0", name_all(mirrored), finder)
+    truth = see_through("pinhole")
+    views = BoardViews("cam0", BOARD)
+    views.views = [
+        replace(v, pixels=[truth.width - 1, 0] - v.pixels * [1, -1]) for v in look(truth, SIDES, 0.1)
+    ]
+    views.size, views.frames = (truth.width, truth.height), 24
+    with pytest.raises(CalibrationError, match="mirrored"):
+        views.solve()
 
 
 class ViewReplay:
