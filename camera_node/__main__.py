@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m camera_node` publishes a camera, `detect` reads images, `print` draws roundels,
-`snapshot` and `settings` ask a camera that runs."""
+`snapshot` and `settings` ask a camera that runs, `cameras` the server for all of them."""
 
 import sys
 
@@ -18,7 +18,7 @@ def main() -> None:
 
 def _program() -> int | None:
     arguments = sys.argv[1:]
-    check_command(arguments, ("detect", "print", "snapshot", "settings"))
+    check_command(arguments, ("detect", "print", "snapshot", "settings", "cameras"))
     name = arguments[0] if arguments else ""
     if name == "detect":
         from camera_node.commands.detect import Detect
@@ -33,6 +33,10 @@ def _program() -> int | None:
 
         kind = SaveSnapshot if name == "snapshot" else ChangeSettings
         return run_command(kind, f"camera_node {name}", arguments[1:])
+    if name == "cameras":
+        from camera_node.commands.cameras import cameras
+
+        return run_command(cameras, "camera_node cameras", arguments[1:])
     return run_command(Publish, "camera_node", arguments)
 
 

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: `python -m fusion` is the live server, `python -m fusion NAME` one of the commands."""
 
+import os
 import sys
 from importlib import import_module
 from typing import Any
+
+# Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from camera_node.command_line import run_command
 from camera_node.errors import check_command, run
@@ -14,18 +18,19 @@ COMMANDS = {  # and their modules in fusion.commands
     "run": "run",
     "replay": "replay",
     "record": "record",
+    "recordings": "record",
     "repair": "repair",
     "health": "health",
     "doctor": "doctor",
     "define": "define",
     "robots": "robots",
-    "cameras": "cameras",
     "undo": "undo",
     "redo": "undo",
     "export": "export",
-    "ros2": "ros2",
-    "vrpn": "vrpn",
-    "mavlink": "mavlink",
+    "ros2": "bridges.ros2",
+    "vrpn": "bridges.vrpn",
+    "mavlink": "bridges.mavlink",
+    "foxglove": "bridges.foxglove",
 }
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 
 from tests.waiting import wait_for
+from web.demo import conclude
 from web.demo_server import USUAL, start_server
 from web.processes import Processes
 
@@ -82,3 +83,12 @@ def test_a_second_demo_finds_another_port(scene: Path, tmp_path: Path):
         assert all(server.startup_s > 0 for server in servers)
         first.check()
         second.check()
+
+
+def test_a_demo_that_a_user_ends_does_not_fail():
+    """Only a demo with --seconds is a test: a gap in minutes of watching is reported, and the exit code is 0."""
+    faults = ["rover: not tracked for 0.61 s (limit 0.5 s)"]
+    assert conclude([], is_test=True)[1] == conclude([], is_test=False)[1] == 0
+    text, code = conclude(faults, is_test=False)
+    assert (code, "FAILED" in text, faults[0] in text) == (0, False, True)
+    assert conclude(faults, is_test=True) == (f"FAILED: {faults[0]}", 1)

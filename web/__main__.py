@@ -39,6 +39,7 @@ class Options:
         demo: Run a simulated arena: calibrate it with a wand, track its robots and show it.
         rig: The arena's rig.yaml with at least the intrinsics; adds a button that calibrates with a wand.
         wand: The wand for that button.
+        folder: Where the page saves recordings and robots, and lists recordings.
         replay: Show a recording (MCAP, from python -m fusion record) instead of a running arena.
         scene: The demo's scene, with arena.yaml, robots.yaml and wand.yaml beside it; by default the one in configs.
         listen: Zenoh endpoint of the demo's server; by default tcp/127.0.0.1:7447, or a free port if that is taken.
@@ -56,6 +57,7 @@ class Options:
     demo: bool = False
     rig: Path | None = None
     wand: Path = field(default_factory=partial(example_file, "wand.yaml"))
+    folder: Path = Path()
     replay: Path | None = None
     scene: Path | None = None
     listen: str | None = None
@@ -105,7 +107,7 @@ def _show(
         if isinstance(source, RecordingPlayer):
             add_replay_page(view, source)
         else:
-            add_live_page(view, source, " ".join(options.connect), files, stack)
+            add_live_page(view, source, " ".join(options.connect), files, stack, options.folder)
         print(*access.instructions(options.tokens), sep="\n", flush=True)
         view.run(stop)
 

@@ -46,8 +46,7 @@ def next_step(state: ArenaState) -> Step:
         return "cameras"
     if state.rig is None or not state.rig.placed():
         return "calibrate"
-    status: FusionStatus | None = state.status.message if state.status else None
-    return "run" if status is None or status.robots else "robots"
+    return "run" if state.status is None or state.declared_robots() else "robots"
 
 
 def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:

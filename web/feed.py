@@ -54,6 +54,11 @@ class ArenaState:
     message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
 
+    def declared_robots(self) -> tuple[str, ...]:
+        """Names of the robots that the server tracks or looks for, sorted; empty before its first status."""
+        status: FusionStatus | None = self.status.message if self.status else None
+        return tuple(sorted({*status.robots, *status.not_acquired})) if status else ()
+
     def age_s(self, timed: TimedMessage | None) -> float:
         """Return the seconds since a message arrived; infinity for None."""
         return self.now_s - timed.received_s if timed else math.inf
@@ -150,7 +155,9 @@ class Feed:
     def _store_status(self, status: FusionStatus, key: str) -> None:
         state = self._state
         state.status = TimedMessage(status, self._clock())
-        for robot in state.poses.keys() - status.robots.keys():  # renamed or removed, unless it is new
+        for robot in (
+            state.poses.keys() - status.robots.keys() - status.not_acquired.keys()
+        ):  # renamed or removed, unless it is new
             if self._clock() - state.poses[robot].received_s > REMOVED_S:
                 del state.poses[robot]
 

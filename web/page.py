@@ -2,15 +2,18 @@
 """Assembles the page of a running arena or of a recording: header, tabs and their controls."""
 
 import contextlib
+import threading
+from pathlib import Path
 
+from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.subscription import Subscription
 from web.tabs.calibrate import RigHistory
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
-from web.tabs.record import ReplayControls
-from web.tabs.robots import RobotTable
+from web.tabs.record import Recorder, RecordingList, ReplayControls
+from web.tabs.robots import RobotEditor, RobotTable
 from web.tabs.status import StatusTab
 from web.tabs.wand_session import CalibrationFiles, WandSessionPanel
 from web.view import View
@@ -22,6 +25,7 @@ def add_live_page(
     endpoint: str,
     files: CalibrationFiles | None,
     closing: contextlib.ExitStack,
+    folder: Path = Path(),
 ) -> None:
     """Add the controls of a running arena.
 
@@ -31,6 +35,7 @@ def add_live_page(
         endpoint: of the arena's server.
         files: of the calibration with a wand; None for none.
         closing: ends what runs in the background.
+        folder: where recordings and robots are saved.
     """
     header = Header(view.server, view.feed.keys.arena, endpoint, view.reset_view)
     gui = view.server.gui
@@ -39,19 +44,50 @@ def add_live_page(
         view.add(CameraTable(gui))
         pictures = LivePictures(view.server, subscription, view.cameras)
         closing.callback(pictures.close)
-        view.add(pictures)
-        view.add(CameraSettings(gui, subscription))
+        view.add(pictures, is_live=True)
+        view.add(CameraSettings(gui, subscription), is_live=True)
     with header.tabs["Calibrate"]:
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
-            view.add(panel)
+            view.add(panel, is_live=True)
             closing.callback(panel.close)
-        view.add(RigHistory(gui, subscription))
+        view.add(RigHistory(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))
-        view.add(MarkerPicker(view.server, subscription))
+        view.add(RobotEditor(gui, subscription, folder), is_live=True)
+        view.add(MarkerPicker(view.server, subscription), is_live=True)
+    with header.tabs["Record"]:
+        recorder = Recorder(gui, subscription, folder)
+        closing.callback(recorder.close)
+        view.add(recorder, is_live=True)
+        controls = ReplayControls(gui)
+        shown = ShownRecording(view, header, controls)
+        closing.callback(shown.show, None)
+        view.add(RecordingList(gui, folder, shown.show), is_live=True)
+        view.add(controls)
     with header.tabs["Status"]:
-        view.add(StatusTab(gui))
+        view.add(StatusTab(gui, endpoint, view.feed.keys.arena), is_live=True)
+
+
+class ShownRecording:
+    """Shows a recording in the page of a running arena, and the arena again."""
+
+    def __init__(self, view: View, header: Header, controls: ReplayControls) -> None:
+        self._view, self._header, self._controls = view, header, controls
+        self._stop = threading.Event()
+
+    def show(self, path: Path | None) -> None:
+        """Play a recording; None shows the arena. Raises ConfigError if the file is no recording."""
+        player = RecordingPlayer(path) if path is not None else None
+        self._stop.set()  # ends the thread of the recording before
+        if player is not None and path is not None:
+            self._stop = threading.Event()
+            self._view.shown = Feed(player.arena, clock=player.seconds)
+            arguments = (self._view.shown, self._stop)
+            threading.Thread(target=player.run, args=arguments, name="replay", daemon=True).start()
+        else:
+            self._view.shown = self._view.feed
+        self._controls.player, self._header.recording = player, path.name if path else ""
 
 
 def add_replay_page(view: View, player: RecordingPlayer) -> None:
@@ -64,6 +100,6 @@ def add_replay_page(view: View, player: RecordingPlayer) -> None:
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))
     with header.tabs["Record"]:
-        view.add(ReplayControls(view.server, player))
+        view.add(ReplayControls(gui, player))
     with header.tabs["Status"]:
-        view.add(StatusTab(gui))
+        view.add(StatusTab(gui, "", player.arena))

@@ -26,6 +26,7 @@ class RecordingPlayer:
     Attributes:
         arena: name of the recorded arena.
         duration_s: time from the first message to the last.
+        start_s: Unix time of the first message.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,6 +52,7 @@ class RecordingPlayer:
             )
         self.arena = arenas.most_common(1)[0][0]
         self._start_ns = times[0]
+        self.start_s = times[0] / 1e9
         self.duration_s = (times[1] - times[0]) / 1e9
         self._lock = threading.Lock()
         self._position_s, self._position_set_at = 0.0, time.monotonic()
@@ -85,6 +87,12 @@ class RecordingPlayer:
         with self._lock:
             self._set_position(min(max(seconds, 0.0), self.duration_s))
             self._jumped = True
+
+    def step(self, seconds: float) -> None:
+        """Pause, and advance by some seconds."""
+        with self._lock:
+            self._set_position(min(self._seconds() + seconds, self.duration_s))
+            self._playing = False
 
     def run(self, feed: Feed, stop: threading.Event, once: bool = False) -> None:
         """Play into a feed until `stop` is set; with `once`, set it at the end of the recording."""

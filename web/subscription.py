@@ -3,6 +3,7 @@
 
 import contextlib
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -15,7 +16,7 @@ from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
-from fusion.protocol.requests import change_robots
+from fusion.protocol.requests import change_robots, reframe_robot, request_robots
 from web.feed import Feed
 
 REQUEST_TIMEOUT_S = 2.0
@@ -79,8 +80,19 @@ class Subscription:
             FusionError: the server refuses, as it does where the name is in use.
             NetworkError: it does not answer.
         """
-        request = RobotsRequest(define={name: robot})
+        return self.change_robots(RobotsRequest(define={name: robot}))
+
+    def change_robots(self, request: RobotsRequest) -> Robots:
+        """Have the server change its robots; returns all robots and raises as `define`."""
         return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
+
+    def reframe_robot(self, name: str, change: Callable[[Robot], Robot]) -> Robots:
+        """Have the server replace a robot by `change` of it; returns all robots and raises as `define`."""
+        return reframe_robot(self.session, self.feed.keys.arena, name, change, REQUEST_TIMEOUT_S)
+
+    def declared_robots(self) -> Robots:
+        """All robots of the server. Raises NetworkError if it does not answer."""
+        return request_robots(self.session, self.feed.keys.arena, REQUEST_TIMEOUT_S)
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
         """Have the server undo the last change of its rig; return the outcome as text.

@@ -44,11 +44,9 @@ def robot_state(state: ArenaState, robot: str) -> str:
 
 def tabulate_robots(state: ArenaState) -> HtmlTable:
     """One row per robot: state, position, speed, standard deviation of the position, number of markers."""
-    status: FusionStatus | None = state.status.message if state.status else None
-    declared = {*status.robots, *status.not_acquired} if status else set()
     rows = [
         _robot_row(state, name) if name in state.poses else _missing_row(state, name)
-        for name in sorted({*state.poses, *declared})
+        for name in sorted({*state.poses, *state.declared_robots()})
     ]
     return HtmlTable(ROBOT_COLUMNS, rows, "no robot is declared; create one below")
 

@@ -44,6 +44,7 @@ class View:
         """
         check_port(access.host, access.port)
         self.feed, self.access = feed, access
+        self.shown = feed  # in the scene and the tables: the arena's, or that of a recording
         with guarding(access):
             self.server = viser.ViserServer(
                 host=access.host, port=access.port, label="Roundel", verbose=False
@@ -52,7 +53,7 @@ class View:
         self.server.gui.configure_theme(
             dark_mode=True, control_width="large", show_logo=False, show_share_button=False
         )
-        self._sections: list[PanelSection] = []
+        self._sections: list[tuple[PanelSection, bool]] = []
         self._drawings = 0
         self._rig: Rig | None = None
         self.cameras = CameraDrawing(self.server.scene)
@@ -87,7 +88,8 @@ class View:
 
     def update(self) -> None:
         """Draw the current state."""
-        state = self.feed.state()
+        live = self.feed.state()
+        state = live if self.shown is self.feed else self.shown.state()
         with self.server.atomic():
             if state.rig is not self._rig:
                 self._draw_rig(state.rig)
@@ -95,13 +97,13 @@ class View:
             self._markers.draw(state)
             self.true_points.draw(state)
             if self._drawings % PANEL_INTERVAL == 0:
-                for section in self._sections:
-                    section.update(state)
+                for section, is_live in self._sections:
+                    section.update(live if is_live else state)
         self._drawings += 1
 
-    def add(self, section: PanelSection) -> None:
-        """Update further controls of the panel together with the others."""
-        self._sections.append(section)
+    def add(self, section: PanelSection, is_live: bool = False) -> None:
+        """Update further controls of the panel; live ones act on the arena, also while a recording is shown."""
+        self._sections.append((section, is_live))
 
     def reset_view(self) -> None:
         """Show the whole arena in all browsers, present and future."""

@@ -2,7 +2,8 @@
 """`python -m camera_node detect`: detects roundels in image files."""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,14 +13,18 @@ import tyro
 from rich.table import Table
 
 from camera_node.arrays import Grey
-from camera_node.detection.detector import Detector
+from camera_node.detection.detector import Detector, DetectorSettings
 from camera_node.detection.disc_pose import locate_all
-from camera_node.detection.overlay import draw_roundels
+from camera_node.detection.overlay import draw_refused, draw_roundels
+from camera_node.detection.refusals import RefusedRing, explain
 from camera_node.detection.roundels import Roundel, Roundels
-from camera_node.errors import ConfigError
+from camera_node.errors import CameraError, ConfigError
 from camera_node.geometry.lens import Lens, load_lens
 from camera_node.sources.replay import read_grey
 from camera_node.terminal import console, say
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")  # of the pictures of a folder
+PASSES = 2  # over a picture: the first one learns prints and tone curve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,15 +32,25 @@ class Detect:
     """Detect the roundels in image files."""
 
     images: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """PNG or JPEG files."""
+    """PNG or JPEG files, or folders of them."""
     json: bool = False
     """Print one JSON object for each image instead of a table."""
+    why: bool = False
+    """Also list the ring-like shapes that are no roundels, with the test that each of them fails."""
     draw: Path | None = None
-    """Draw the roundels on the image and write it to this file; for a single image."""
+    """Draw the roundels (and refused rings) on the image and write it to this file; a folder for several images."""
     detector: Literal["chords", "paper"] = "chords"
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
     inner_ratios: tuple[float, ...] = ()
     """Inner over outer diameters of the prints in use, such as 0.6; without any, they are found."""
+    ratio_tolerance: float = DetectorSettings.ratio_tolerance
+    """Largest difference between a measured ratio and that of a print."""
+    min_diameter_px: float = DetectorSettings.min_diameter_px
+    """Least major axis of the black disc, pixels."""
+    max_diameter_px: float = DetectorSettings.max_diameter_px
+    """Greatest major axis of the black disc, pixels."""
+    min_contrast: float = DetectorSettings.min_contrast
+    """Least difference of paper and ink, grey levels."""
     rig: Path | None = None
     """A rig.yaml with the camera's lens: adds both poses of each roundel. Requires --name and --diameter."""
     name: str | None = None
@@ -51,23 +66,36 @@ class Detect:
             CameraError: a file is missing or no image.
         """
         lens = self._lens()
-        if not self.images:
-            raise ConfigError("no image given; name one or more PNG or JPEG files")
-        if self.draw and len(self.images) > 1:
-            raise ConfigError(
-                f"--draw takes one image, got {len(self.images)}; run the command once for each image"
-            )
-        for path in self.images:
-            image = read_grey(path)
-            # The images are not a sequence, so each one gets a detector without tracks.
-            detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
-            roundels = detector.detect(image)
-            rows = [_describe(roundel) for roundel in roundels]
-            if lens is not None and self.diameter is not None:
-                _add_poses(rows, roundels, lens, self.diameter)
-            self._print(path, rows)
-            self._draw(image, roundels)
+        paths = list(_pictures(self.images))
+        if not paths:
+            raise ConfigError("no image given; name PNG or JPEG files, or folders of them")
+        if self.draw and len(paths) > 1:
+            _make_folder(self.draw)
+        for path in paths:
+            self._inspect(path, lens, one_of=len(paths))
         return 0
+
+    def _inspect(self, path: Path, lens: Lens | None, one_of: int) -> None:
+        image = read_grey(path)
+        detector, roundels = self._detect(image)
+        refused = explain(detector, image, roundels) if self.why else []
+        rows = [_describe(roundel) for roundel in roundels]
+        if lens is not None and self.diameter is not None:
+            _add_poses(rows, roundels, lens, self.diameter)
+        self._print(path, rows, refused)
+        if self.draw:
+            to = self.draw if one_of == 1 else self.draw / f"{path.parent.name}_{path.stem}.png"
+            _draw(image, roundels, refused, to)
+            if not self.json:  # whose output has JSON only
+                say(f"wrote {to}")
+
+    def _detect(self, image: Grey) -> tuple[Detector, Roundels]:
+        """The roundels of an image. The images are not a sequence, so each one gets a detector without tracks."""
+        names = {f.name for f in fields(DetectorSettings)} & {f.name for f in fields(self)}
+        detector = Detector(detector=self.detector, **{name: getattr(self, name) for name in names})
+        for _ in range(PASSES - 1):
+            detector.detect(image)
+        return detector, detector.detect(image)
 
     def _lens(self) -> Lens | None:
         given = [self.rig is not None, self.name is not None, self.diameter is not None]
@@ -79,23 +107,66 @@ class Detect:
             raise ConfigError(f"--diameter is {self.diameter}; give the black disc's diameter in metres")
         return load_lens(self.rig, self.name)
 
-    def _print(self, path: Path, rows: list[dict[str, Any]]) -> None:
+    def _print(self, path: Path, rows: list[dict[str, Any]], refused: list[RefusedRing]) -> None:
         if self.json:
-            print(json.dumps({"file": str(path), "roundels": rows}))
-        else:
-            say(f"{path}: {len(rows)} roundel{'' if len(rows) == 1 else 's'}")
-            if rows:
-                console().print(_table(rows))
-
-    def _draw(self, image: Grey, roundels: Roundels) -> None:
-        if self.draw is None:
+            why = {"refused": [_describe_refused(ring) for ring in refused]} if self.why else {}
+            print(json.dumps({"file": str(path), "roundels": rows, **why}))
             return
-        try:
-            written = cv2.imwrite(str(self.draw), draw_roundels(image, roundels))
-        except cv2.error:
-            written = False
-        if not written:
-            raise ConfigError(f"{self.draw} can't be written; give a .png or .jpg in an existing folder")
+        say(f"{path}: {len(rows)} roundel{'' if len(rows) == 1 else 's'}")
+        if rows:
+            console().print(_table(rows))
+        if self.why:
+            say(f"{path}: {len(refused)} ring-like shape{'' if len(refused) == 1 else 's'} refused")
+        for ring in refused:
+            u, v, size = *ring.uv, ring.axes_px[0]
+            say(f"  at {u:.0f}, {v:.0f}, {size:.0f} px: {ring.text}")
+
+
+def _pictures(paths: tuple[Path, ...]) -> Iterator[Path]:
+    """The files, and those of the folders by name."""
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
+        if not inside:
+            raise CameraError(f"{path} has no picture; it needs files such as .png or .jpg")
+        yield from inside
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"--draw is {path}, which is no folder; several images need one: name a folder"
+        ) from error
+
+
+def _draw(image: Grey, roundels: Roundels, refused: list[RefusedRing], to: Path) -> None:
+    canvas = draw_roundels(image, roundels)
+    draw_refused(canvas, refused)
+    try:
+        written = cv2.imwrite(str(to), canvas)
+    except cv2.error:
+        written = False
+    if not written:
+        raise ConfigError(f"{to} can't be written; give a .png or .jpg in an existing folder")
+
+
+def _describe_refused(ring: RefusedRing) -> dict[str, Any]:
+    return {
+        "u": float(ring.uv[0]),
+        "v": float(ring.uv[1]),
+        "major_px": float(ring.axes_px[0]),
+        "minor_px": float(ring.axes_px[1]),
+        "angle_rad": ring.angle_rad,
+        "ratio": ring.ratio,
+        "contrast": ring.contrast,
+        "misfit": ring.misfit,
+        "reason": ring.reason.name.lower(),
+        "text": ring.text,
+    }
 
 
 def _describe(roundel: Roundel) -> dict[str, Any]:

@@ -1,89 +1,137 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m camera_node print`: draws a sheet of roundels as an SVG in millimetres, to be printed at 100 %."""
+"""`print`: roundels, wands, boards, L-frames and robots at true scale, as PDF or SVG, with the YAML that belongs to
+them."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import msgspec
 import tyro
 
-from camera_node.config import write_atomically
+from camera_node.config import dump_yaml, example_file, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
+from camera_node.printing.drawing import Page, write_pages
+from camera_node.printing.sheets import Card, board_page, body_page, card_pages, cards_for_page
+from camera_node.terminal import say
 
-PAPER_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 8.0  # unprintable margin of most printers; the scale is drawn in it
+EXAMPLES = {"wand": "wand.yaml", "l-frame": "l.yaml", "robot": "robots.yaml"}
+DIAMETER_M = 0.09  # of all examples
+
+
+class _Robots(msgspec.Struct):
+    """The bodies in robots.yaml; what else it declares of a robot is not printed."""
+
+    robots: dict[str, dict[str, object]]
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Write a sheet of roundels to print, with a scale to check the print."""
+    """Write something to print, at true scale, with cut marks and a ruler to check the printer.
 
-    out: Annotated[Path, tyro.conf.Positional]
-    """The SVG file to write."""
-    diameter: float = 0.12
-    """Outer diameter d_o of the black disc, metres."""
+    roundels: a page of roundels. wand, l-frame, robot: the roundels of a body, with its YAML beside the print. board: a
+    ChArUco board for lens calibration.
+    """
+
+    what: Annotated[Literal["roundels", "wand", "board", "l-frame", "robot"], tyro.conf.Positional]
+    """What to print."""
+    out: Annotated[Path | None, tyro.conf.Positional] = None
+    """The PDF or SVG file; the thing's name with .pdf unless given."""
+    diameter: float | None = None
+    """Outer diameter d_o of the black disc, metres; 0.09, or that of the file, unless given."""
     inner_ratio: float = 0.6
-    """Inner over outer diameter, d_i / d_o."""
+    """roundels: inner over outer diameter, d_i / d_o."""
     surround_ratio: float = 9 / 7
-    """White card over outer diameter, d / d_o; increase it for dark floors and distant cameras."""
+    """roundels: white card over outer diameter, d / d_o; increase it for dark floors and distant cameras."""
     paper: str = "a4"
-    """a4, a3 or letter."""
+    """a4, a3, a2, letter or tabloid."""
+    file: Path | None = None
+    """wand, l-frame, robot: the YAML that describes it; an example unless given."""
+    name: str | None = None
+    """robot: its name in the file; the first one unless given."""
+    columns: int = 5
+    """board: squares in a row."""
+    rows: int = 7
+    """board: squares in a column."""
+    square: float = 0.035
+    """board: side of a square, metres."""
 
     def run(self) -> int:
-        """Write the sheet and print the number of roundels on it."""
-        svg, count = draw(self)
-        write_atomically(self.out, svg)
-        roundels = "1 roundel" if count == 1 else f"{count} roundels"
-        size = f"d_o = {self.diameter * 1e3:g} mm"
-        print(f"{self.out}: {roundels} of {size}; print at 100 %, then measure one of them")
+        """Write the print and its YAML, and say what was written."""
+        out = self.out or Path(f"{self.what}.pdf")
+        if self.what == "board":
+            pages, note = self._board()
+        elif self.what == "roundels":
+            pages, note = self._roundels()
+        else:
+            name, body = self._body()
+            pages = self._body_pages(name, body)
+            note = self._write_yaml(out.with_suffix(".yaml"), name, body)
+        for path in write_pages(pages, out):
+            say(f"wrote {path}")
+        say(f"{note}; print at 100 %, then check the ruler")
         return 0
 
+    def _board(self) -> tuple[list[Page], str]:
+        spec = f"charuco:{self.columns}x{self.rows}:{self.square:g}"
+        page = board_page(self.columns, self.rows, self.square, self.paper, f"--board {spec}")
+        return [page], f"for the lens calibration: --board {spec}"
 
-def draw(sheet: Sheet) -> tuple[str, int]:
-    """Draw as many roundels as fit on the paper; return the SVG text and their number.
+    def _roundels(self) -> tuple[list[Page], str]:
+        try:
+            body = Body(
+                diameter_m=DIAMETER_M if self.diameter is None else self.diameter,
+                inner_ratio=self.inner_ratio,
+                surround_ratio=self.surround_ratio,
+            )
+        except ValueError as error:
+            raise ConfigError(f"invalid sheet: {error}") from None
+        size = f"d_o = {1e3 * body.diameter_m:g} mm"
+        count = cards_for_page(body, self.paper)
+        cards = [Card(body, f"{k + 1}  {size}") for k in range(count)]
+        roundels = "1 roundel" if count == 1 else f"{count} roundels"
+        return card_pages(cards, self.paper, size), f"{roundels} of {size}; diameter_m: {body.diameter_m:g}"
 
-    Raises:
-        ConfigError: a size is invalid, the paper is unknown, or a roundel is larger than the paper.
-    """
-    try:
-        body = Body(
-            diameter_m=sheet.diameter, inner_ratio=sheet.inner_ratio, surround_ratio=sheet.surround_ratio
+    def _body(self) -> tuple[str, Body]:
+        """The name and the body that the file describes."""
+        path = self.file or example_file(EXAMPLES[self.what])
+        if self.what != "robot":
+            body = load_yaml(path, Body)
+            return self.what, self._resized(body)
+        robots = load_yaml(path, _Robots).robots
+        name = self.name or next(iter(robots), "")
+        if name not in robots:
+            raise ConfigError(f"{path} has no robot '{name}'; it has {', '.join(robots) or 'none'}")
+        fields = {key: value for key, value in robots[name].items() if key in Body.__struct_fields__}
+        try:
+            return name, self._resized(msgspec.convert(fields, Body))
+        except (msgspec.ValidationError, ValueError) as error:
+            raise ConfigError(f"{path}: robot {name}: {error}") from None
+
+    def _resized(self, body: Body) -> Body:
+        if self.diameter is None:
+            return body
+        try:
+            return Body(**{**msgspec.structs.asdict(body), "diameter_m": self.diameter})
+        except ValueError as error:
+            raise ConfigError(f"--diameter: {error}") from None
+
+    def _body_pages(self, name: str, body: Body) -> list[Page]:
+        """One page with the whole body where it fits, else a card for each roundel."""
+        title = f"{name}, d_o = {1e3 * body.diameter_m:g} mm"
+        if page := body_page(body, self.paper, name, title):
+            return [page]
+        places = (", ".join(f"{1e3 * x:g}" for x in marker) for marker in body.markers)
+        cards = [Card(body, f"{name} {k}: ({place}) mm") for k, place in enumerate(places, 1)]
+        return card_pages(cards, self.paper, title)
+
+    def _write_yaml(self, path: Path, name: str, body: Body) -> str:
+        """Write the body's YAML unless the file exists, which may be the one it was read from; return a note."""
+        data = dump_yaml(_Robots({name: msgspec.to_builtins(body)}) if self.what == "robot" else body)
+        if path.exists():
+            return f"{path} exists and is unchanged; the print is {len(body.markers)} roundels of {body.diameter_m:g} m"
+        write_atomically(path, data)
+        return (
+            f"wrote {path}, which describes the print: {len(body.markers)} roundels of {body.diameter_m:g} m"
         )
-    except ValueError as error:
-        raise ConfigError(f"invalid sheet: {error}") from None
-    if sheet.paper not in PAPER_MM:
-        raise ConfigError(f"--paper {sheet.paper} is not known; choose one of {', '.join(PAPER_MM)}")
-    width, height = PAPER_MM[sheet.paper]
-    d = 1e3 * body.diameter_m
-    card = d * body.surround_ratio
-    columns, rows = (int((size - 2 * MARGIN_MM) // card) for size in (width, height))
-    if not columns or not rows:
-        raise ConfigError(f"a card of {card:.0f} mm does not fit on {sheet.paper}; choose a larger --paper")
-    centres = [
-        ((c + 0.5) * width / columns, (r + 0.5) * height / rows) for r in range(rows) for c in range(columns)
-    ]
-    discs = "\n".join(_roundel(x, y, d, body.inner_ratio, card) for x, y in centres)
-    return _page(width, height, discs, f"d_o = {d:g} mm"), len(centres)
-
-
-def _roundel(x: float, y: float, d: float, inner_ratio: float, card: float) -> str:
-    return (
-        f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{card / 2:.3f}" fill="none" stroke="#bbb" stroke-width="0.1"/>'
-        f'<path fill="#000" fill-rule="evenodd" d="{_ring(x, y, d / 2)} {_ring(x, y, inner_ratio * d / 2)}"/>'
-    )
-
-
-def _ring(x: float, y: float, r: float) -> str:
-    arc = f"A {r:.3f} {r:.3f} 0 1 0"
-    return f"M {x - r:.3f} {y:.3f} {arc} {x + r:.3f} {y:.3f} {arc} {x - r:.3f} {y:.3f} Z"
-
-
-def _page(width: float, height: float, discs: str, text: str) -> str:
-    y = height - 2.5
-    scale = f'<path d="M 10 {y:.1f} h 100 m 0 -1 v 2 m -100 -2 v 2" stroke="#000" stroke-width="0.2" fill="none"/>'
-    label = f'<text x="112" y="{y + 1:.1f}" font-size="3.5" font-family="sans-serif">100 mm; {text}</text>'
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
-        f'viewBox="0 0 {width} {height}">\n{discs}\n{scale}\n{label}\n</svg>\n'
-    )

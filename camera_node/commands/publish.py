@@ -12,13 +12,13 @@ from typing import Annotated, Literal
 import tyro
 
 from camera_node.config import example_file, require_name
-from camera_node.errors import CameraError
 from camera_node.protocol.registration import CameraAssignment, CameraRegistration
 from camera_node.simulation.camera import SimulatedCamera
-from camera_node.sources.address import is_url, without_credentials
+from camera_node.sources.address import is_url
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.identity import SourceIdentity, identify, is_simulation
 from camera_node.sources.replay import ArenaTime, FrameFolder, PacedSource, VideoFile
+from camera_node.sources.stream import StreamSource
 from camera_node.sources.v4l2 import V4l2Source, find_device
 
 if typing.TYPE_CHECKING:
@@ -112,7 +112,8 @@ class Publish:
 def open_source(
     text: str, settings: SourceSettings, name: str = "cam0", arena_time: ArenaTime | None = None
 ) -> Source:
-    """Open the source that `--source` names: `sim`, a folder, a video file, or a camera by number, path or name.
+    """Open the source that `--source` names: `sim`, a folder, a video file, the address of a stream, or a
+    camera by number, path or name.
 
     Args:
         text: the value of `--source`.
@@ -128,9 +129,7 @@ def open_source(
     if is_simulation(text):
         return _open_simulation(settings, text.partition(":")[2] or name, arena_time)
     if is_url(text):
-        raise CameraError(
-            f"{without_credentials(text)} is a network stream, which can't be read yet; give a camera"
-        )
+        return StreamSource(text)
     if Path(text).is_dir():
         return PacedSource(FrameFolder(Path(text)), settings, arena_time)
     if Path(text).is_file():

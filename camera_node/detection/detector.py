@@ -157,9 +157,7 @@ class Detector:
         Raises:
             ValueError: the array is not a grey image; `camera_node.sources.grey.to_grey` converts other formats.
         """
-        if image.dtype != np.uint8 or image.ndim != 2:
-            raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
-        columns = self._core.detect(image if image.strides[1] == 1 else np.ascontiguousarray(image))
+        columns = self._core.detect(_as_rows(image))
         roundels = DetectedRoundels(
             cov=columns["pose_cov"][:, :2, :2],
             id=np.full(len(columns["track"]), -1, np.int32),
@@ -169,9 +167,26 @@ class Detector:
             return roundels
         return roundels.select(np.array([not self._is_masked(uv) for uv in roundels.uv], bool))
 
+    def measure_rings(self, image: Grey) -> Array:
+        """Ring-like shapes of an image that it does not accept as roundels, one row each; it learns nothing from them.
+
+        Returns:
+            (N, 9): u, v, major and minor axis, angle, ratio, contrast, misfit and reason, as in `refusals.RefusedRing`.
+
+        Raises:
+            ValueError: the array is not a grey image.
+        """
+        return self._core.explain(_as_rows(image))
+
     def _is_masked(self, uv: Array) -> bool:
         at = (float(uv[0]), float(uv[1]))
         return any(cv2.pointPolygonTest(polygon, at, False) >= 0 for polygon in self._mask)
+
+
+def _as_rows(image: Grey) -> Grey:
+    if image.dtype != np.uint8 or image.ndim != 2:
+        raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
+    return image if image.strides[1] == 1 else np.ascontiguousarray(image)
 
 
 def _check_polygon(polygon: ArrayLike) -> NDArray[np.float32]:

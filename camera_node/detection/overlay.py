@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.arrays import Array
+from camera_node.detection.refusals import RefusedRing
 from camera_node.detection.roundels import Roundel, Roundels
 
 GREEN, RED, AMBER = (60, 200, 60), (40, 40, 230), (58, 166, 240)
@@ -21,6 +22,18 @@ def draw_roundels(image: NDArray[np.uint8], roundels: Roundels) -> NDArray[np.ui
     for k, roundel in enumerate(roundels):
         _draw(canvas, roundel, str(k if roundel.id is None else roundel.id))
     return canvas.astype(np.uint8, copy=False)
+
+
+def draw_refused(canvas: NDArray[np.uint8], rings: Sequence[RefusedRing]) -> None:
+    """Draw refused rings on a BGR image (h, w, 3): their ellipses and the reasons."""
+    for ring in rings:
+        u, v, a, b = (int(x) for x in np.rint(np.concatenate([ring.uv, ring.axes_px / 2]) * 2**SHIFT))
+        angle = float(np.degrees(ring.angle_rad))
+        cv2.ellipse(canvas, (u, v), (a, b), angle, 0, 360, AMBER, 1, cv2.LINE_AA, SHIFT)
+        at = (int(ring.uv[0] - ring.axes_px[0] / 2), int(ring.uv[1] + ring.axes_px[0] / 2 + 12))
+        cv2.putText(
+            canvas, ring.reason.name.lower(), at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, AMBER, 1, cv2.LINE_AA
+        )
 
 
 def draw_preview(

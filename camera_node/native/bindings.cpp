@@ -49,6 +49,21 @@ static nb::dict detect(roundel::Detector& detector, const GreyImage& image) {
     return named;
 }
 
+/// One row a ring: u, v, major, minor, angle, ratio, contrast, misfit, reason.
+static nb::object explain(roundel::Detector& detector, const GreyImage& image) {
+    const auto pixels = view(image);
+    std::vector<roundel::RefusedRing> rings;
+    {
+        nb::gil_scoped_release release;
+        rings = detector.explain(pixels);
+    }
+    std::vector<double> rows;
+    for (const auto& [e, ratio, contrast, misfit, reason] : rings)
+        rows.insert(rows.end(),
+                    {e.x, e.y, e.major, e.minor, e.angle, ratio, contrast, misfit, double(int(reason))});
+    return array(rows, rings.size(), {9});
+}
+
 NB_MODULE(_core, m) {
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
@@ -71,6 +86,7 @@ NB_MODULE(_core, m) {
         .def(nb::init<roundel::RoundelLimits, double, bool>(), nb::arg("limits"), nb::arg("search_share"),
              nb::arg("by_paper"))
         .def("detect", &detect, nb::arg("image").noconvert())
+        .def("explain", &explain, nb::arg("image").noconvert())
         .def("take_over", &roundel::Detector::take_over, nb::arg("other"))
         .def_prop_ro("found_ratios", &roundel::Detector::found_ratios)
         .def_prop_ro("theta", &roundel::Detector::theta)

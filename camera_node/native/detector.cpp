@@ -18,8 +18,8 @@ constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are sear
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
 constexpr int kMaxFailures = 3;        // of which so many may fail
 
-// Least contrast of the further rings of a bullseye: blur makes thin rings, and paper between them, grey. Both
-// are tried for a ring of no known print, which is more often one of a bullseye.
+// Least contrast of the further rings of a bullseye: blur makes thin rings, and paper between them, grey.
+// Both are tried for a ring of no known print, which is more often one of a bullseye.
 constexpr double kRingDepths[] = {0.3, 0.5};
 
 constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
@@ -136,8 +136,7 @@ void Detector::search_part(const Box& part, FrameState& frame) {
     chords.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
     const float left = float(part.left), top = float(part.top);
     for (Seed seed : chords.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
-    for (Streak streak : chords.streaks())
-        streak.x += left, streak.y += top, frame.streaks.push_back(streak);
+    for (Streak streak : chords.streaks()) streak.x += left, streak.y += top, frame.streaks.push_back(streak);
 }
 
 /// Fits the seeds. If there are more than the fits allowed, the next frame begins with those that are left.
@@ -264,6 +263,14 @@ bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameStat
     frame.suppression.add(fit->outer);
     frame.found.push_back({*fit, track});
     return true;
+}
+
+std::vector<RefusedRing> Detector::explain(const ImageView& image) {
+    const std::lock_guard lock(mutex_);
+    if (image.width < 3 || image.height < 3) return {};
+    const ImageView linear = response_.linearize(image);
+    return explain_refusals(
+        linear, {limits_, noise_level(linear), response_.edge_noise(), response_.shading_sigma()});
 }
 
 std::optional<double> Detector::theta() const {

@@ -6,6 +6,7 @@
 
 #include "blur/acceptance.hpp"
 #include "blur/matcher.hpp"
+#include "explanation.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
 #include "reference/faigl2013.hpp"
@@ -36,6 +37,8 @@ class Detector {
     /// by the paper's segments instead of chords.
     explicit Detector(RoundelLimits limits, double search_share = 1, bool by_paper = false);
     FrameResult detect(const ImageView& image);
+    /// The ring-like shapes of an image that this detector refuses; it learns nothing from it.
+    std::vector<RefusedRing> explain(const ImageView& image);
     /// The threshold of the paper's search in the next frame; none with another search.
     std::optional<double> theta() const;
     /// Continues another detector's tracks and theta with this one's settings.

@@ -119,11 +119,13 @@ class Node:
         return DetectedFrame(frame, roundels, (time.perf_counter_ns() - begun_ns) / 1000)
 
     def _stamp(self, frame: Frame) -> tuple[int, float]:
-        """The frame's capture time in the server's time, ns, and the bound of its clock error, us."""
+        """The frame's capture time in the server's time, ns, and the bound of its error by clocks, us."""
         if self._keep_stamps:
-            return frame.t_ns, 0.0
+            return frame.t_ns, frame.error_us
         estimate = self._clock.estimate(frame.t_ns)
-        return (frame.t_ns + estimate[0], estimate[1] / 1000) if estimate else (frame.t_ns, math.nan)
+        if estimate is None:
+            return frame.t_ns, math.nan
+        return frame.t_ns + estimate[0], estimate[1] / 1000 + frame.error_us
 
     def _encode(self, seq: int, detected: DetectedFrame, t_ns: int, clock_error_us: float) -> bytes:
         height, width = detected.frame.image.shape

@@ -2,11 +2,13 @@
 """`python -m camera_node.simulation`: renders a simulated recording into a folder."""
 
 import math
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from camera_node.command_line import run_command
 from camera_node.errors import ConfigError, run
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
@@ -14,10 +16,10 @@ from camera_node.simulation.scene import Scene
 
 def main() -> None:
     """The entry point of the command."""
-    run(lambda: tyro.cli(_render, prog="python -m camera_node.simulation"))
+    run(lambda: run_command(simulate, "python -m camera_node.simulation", sys.argv[1:]))
 
 
-def _render(
+def simulate(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.Positional],
     start: float = 0.0,

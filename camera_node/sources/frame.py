@@ -13,11 +13,15 @@ from camera_node.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One image: grey (h, w) uint8; `t_ns` is the middle of its exposure in this machine's Unix time."""
+    """One image: grey (h, w) uint8; `t_ns` is the middle of its exposure in this machine's Unix time.
+
+    `error_us` bounds the varying error of `t_ns`; a constant one is the camera's time offset, which is calibrated.
+    """
 
     image: Grey
     t_ns: int
     exposure_us: float = 0.0
+    error_us: float = 0.0
 
 
 class Source(Protocol):

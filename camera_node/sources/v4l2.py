@@ -17,6 +17,7 @@ from camera_node.protocol.host_clock import unix_ahead_ns
 from camera_node.sources.address import without_credentials
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import RAW, to_grey
+from camera_node.sources.newest_frame import NewestFrame
 
 log = logging.getLogger("camera_node.device")
 
@@ -180,14 +181,13 @@ class V4l2Source(Source):
     ) -> None:
         """Raises CameraError where the camera does not open."""
         self.device = device
-        self.dropped = 0
         self._settings = settings
         self._open, self._reopen_s = open, reopen_s
         self._lost = False
         self._capture: Capture | None = open(device, settings)
         self._pending: list[tuple[int, float]] = []  # properties to set before the next frame
-        self._latest: Frame | None = None
-        self._arrived = threading.Condition()
+        self._newest = NewestFrame()
+        self._setting = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"grab {device}", daemon=True)
         self._thread.start()
@@ -200,27 +200,24 @@ class V4l2Source(Source):
     def gain(self) -> float | None:
         return self._settings.gain
 
+    @property
+    def dropped(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]: read only
+        """See `Source`."""
+        return self._newest.dropped
+
     def __iter__(self) -> Iterator[Frame]:
-        while True:
-            with self._arrived:
-                self._arrived.wait_for(lambda: self._latest or self._closed.is_set(), timeout=1.0)
-                if self._closed.is_set():
-                    return
-                frame, self._latest = self._latest, None
-            if frame:
-                yield frame
+        return iter(self._newest)
 
     def adjust(self, exposure_us: float | None = None, gain: float | None = None) -> None:
         """See `Source.adjust`."""
-        with self._arrived:
+        with self._setting:
             given = {"exposure_us": exposure_us, "gain": gain}
             self._settings = replace(self._settings, **{k: v for k, v in given.items() if v is not None})
             self._pending += exposure_properties(exposure_us, gain)
 
     def close(self) -> None:
         self._closed.set()
-        with self._arrived:
-            self._arrived.notify_all()
+        self._newest.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(CLOSE_S)
 
@@ -233,7 +230,7 @@ class V4l2Source(Source):
 
     def _grab(self) -> bool:
         assert self._capture
-        with self._arrived:
+        with self._setting:
             pairs, self._pending = self._pending, []
         apply(self._capture, pairs, self.device)
         ok, image = self._capture.read()
@@ -258,10 +255,7 @@ class V4l2Source(Source):
         if self._lost:
             log.warning("%s delivers frames again", self.device)
         self._lost = False
-        with self._arrived:
-            self.dropped += self._latest is not None
-            self._latest = frame
-            self._arrived.notify_all()
+        self._newest.put(frame)
 
     def _reopen(self) -> bool:
         try:

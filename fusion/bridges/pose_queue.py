@@ -32,14 +32,13 @@ class PoseQueue:
 
     Args:
         client: connected to the arena.
-        robot: receive only the poses of this robot.
 
     Attributes:
         client: as given.
         faults: skipped poses, by reason.
     """
 
-    def __init__(self, client: Arena, robot: str | None = None) -> None:
+    def __init__(self, client: Arena) -> None:
         self.client = client
         self.faults: Counter[str] = Counter()
         self._poses: deque[RobotPose] = deque(maxlen=QUEUE_SIZE)
@@ -48,8 +47,7 @@ class PoseQueue:
         self._reader.setblocking(False)
         self._writer.setblocking(False)
         self._received_s, self._is_silent = time.monotonic(), False
-        stream = client.poses() if robot is None else client.robot(robot)
-        self._remove = stream.on_message(self._put)
+        self._remove = client.poses().on_message(self._put)
 
     def close(self) -> None:
         """Receive no more poses."""
@@ -112,8 +110,8 @@ class ServerAddress:
             ConfigError: the Zenoh configuration is missing or invalid.
         """
         session = open_client(self.connect, self.zenoh)
-        with Arena(session, self.arena, " ".join(self.connect)) as client:
-            poses = PoseQueue(client, robot)
+        with Arena(session, self.arena, " ".join(self.connect), robot or "*") as client:
+            poses = PoseQueue(client)
             try:
                 yield poses
             finally:

@@ -17,7 +17,7 @@ import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.logs import about
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transform
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
@@ -49,14 +49,15 @@ class Ros2Node:
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
     def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
-        """Publish `<robot>/pose`, `<robot>/odometry` and `tf` of the robots that are not lost."""
+        """Publish `<robot>/pose`, `<robot>/odometry` of the robots that are not lost, and all of them in one `tf`."""
         shown = [pose for pose in poses if pose.state != "lost" and self._has_name(pose.robot)]
         names = [ros_name(pose.robot) for pose in shown]
         for pose, name, odom in zip(shown, names, odometries(shown, frame, names), strict=True):
             prefix = f"{self._namespace}/{name}".lstrip("/")
             self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped").put(pose_stamped(pose, frame))
             self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odom)
-            self._topic("tf", "tf2_msgs/msg/TFMessage").put(transform(pose, frame, name))
+        if shown:
+            self._topic("tf", "tf2_msgs/msg/TFMessage").put(transforms(shown, frame, names))
 
     def _has_name(self, robot: str) -> bool:
         """Whether no other robot has its name in ROS; counted otherwise."""

@@ -86,13 +86,14 @@ def odometries(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) 
     return messages
 
 
-def transform(pose: RobotPose, frame: str, child: str) -> bytes:
-    """`tf2_msgs/msg/TFMessage` with one transform, that of `child` in `frame`."""
+def transforms(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) -> bytes:
+    """`tf2_msgs/msg/TFMessage` with the transforms of N poses, whose bodies' frames are `children`, in `frame`."""
     cdr = Cdr()
-    cdr.u32(1)
-    _put_header(cdr, pose, frame)
-    cdr.text(child)
-    _put_pose(cdr, pose)
+    cdr.u32(len(poses))
+    for pose, child in zip(poses, children, strict=True):
+        _put_header(cdr, pose, frame)
+        cdr.text(child)
+        _put_pose(cdr, pose)
     return cdr.finish()
 
 

@@ -10,10 +10,11 @@ Needs no GTSAM and no SciPy. A reader that is slower than the poses gets the new
 
 import asyncio
 import contextlib
+import difflib
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -34,6 +35,7 @@ from fusion.protocol.requests import change_robots, request_robots
 T = TypeVar("T")
 TIMEOUT_S = 10.0
 MAX_ROBOTS = 1024
+MAX_NAMED = 20  # robots in one error
 
 
 class Stream(Generic[T]):
@@ -120,7 +122,11 @@ class Stream(Generic[T]):
                 yield message
 
     def _silence(self, timeout_s: float | None) -> NetworkError:
-        return NetworkError(f"no {self._content} within {timeout_s:g} s; is python -m fusion running there?")
+        return NetworkError(f"no {self._content} within {timeout_s:g} s; {self._cause()}")
+
+    def _cause(self) -> str:
+        """The likely cause of silence, with what to do."""
+        return "is roundel server, or python -m fusion, running there?"
 
     def _put(self, message: T) -> None:
         with self._changed:
@@ -137,7 +143,26 @@ class Stream(Generic[T]):
 
 
 class RobotStream(Stream[RobotPose]):
-    """The poses of one robot."""
+    """The poses of one robot.
+
+    Args:
+        name: the robot's.
+        origin: where its poses come from, for errors.
+        timeout_s: of iterating.
+        known: the names of all robots whose poses arrive; they grow.
+    """
+
+    def __init__(self, name: str, origin: str, timeout_s: float | None, known: Collection[str]) -> None:
+        super().__init__(f"pose of '{name}' {origin}", timeout_s)
+        self._name, self._known = name, known
+
+    def _cause(self) -> str:
+        known = sorted(self._known)
+        if not known or self._name in known:
+            return super()._cause()
+        similar = difflib.get_close_matches(self._name, known, 1)
+        hint = f"; did you mean {similar[0]}?" if similar else ""
+        return f"the arena has no such robot, but {', '.join(known[:MAX_NAMED])}{hint}"
 
     def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
         """Call `callback` with every pose, on Zenoh's thread: it must be fast. Returns its removal."""
@@ -145,9 +170,16 @@ class RobotStream(Stream[RobotPose]):
 
 
 class Arena:
-    """A connection to an arena's server. `faults` counts undecodable messages, by kind."""
+    """A connection to an arena's server. `faults` counts undecodable messages, by kind.
 
-    def __init__(self, session: zenoh.Session, arena: str, endpoints: str) -> None:
+    Args:
+        session: an open session; it is closed with the arena.
+        arena: its name.
+        endpoints: of the server, for messages.
+        robot: receive the poses of this robot only; "*" for all.
+    """
+
+    def __init__(self, session: zenoh.Session, arena: str, endpoints: str, robot: str = "*") -> None:
         self.keys = Keys(arena)
         self.faults: Counter[str] = Counter()
         self._session, self._origin = session, f"from arena '{arena}' at {endpoints}"
@@ -156,7 +188,7 @@ class Arena:
         self._streams: dict[str, Stream] = {}
         self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
         self._known: set[str] = set()
-        poses = session.declare_subscriber(self.keys.robot_pose(), guarded("a pose", self._take_pose))
+        poses = session.declare_subscriber(self.keys.robot_pose(robot), guarded("a pose", self._take_pose))
         self._subscribers: list[Any] = [poses]
 
     @property
@@ -196,7 +228,7 @@ class Arena:
     def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> RobotStream:
         """The poses of a robot; iterating waits at most `timeout_s` for the next one (None: for ever)."""
         with self._lock:
-            robot = self._robots.setdefault(name, RobotStream(f"pose of '{name}' {self._origin}", timeout_s))
+            robot = self._robots.setdefault(name, RobotStream(name, self._origin, timeout_s, self._known))
         robot.timeout_s = timeout_s
         return robot
 

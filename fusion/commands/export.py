@@ -6,12 +6,19 @@ from typing import Literal
 
 from camera_node.errors import ConfigError
 from camera_node.terminal import say
-from fusion.export.files import write_c3d, write_csv, write_rosbag, write_trc, write_tum
+from fusion.export.files import write_c3d, write_csv, write_foxglove, write_rosbag, write_trc, write_tum
 from fusion.export.points import sample_points
 from fusion.export.poses import RecordedPoses
 
-Format = Literal["c3d", "trc", "csv", "tum", "rosbag"]
-FORMATS: dict[str, Format] = {".c3d": "c3d", ".trc": "trc", ".csv": "csv", ".tum": "tum", "": "rosbag"}
+Format = Literal["c3d", "trc", "csv", "tum", "rosbag", "foxglove"]
+FORMATS: dict[str, Format] = {
+    ".c3d": "c3d",
+    ".trc": "trc",
+    ".csv": "csv",
+    ".tum": "tum",
+    "": "rosbag",
+    ".mcap": "foxglove",
+}
 
 
 def export(
@@ -28,7 +35,7 @@ def export(
 
     Args:
         recording: the MCAP file of fusion record or fusion replay.
-        out: the file to write: .c3d, .trc, .csv or .tum; a name without suffix becomes a ROS 2 bag, a folder.
+        out: the file to write: .c3d, .trc, .csv, .tum, or .mcap for Foxglove; without suffix a ROS 2 bag, a folder.
         format: the format, if the suffix does not say it.
         robots: names of the robots to write; all unless given.
         rate_hz: frames a second (C3D, TRC); the rate of the poses unless given.
@@ -37,7 +44,7 @@ def export(
     chosen = format or FORMATS.get(out.suffix)
     if chosen is None:
         raise ConfigError(
-            f"{out.name} does not say its format; end it in .c3d, .trc, .csv or .tum, or give --format"
+            f"{out.name} does not say its format; end it in .c3d, .trc, .csv, .tum or .mcap, or give --format"
         )
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another name, or --force to replace it")
@@ -60,5 +67,5 @@ def _write(format: Format, poses: RecordedPoses, out: Path, rate_hz: float | Non
         write = write_c3d if format == "c3d" else write_trc
         write(sample_points(poses, rate_hz), out)
     else:
-        (write_csv if format == "csv" else write_rosbag)(poses, out)
+        {"csv": write_csv, "rosbag": write_rosbag, "foxglove": write_foxglove}[format](poses, out)
     return [out]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion robots`: lists, renames, removes and saves the robots of the running server."""
+"""`fusion robots`: lists, renames, removes, turns, moves the pivot of and saves the robots of the running server."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,18 +9,34 @@ import tyro
 import zenoh
 
 from camera_node.errors import ConfigError
-from camera_node.protocol.session import open_client
+from camera_node.protocol.session import open_requester
 from camera_node.terminal import say
 from fusion.client.define import LOST_AT_RESTART
+from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import Robot, save_robots
 from fusion.protocol.messages import Robots, RobotsRequest
-from fusion.protocol.requests import change_robots, request_robots
+from fusion.protocol.requests import change_robots, reframe_robot, request_robots
 
-USES = {"list": "", "rename": "OLD NEW", "remove": "NAME...", "save": "FILE"}
+USES = {
+    "list": "",
+    "rename": "OLD NEW",
+    "remove": "NAME...",
+    "pivot": "NAME X Y Z",
+    "turn": "NAME DEGREES",
+    "save": "FILE",
+}
+COUNTS = {
+    "list": (0, 0),
+    "rename": (2, 2),
+    "remove": (1, 1000),
+    "pivot": (4, 4),
+    "turn": (2, 2),
+    "save": (1, 1),
+}
 
 
 def robots(
-    action: Literal["list", "rename", "remove", "save"],
+    action: Literal["list", "rename", "remove", "pivot", "turn", "save"],
     arguments: tuple[str, ...] = (),
     /,
     *,
@@ -28,22 +45,24 @@ def robots(
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
 ) -> int:
-    """List, rename or remove the robots of the running server, or save them in a file.
+    """List, rename or remove the robots of the running server, change their frames, or save them in a file.
 
     Args:
-        action: list; rename OLD NEW; remove NAME...; save FILE writes robots.yaml on this machine.
+        action: list; rename OLD NEW; remove NAME...; pivot NAME X Y Z moves the robot's origin to a point of its
+            present frame, metres; turn NAME DEGREES turns its x axis about its z axis; save FILE writes robots.yaml on
+            this machine.
         arguments: as the action needs them.
         force: save overwrites the file.
         connect: the server's Zenoh endpoints.
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    counts = {"list": (0, 0), "rename": (2, 2), "remove": (1, 1000), "save": (1, 1)}[action]
+    counts = COUNTS[action]
     if not counts[0] <= len(arguments) <= counts[1]:
         raise ConfigError(f"{len(arguments)} arguments; use fusion robots {action} {USES[action]}".rstrip())
     if action == "save" and Path(arguments[0]).exists() and not force:
         raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
-    with open_client(connect, zenoh_config) as session:
+    with open_requester(connect, zenoh_config) as session:
         after = _apply(session, arena, action, arguments)
     if action == "save":
         save_robots(after.robots, Path(arguments[0]))
@@ -63,7 +82,22 @@ def _apply(session: zenoh.Session, arena: str, action: str, arguments: tuple[str
         return change_robots(session, arena, RobotsRequest(rename={arguments[0]: arguments[1]}))
     if action == "remove":
         return change_robots(session, arena, RobotsRequest(remove=arguments))
+    if action in ("pivot", "turn"):
+        name, numbers = arguments[0], _numbers(arguments[1:])
+        change = _move(*numbers) if action == "pivot" else lambda robot: turn_heading(robot, *numbers)
+        return reframe_robot(session, arena, name, change)
     return request_robots(session, arena)
+
+
+def _move(x: float, y: float, z: float) -> Callable[[Robot], Robot]:
+    return lambda robot: move_origin(robot, (x, y, z))
+
+
+def _numbers(words: tuple[str, ...]) -> tuple[float, ...]:
+    try:
+        return tuple(map(float, words))
+    except ValueError as error:
+        raise ConfigError(f"{error}; give numbers, such as 0.05") from None
 
 
 def _line(name: str, robot: Robot, is_unsaved: bool) -> str:

@@ -12,8 +12,9 @@ import numpy as np
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError
 from camera_node.extras import require
+from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.bridges.ros2 import ros_name
-from fusion.bridges.ros2_messages import odometries, pose_stamped, transform
+from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
 from fusion.export.points import PointTrajectories
 from fusion.export.poses import RecordedPoses
 from fusion.recordings.report import write_pose_table
@@ -135,7 +136,28 @@ def write_rosbag(poses: RecordedPoses, path: Path) -> None:
                 put(f"/{name}/pose", "geometry_msgs/msg/PoseStamped", pose.t_ns, pose_stamped(pose, "world"))
                 (odom,) = odometries([pose], "world", [name])
                 put(f"/{name}/odometry", "nav_msgs/msg/Odometry", pose.t_ns, odom)
-                put("/tf", "tf2_msgs/msg/TFMessage", pose.t_ns, transform(pose, "world", name))
+                put("/tf", "tf2_msgs/msg/TFMessage", pose.t_ns, transforms([pose], "world", [name]))
+
+
+def write_foxglove(poses: RecordedPoses, path: Path) -> None:
+    """Write an MCAP file with the topics of `fusion foxglove`, except images and unlabeled markers.
+
+    Raises:
+        ConfigError: foxglove-sdk is missing.
+    """
+    foxglove = require("foxglove", "foxglove", "Foxglove")
+    context = foxglove.Context()
+    bodies = cameras = None
+    with new_path(path) as part, foxglove.open_mcap(str(part), context=context):
+        channels = FoxgloveChannels(context)
+        for pose in poses:
+            if poses.cameras is not cameras:
+                cameras = poses.cameras
+                channels.add_cameras(cameras, pose.t_ns)
+            if poses.bodies is not bodies:
+                bodies = poses.bodies
+                channels.add_bodies(bodies, pose.t_ns)
+            channels.add_poses([pose])
 
 
 def _remove(path: Path) -> None:

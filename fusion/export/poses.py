@@ -5,6 +5,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from calib.rig.camera import Camera
+from calib.rig.messages import RigMessage
 from calib.rig.recording import read_messages
 from camera_node.errors import ConfigError
 from camera_node.protocol.messages import MessageError, decode
@@ -20,7 +22,8 @@ class RecordedPoses:
         robots: names of the robots to read; all unless given.
 
     Attributes:
-        bodies: the robots' markers, once the file was read; the last ones that were recorded.
+        bodies: the robots' markers that were recorded last before the present pose.
+        cameras: the cameras of the rig that was recorded last before it.
         counts: poses by robot.
         faults: skipped messages, by reason.
     """
@@ -28,6 +31,7 @@ class RecordedPoses:
     def __init__(self, path: Path, robots: Sequence[str] = ()) -> None:
         self.path = path
         self.bodies: dict[str, Robot] = {}
+        self.cameras: dict[str, Camera] = {}
         self.counts: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self._robots = frozenset(robots)
@@ -41,8 +45,8 @@ class RecordedPoses:
         self.counts.clear()
         last_ns: dict[str, int] = {}
         for key, data, _ in read_messages(self.path, self.faults):
-            if key.endswith("/robots"):
-                self._add_bodies(data)
+            if key.endswith(("/robots", "/rig")):
+                self._add_arena(key, data)
             if not key.endswith("/pose") or (pose := self._decode(data)) is None:
                 continue
             if pose.t_ns <= last_ns.get(pose.robot, -1):
@@ -69,8 +73,11 @@ class RecordedPoses:
             return None
         return pose if not self._robots or pose.robot in self._robots else None
 
-    def _add_bodies(self, data: bytes) -> None:
+    def _add_arena(self, key: str, data: bytes) -> None:
         try:
-            self.bodies = decode(data, Robots).robots
+            if key.endswith("/robots"):
+                self.bodies = decode(data, Robots).robots
+            else:
+                self.cameras = decode(data, RigMessage).rig.cameras
         except MessageError:
-            self.faults["undecodable robots"] += 1
+            self.faults[f"undecodable messages on {key}"] += 1

@@ -186,6 +186,12 @@ class MatchedObservations:
     def __len__(self) -> int:
         return len(self.discs)
 
+    def select(self, rows: NDArray) -> "MatchedObservations":
+        """The observations of a mask or an index array."""
+        return MatchedObservations(
+            self.discs.select(rows), self.detections.select(rows), self.whiten[:, :, rows]
+        )
+
 
 def _whiten(detections: DetectionTable) -> Array:
     """L^-1 scale, where L L^T is the covariance of the detection."""

@@ -4,7 +4,7 @@
     arrival of a frame   -> `StampCheck`: its stamp jumped?             -> excluded from this frame on
     every frame set      -> `offset_information`: one camera off?       -> excluded
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
-    slow information     -> `disagreement` with image shifts: a drift?  -> corrected while in use
+    slow information     -> `DriftMonitor`: an offset, or a rate?       -> corrected while in use
 
 See docs/time_offsets.md.
 """
@@ -17,12 +17,13 @@ from typing import Literal
 
 import numpy as np
 
-from camera_node.arrays import Mask
+from camera_node.arrays import Array, Mask
 from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.states import States
+from fusion.monitoring.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
 from fusion.monitoring.stamp_check import StampCheck
 from fusion.monitoring.time_offsets import OffsetInformation, disagreement, offset_information
 from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_time_shift
@@ -31,11 +32,16 @@ log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
 
 COMPARED_NS, CHECKED_NS = 45_000_000, 500_000_000  # between comparisons, and between searches for a drift
+LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set
+JUMP_SIGMA_V, DRIFT_SIGMA_V = (
+    0.5,
+    0.1,
+)  # of velocities, m/s: of a filter with wrong stamps, and of a mean velocity
 FAST_NS = 120_000_000  # of frame sets that show a jump
-SLOW_S = 8.0  # time constant of the information that shows a drift
-JUMP_PX, DRIFT_PX = 1.5, 0.4  # RMS image motion that an offset must explain
-MIN_DRIFT_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest correction of a drift
-MIN_SLOW_NS = 1_500_000_000  # of frame sets, for a correction of a drift
+JUMP_PX = 1.5  # RMS image motion that a jump must explain
+MIN_OFFSET_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest change of a correction by a slow offset
+MIN_STEP_S = 0.0002  # smallest change of a correction by a known rate
+REPORTED_NS = 500_000  # smallest correction that is reported; later ones when it has doubled
 KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
 MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
@@ -71,6 +77,7 @@ class _Clock:
         since_ns: server time of the exclusion; 0 while the camera is in use.
         has_jumped: whether the arrival of its frames shows a jump.
         searched_ns, trusted_ns: times of the last search, and until which no evidence of the same kind counts.
+        reported_ns: the correction that was last reported.
     """
 
     state: ClockState = "correct"
@@ -82,6 +89,7 @@ class _Clock:
     has_jumped: bool = False
     searched_ns: int = 0
     trusted_ns: int = 0
+    reported_ns: int = 0
 
 
 class CameraClocks:
@@ -100,9 +108,10 @@ class CameraClocks:
         self._clocks = {name: _Clock() for name in cameras.names}
         self._history: deque[Snapshot] = deque()
         self._fast: deque[tuple[int, OffsetInformation]] = deque()
-        self._slow, self._slow_since_ns = OffsetInformation.none(len(cameras.names)), 0
+        self._drifts = DriftMonitor(len(cameras.names))
+        self._lagged: deque[tuple[Snapshot, MatchedObservations, Array]] = deque()
         self._now_ns = self._undecided_ns = self._reported_ns = 0
-        self._compared_ns = self._checked_ns = 0
+        self._compared_ns = self._lagged_ns = self._checked_ns = 0
         self._undecided_s = 0.0
 
     @property
@@ -155,6 +164,7 @@ class CameraClocks:
             self._history.popleft()
         if t_ns >= self._compared_ns + COMPARED_NS:
             self._compare(states, tracked, detections, assignments)
+        self._find_drifts()
         for name in self.excluded:
             self._search(name)
 
@@ -190,15 +200,16 @@ class CameraClocks:
         self, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
     ) -> None:
         """Compare the cameras by the robots that move."""
-        interval_s = min((self._now_ns - self._compared_ns) * 1e-9, SLOW_S)
         self._compared_ns = self._now_ns
         moving = np.linalg.norm(states.v, axis=1) > MIN_SPEED_M_S
         chosen = self._choose(states, tracked & moving, detections, assignments)
-        if len(chosen):
-            observations = MatchedObservations.of(chosen, detections, self._markers)
-            info = offset_information(self._cameras, states, observations, self._single)
-            self._find_jumps(info)
-            self._find_drifts(info, interval_s)
+        if not len(chosen):
+            return
+        observations = MatchedObservations.of(chosen, detections, self._markers)
+        self._find_jumps(offset_information(self._cameras, states, observations, self._single, JUMP_SIGMA_V))
+        if self._now_ns >= self._lagged_ns + LAGGED_NS:
+            self._lagged_ns = self._now_ns
+            self._lagged.append((Snapshot(self._now_ns, states, tracked), observations, self._offsets_s()))
 
     def _choose(
         self, states: States, robots: Mask, detections: DetectionTable, assignments: Assignments
@@ -210,7 +221,7 @@ class CameraClocks:
         fits = robots[order] & (np.cumsum(count[order]) <= max(MAX_MARKERS, count[order][:1].sum()))
         return assignments.select(np.isin(robot, order[fits]))
 
-    def _offsets_s(self) -> np.ndarray:
+    def _offsets_s(self) -> Array:
         """(C,) corrections in use."""
         return np.array([self._clocks[name].correction_ns * 1e-9 for name in self._cameras.names])
 
@@ -234,19 +245,22 @@ class CameraClocks:
                 self._exclude(clock, self._now_ns, FAST_NS)
         self._forget()
 
-    def _find_drifts(self, info: OffsetInformation, interval_s: float) -> None:
+    def _find_drifts(self) -> None:
         """Correct the cameras that depart slowly from the others."""
-        n = len(self._cameras.names)
-        faded = OffsetInformation.none(n).plus(self._slow, float(np.exp(-interval_s / SLOW_S)))
-        self._slow = faded.plus(info.relative_to(-self._offsets_s()))
-        self._slow_since_ns = self._slow_since_ns or self._now_ns
-        if self._now_ns < max(self._slow_since_ns + MIN_SLOW_NS, self._checked_ns + CHECKED_NS):
-            return
-        self._checked_ns = self._now_ns
-        found = disagreement(self._slow.relative_to(self._offsets_s()), DRIFT_PX, has_shifts=True)
-        for k, offset_s, sigma_s in zip(*found.columns, strict=True) if found else ():
-            if MIN_DRIFT_S < abs(offset_s) < MAX_DRIFT_S:
-                self._correct_drift(self._cameras.names[k], offset_s, sigma_s)
+        is_complete = False
+        while self._lagged and self._now_ns >= self._lagged[0][0].t_ns + HALF_NS:
+            snapshot, observations, offsets_s = self._lagged.popleft()
+            states, known = with_mean_velocities(snapshot, self._history)
+            observations = observations.select(known[observations.discs.body])
+            info = offset_information(self._cameras, states, observations, self._single, DRIFT_SIGMA_V)
+            is_complete |= self._drifts.add(snapshot.t_ns, info.relative_to(-offsets_s))
+        if self._now_ns >= self._checked_ns + CHECKED_NS:
+            self._checked_ns = self._now_ns
+            for drift in self._drifts.offsets(self._offsets_s()):
+                self._correct_drift(drift, MIN_OFFSET_S)
+        if is_complete:
+            for drift in self._drifts.rates(self._now_ns):
+                self._correct_drift(drift, MIN_STEP_S)
 
     # Changes.
 
@@ -298,24 +312,32 @@ class CameraClocks:
         message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
         log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s, extra=about(name))
 
-    def _correct_drift(self, name: str, offset_s: float, sigma_s: float) -> None:
-        clock = self._clocks[name]
-        self._set(clock, clock.correction_ns + round(offset_s * 1e9), sigma_s)
-        log.warning(
-            "camera %s: its clock drifts from those of the other cameras; its stamps are corrected by %.1f ms",
-            name,
-            clock.correction_ns * 1e-6,
-            extra=about(name),
-        )
+    def _correct_drift(self, drift: Drift, min_s: float) -> None:
+        """Correct a camera that is in use by a change of more than `min_s`."""
+        name = self._cameras.names[drift.camera]
+        clock, correction_ns = self._clocks[name], round(drift.offset_s * 1e9)
+        change_s = abs(correction_ns - clock.correction_ns) * 1e-9
+        if clock.state == "excluded" or not min_s < change_s < MAX_DRIFT_S:
+            return
+        clock.state, clock.correction_ns, clock.sigma_s = "corrected", correction_ns, drift.sigma_s
+        self._fast.clear()
+        if abs(correction_ns - clock.reported_ns) < REPORTED_NS + abs(clock.reported_ns):
+            return
+        clock.reported_ns = correction_ns
+        rate = f" by {-drift.ppm:.0f} ppm" if drift.ppm else ""
+        message = "camera %s: its clock drifts from the others%s; its stamps are corrected, now by %.1f ms"
+        log.warning(message, name, rate, correction_ns * 1e-6, extra=about(name))
 
     def _set(self, clock: _Clock, correction_ns: int, sigma_s: float) -> None:
         clock.state, clock.correction_ns, clock.sigma_s = "corrected", correction_ns, sigma_s
+        clock.reported_ns = correction_ns
         self._forget()
 
     def _forget(self) -> None:
         """Drop the information of frames with earlier corrections or of excluded cameras."""
         self._fast.clear()
-        self._slow, self._slow_since_ns = OffsetInformation.none(len(self._cameras.names)), 0
+        self._lagged.clear()
+        self._drifts.forget()
 
     def _report_undecided(self, spread_s: float) -> None:
         self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)

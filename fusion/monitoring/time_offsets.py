@@ -18,7 +18,7 @@ from fusion.model.states import POSITION, THETA, States
 
 SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detection
 FREE = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # pose and velocity of a state, which a wrong clock displaces too
-WEAK = np.repeat([1.0, 1.0, 4.0], 3)  # their prior information: 1 / rad^2, 1 / m^2, s^2 / m^2
+WEAK = 1.0  # prior information about rotations and positions, 1 / rad^2 and 1 / m^2
 REWEIGHTED = 1  # times: by the residuals that offsets do not explain
 CAUCHY = 4.0  # standard deviations, as in docs/fusion_filter.md section 4
 SHIFT_PX = 2.0  # prior standard deviation of the shift of an image by calibration errors or a touch
@@ -94,7 +94,11 @@ class Disagreement:
 
 
 def offset_information(
-    cameras: CameraArray, states: States, observations: MatchedObservations, single: Mask
+    cameras: CameraArray,
+    states: States,
+    observations: MatchedObservations,
+    single: Mask,
+    sigma_v: float,
 ) -> OffsetInformation:
     """The information of one frame set about the time offsets of the cameras; the states of robots are eliminated.
 
@@ -103,6 +107,7 @@ def offset_information(
         states: bodies at the time of the frame set.
         observations: N detections with their discs.
         single: as in `Estimator`.
+        sigma_v: prior standard deviation of the velocities in `states`, m/s.
     """
     n = len(cameras.names)
     if not len(observations):
@@ -112,7 +117,7 @@ def offset_information(
     camera = observations.detections.camera
     J = _jacobian(A, np.concatenate([g[:, :, None], _whitened_shifts(observations)], 2), body, camera, n)
     k, weights = J.shape[2] - 3 * n, np.ones(len(e))
-    states_prior = np.tile(WEAK, k // len(WEAK))
+    states_prior = np.tile(np.repeat([WEAK, WEAK, 1 / sigma_v**2], 3), k // len(FREE))
     prior = np.concatenate([states_prior, np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
     H, right = _normal_equations(J, e, weights)
     for _ in range(REWEIGHTED):
@@ -130,9 +135,7 @@ def offset_information(
     )
 
 
-def disagreement(
-    info: OffsetInformation, min_shift_px: float, has_shifts: bool = False
-) -> Disagreement | None:
+def disagreement(info: OffsetInformation, min_shift_px: float) -> Disagreement | None:
     """The cameras whose offsets differ from those of the others; None if none differs.
 
     A common offset of all cameras is unobservable. So the smallest group of cameras is searched whose offsets, with
@@ -141,24 +144,36 @@ def disagreement(
     Args:
         info: of some frame sets.
         min_shift_px: RMS image motion that an offset must explain: calibration errors explain less.
-        has_shifts: whether images may be shifted too; then offsets are known only where motions differ.
     """
-    M, y = info.with_unknown_shifts() if has_shifts else info.without_shifts()
-    known = np.flatnonzero((info.count > 0) & (np.diag(M) > 1.0))
-    M, y = M[np.ix_(known, known)], y[known]
-    speed_px = np.sqrt(info.motion_px2[known] / info.count[known])
-    if len(known) < 2 or float(np.max(np.abs(y) / np.diag(M) * speed_px)) < min_shift_px:
+    speed_px = np.sqrt(info.motion_px2 / np.maximum(info.count, 1))
+    return contradiction(*info.without_shifts(), speed_px, min_shift_px)
+
+
+def contradiction(
+    M: Array, y: Array, motion_px: Array, min_shift_px: float, noise_chi2: float = 0.0
+) -> Disagreement | None:
+    """The smallest group of cameras whose parameters alone explain what all parameters together do.
+
+    Args:
+        M, y: (C, C) and (C,) least squares about one parameter of each camera, M x = y.
+        motion_px: (C,) RMS image motion for each unit of the parameter; 0 without observations.
+        min_shift_px: RMS image motion that a parameter must explain.
+        noise_chi2: how much of the contradiction may be noise and stay unexplained.
+    """
+    known = np.flatnonzero((motion_px > 0) & (np.diag(M) > 1.0))
+    M, y, motion_px = M[np.ix_(known, known)], y[known], motion_px[known]
+    if len(known) < 2 or float(np.max(np.abs(y) / np.diag(M) * motion_px)) < min_shift_px:
         return None
     offsets = np.linalg.pinv(M, rcond=1e-6, hermitian=True) @ y
     total = float(y @ offsets)
     if total < SIGMAS**2:
         return None
-    group = _smallest_group(M, y, EXPLAINED * total)
+    group = _smallest_group(M, y, min(EXPLAINED * total, total - noise_chi2))
     if not group:
         return Disagreement(spread_s=float(np.std(offsets)))
     inverse = np.linalg.inv(M[np.ix_(group, group)])
     found, sigma = inverse @ y[list(group)], np.sqrt(np.diag(inverse))
-    shift_px = np.abs(found) * speed_px[list(group)]
+    shift_px = np.abs(found) * motion_px[list(group)]
     if (np.abs(found) < SIGMAS * sigma).any() or (shift_px < min_shift_px).any():
         return None
     cameras = tuple(known[list(group)].tolist())

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Requests to a running server."""
 
+from collections.abc import Callable
+
 import zenoh
 
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import REQUEST_S, RequestError, send_request
+from camera_node.text import printable
 from fusion.errors import FusionError
+from fusion.model.robots import Robot
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 
 
@@ -32,6 +36,28 @@ def request_robots(session: zenoh.Session, arena: str, timeout_s: float = REQUES
         NetworkError: no server answers in time.
     """
     return _robots_of(_request(session, robots_key(arena), b"", timeout_s))
+
+
+def reframe_robot(
+    session: zenoh.Session,
+    arena: str,
+    name: str,
+    change: Callable[[Robot], Robot],
+    timeout_s: float = REQUEST_S,
+) -> Robots:
+    """Replace a robot by `change` of it, such as `fusion.model.robot_frame.move_origin`; it is acquired again.
+
+    Raises:
+        FusionError: there is no such robot, or it can not be changed so.
+        NetworkError: no server answers in time.
+    """
+    robots = request_robots(session, arena, timeout_s).robots
+    if name not in robots:
+        raise FusionError(
+            f"there is no robot '{printable(name, 80)}'; there are {', '.join(robots) or 'none'}"
+        )
+    request = RobotsRequest(define={name: change(robots[name])}, replace=True)
+    return change_robots(session, arena, request, timeout_s)
 
 
 def _robots_of(data: bytes) -> Robots:

@@ -13,7 +13,7 @@ import numpy as np
 from camera_node.config import write_atomically
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotPose
-from fusion.tracking.result import TrackingResult
+from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 STATES = ("tracked", "coasting", "lost")
@@ -37,6 +37,7 @@ class Summary:
         self.frame_sets += 1
         self.states.update((pose.robot, pose.state) for pose in fused.poses)
         self.unlabeled += int((fused.markers.robot_index() < 0).sum())
+        self.faults.update(f"{TOO_MANY_UNASSIGNED}, of camera '{name}'" for name in fused.crowded)
         for name, use in fused.cameras.items():
             self.used[name] += use.used
             self.unused[name] += use.unused

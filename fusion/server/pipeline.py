@@ -26,6 +26,8 @@ from fusion.tracking.tracker import AssociatedFrames, Tracker
 
 log = logging.getLogger("fusion")
 
+NOT_CALIBRATED = "the cameras are not calibrated"
+
 
 class TrackingPipeline:
     """The state of tracking: the active rig and robots, the frame synchronizer, and the tracker.
@@ -69,8 +71,11 @@ class TrackingPipeline:
         return self.active_rig.rig.placed() if self.active_rig.rig else {}
 
     def restart(self) -> None:
-        """Drop all frames and tracks; the tracker acquires all robots again."""
+        """Drop all frames and tracks; the tracker acquires all robots again, with the clocks as they are known."""
+        old = self.tracker
         self._start(self.cameras)
+        if old is not None and self.tracker is not None:
+            self.tracker.clocks.inherit(old.clocks)
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
@@ -217,7 +222,7 @@ class TrackingPipeline:
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""
-        return self.tracker.not_acquired() if self.tracker else {}
+        return self.tracker.not_acquired() if self.tracker else dict.fromkeys(self.robots, NOT_CALIBRATED)
 
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""

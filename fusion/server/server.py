@@ -35,7 +35,7 @@ from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.server.storage.audit import AuditLog
 from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
-from fusion.tracking.result import latency_of
+from fusion.tracking.result import TOO_MANY_UNASSIGNED, latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -181,6 +181,8 @@ class Server:
         self._publisher.publish_frames(frame_set)
         for correction in tracker.check_extrinsics(frame_set, result):
             self._report_correction(correction)
+        for name in result.crowded:
+            self.statistics.count_fault(TOO_MANY_UNASSIGNED, name)
         states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
         self.statistics.count_frame_set(result.cameras, states, latency.total_ms if latency else None)
 

@@ -33,15 +33,15 @@ from fusion.tracking.identity.single_markers import (
     history_chi2,
     is_local,
 )
-from fusion.tracking.multiview import Marker, Portion, find_markers, portion_of
+from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
 SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
 FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
-MAX_DETECTIONS = (
-    1_000  # unassigned, of one frame; of more, those around one of them are searched, each in its turn
-)
+# Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
+# more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
+MAX_PAIRS = 200_000
 CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
 MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
@@ -58,6 +58,7 @@ class Acquired:
         assignments: of all robots, including the acquired ones.
         markers: triangulated markers that stay unlabeled.
         reasons: why the other missing robots of this shard were not acquired, by row.
+        crowded: cameras whose unassigned detections were too many to search all of them.
     """
 
     rows: Index
@@ -66,6 +67,7 @@ class Acquired:
     assignments: Assignments
     markers: list[Marker]
     reasons: dict[int, str]
+    crowded: Index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,12 +146,13 @@ class Acquisition:
             histories: of unlabeled markers before this frame set.
         """
         if not len(missing) and not self._leads:
-            return Acquired(missing, table.states.select(missing), missing, assignments, [], {})
+            return Acquired(missing, table.states.select(missing), missing, assignments, [], {}, missing[:0])
         bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
         # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
-        markers = self._find_markers(table, detections, of_bodies)
+        n_missing = int(np.isin(table.markers.robot, missing).sum())
+        markers, crowded = self._find_markers(table, n_missing, detections, of_bodies)
         found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
         of_bodies = of_bodies.joined(found.assignments)
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
@@ -164,6 +167,7 @@ class Acquisition:
             assignments.joined(more.assignments),
             _without(markers, more.assignments),
             reasons | choice.reasons,
+            crowded,
         )
 
     def _acquire_bodies(
@@ -214,18 +218,23 @@ class Acquisition:
         return refined.select(refined.misfit < MAX_CHI2)
 
     def _find_markers(
-        self, table: TrackTable, detections: DetectionTable, assignments: Assignments
-    ) -> list[Marker]:
-        """Triangulate markers from unassigned detections."""
+        self, table: TrackTable, n_missing: int, detections: DetectionTable, assignments: Assignments
+    ) -> tuple[list[Marker], Index]:
+        """Triangulate markers from unassigned detections; and the cameras that have too many of these.
+
+        With part of the detections, a robot can be taken for another one whose markers are not in this part. So all are
+        searched that the markers of missing robots, `n_missing`, can explain.
+        """
         free = np.ones(len(detections), bool)
         free[assignments.detection] = False
         diameters = np.unique(2 * table.markers.radius)
         if not free.any() or not len(diameters):
-            return []
+            return [], free.nonzero()[0][:0]
         self._frame_sets += 1
-        portion = Portion(MAX_DETECTIONS, self._frame_sets, float(np.median(diameters)))
-        rows = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
-        return find_markers(self._cameras, detections, rows, diameters)
+        limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
+        portion = Portion(limit, self._frame_sets, float(np.median(diameters)))
+        rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
+        return find_markers(self._cameras, detections, rows, diameters), crowded
 
     def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
         """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""

@@ -16,7 +16,7 @@ with the time between frames.
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, sqrt
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -34,6 +34,7 @@ RAY_SLACK_PX = 0.5  # error of the calibration, and of an outline's centre as th
 FAR_M = 50.0  # largest range of a ray without a size
 CLEARLY = 0.5  # largest ratio of a ray's distances to the closest and the second closest marker
 BLOCK = 64  # rays compared with all markers at a time: the distances stay in the cache
+MIN_LIMIT = 10  # detections of a frame in a portion: those of two robots
 JOIN_ROUNDS = 2  # of refinement before ambiguous rays are reassigned
 
 
@@ -101,7 +102,7 @@ def find_markers(
 
 @dataclass(frozen=True, slots=True)
 class Portion:
-    """Of a frame with more than `limit` detections, those nearest to one point; another one in each turn.
+    """Of frames with more than `limit` detections, those nearest to one point; another one in each turn.
 
     The point is on the ray of a detection of such a frame, at the range of a marker of `diameter_m`.
     """
@@ -111,25 +112,33 @@ class Portion:
     diameter_m: float
 
 
-def portion_of(cameras: CameraArray, detections: DetectionTable, rows: Index, portion: Portion) -> Index:
-    """The rows of this portion; all rows of frames below the limit."""
+def limit_of(n_frames: int, max_pairs: int) -> int:
+    """Detections of each of `n_frames` frames, such that those of different frames make at most `max_pairs` pairs."""
+    return max(MIN_LIMIT, int(sqrt(2 * max_pairs / max(1, n_frames * (n_frames - 1)))))
+
+
+def portion_of(
+    cameras: CameraArray, detections: DetectionTable, rows: Index, portion: Portion
+) -> tuple[Index, Index]:
+    """The rows of this portion, all rows of frames below the limit; and the cameras of the frames above it."""
     limit, diameter_m = portion.limit, portion.diameter_m
     rows = rows[np.isfinite(detections.xy[0, rows])]
     count = np.bincount(detections.frame[rows], minlength=len(detections.exposures.camera))
-    crowded = np.flatnonzero(count > limit)
-    if not len(crowded):
-        return rows
+    above = np.flatnonzero(count > limit)
+    crowded = np.unique(detections.exposures.camera[above])
+    if not len(above):
+        return rows, crowded
     rays = _rays_of(cameras, detections, rows)
-    seeds = np.flatnonzero(np.isin(rays.frame, crowded) & np.isfinite(rays.size))
+    seeds = np.flatnonzero(np.isin(rays.frame, above) & np.isfinite(rays.size))
     if not len(seeds):
-        return rows[~np.isin(rays.frame, crowded)]
+        return rows[~np.isin(rays.frame, above)], crowded
     seed = seeds[np.random.default_rng(portion.turn).integers(len(seeds))]
     to = rays.o[seed] + rays.d[seed] * diameter_m / rays.size[seed] - rays.o
     off = -np.einsum("ni,ni->n", rays.d, to / np.linalg.norm(to, axis=1, keepdims=True))
     rank = np.empty(len(rows), np.intp)
     order = np.lexsort((off, rays.frame))
     rank[order] = np.arange(len(rows)) - np.concatenate([[0], np.cumsum(count)])[rays.frame[order]]
-    return rows[rank < limit]
+    return rows[rank < limit], crowded
 
 
 def _rays_of(cameras: CameraArray, detections: DetectionTable, rows: Index) -> _Rays:

@@ -20,6 +20,7 @@ from fusion.tracking.multiview import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers
 
+TOO_MANY_UNASSIGNED = "frame sets with more unassigned roundels than are searched at once"
 MAX_CAMERAS = 64  # bits of the `cameras` column of `Markers`
 
 
@@ -95,6 +96,7 @@ class TrackingResult:
         assignments: of the detections of all admitted cameras.
         summary: which cameras observed which robots.
         step: for the smoother.
+        crowded: names of the cameras whose unassigned detections were too many to search all of them.
     """
 
     t_ns: int
@@ -104,6 +106,7 @@ class TrackingResult:
     assignments: Assignments
     summary: ObservationSummary
     step: FilterStep
+    crowded: tuple[str, ...] = ()
 
 
 def latency_of(frame_set: FrameSet, begun_ns: int, done_ns: int) -> Latency | None:

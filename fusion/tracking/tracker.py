@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Mask
+from camera_node.arrays import Index, Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
@@ -20,7 +20,7 @@ from fusion.monitoring.geometry_check import GeometryCheck
 from fusion.monitoring.residual_monitor import ResidualMonitor
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
-from fusion.tracking.acquisition import Acquisition
+from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
@@ -176,11 +176,11 @@ class Tracker:
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
-        update, markers = self._acquire(update)
+        update, found = self._acquire(update)
         table = self.table
         self.clocks.observe(update.t_ns, table.states, table.tracked, update.detections, update.assignments)
-        unlabeled = self._track_unlabeled(update, markers)
-        return self._report(update, unlabeled)
+        unlabeled = self._track_unlabeled(update, found.markers)
+        return self._report(update, unlabeled, found.crowded)
 
     def check_extrinsics(
         self, frame_set: FrameSet, result: TrackingResult
@@ -285,8 +285,8 @@ class Tracker:
         self.residuals.learn(assignments.squared_px)
         return states, assignments
 
-    def _acquire(self, update: Update) -> tuple[Update, list[Marker]]:
-        """Acquire missing robots; returns the update with their assignments, and the remaining markers."""
+    def _acquire(self, update: Update) -> tuple[Update, Acquired]:
+        """Acquire missing robots; returns the update with their assignments."""
         missing = np.flatnonzero(~update.tracked)
         if self.acquires_none or not self.table.owned[missing].any():  # other shards acquire their own
             missing = missing[:0]
@@ -300,9 +300,9 @@ class Tracker:
         if len(found.assignments) != len(update.assignments):
             self.table.observe(update.t_ns, found.assignments)
         if not len(missing):
-            return update, found.markers
+            return update, found
         summary = self._summarize(update.detections, found.assignments)
-        return replace(update, assignments=found.assignments, summary=summary), found.markers
+        return replace(update, assignments=found.assignments, summary=summary), found
 
     def _track_unlabeled(self, update: Update, markers: list[Marker]) -> UnlabeledMarkers:
         """Track the remaining markers; the leading shard adds those that only one camera sees."""
@@ -317,7 +317,7 @@ class Tracker:
         known = np.concatenate([positions, seen.position]), np.concatenate([covariances, seen.covariance])
         return seen.joined(self.single_view.locate(update.detections, rows, known))
 
-    def _report(self, update: Update, unlabeled: UnlabeledMarkers) -> TrackingResult:
+    def _report(self, update: Update, unlabeled: UnlabeledMarkers, crowded: Index) -> TrackingResult:
         """The result of the frame set; the poses of the update stay as they were published."""
         table, summary, t_ns = self.table, update.summary, update.t_ns
         rest = [k for k in np.flatnonzero(table.owned).tolist() if k not in update.poses]
@@ -331,4 +331,5 @@ class Tracker:
             update.assignments,
             summary,
             FilterStep(table.states, update.prediction, update.tracked & table.alive),
+            tuple(self.cameras.names[k] for k in crowded.tolist()),
         )

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
+from calib.rig.camera import Camera
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from fusion.protocol.messages import RobotPose
 from fusion.recordings.report import Summary
@@ -104,15 +106,36 @@ def seconds(t_ns: int) -> float:
     return (t_ns - START_NS) * 1e-9
 
 
+def inaccurate(rig: Mapping[str, Camera], error_px: float) -> dict[str, Camera]:
+    """A rig whose rotations and focal lengths displace roundels at the edge of the image by about `error_px`."""
+    rng, wrong = np.random.default_rng(5), {}
+    for name, camera in rig.items():
+        T, sigma = camera.matrix().copy(), error_px / camera.fx
+        T[:3, :3] @= rotation_from_vector(rng.normal(size=(1, 3)) * sigma * [1.0, 1.0, 2.0])[0]
+        fx, fy = np.array([camera.fx, camera.fy]) * (1 + 2 * sigma * rng.normal(size=2))
+        pose = Pose.from_matrix(T)
+        wrong[name] = msgspec.structs.replace(camera, T_world_cam=pose, fx=float(fx), fy=float(fy))
+    return wrong
+
+
 def fuse(
-    load: Load, duration_s: float, faults: Mapping[str, StampError], jitter_s: float | None = JITTER_S
+    load: Load,
+    duration_s: float,
+    faults: Mapping[str, StampError],
+    jitter_s: float | None = JITTER_S,
+    rig: dict[str, Camera] | None = None,
 ) -> Outcome:
-    """Track a recording of faulty cameras, in order of arrival, by the code of `fusion run` and the server."""
+    """Track a recording of faulty cameras, in order of arrival, by the code of `fusion run` and the server.
+
+    Args:
+        load, duration_s, faults, jitter_s: see `arrivals`.
+        rig: the calibration, if it is not the true one.
+    """
     outcome, summary, log = Outcome(), Summary(), _Log()
     logger = logging.getLogger("fusion")
     logger.addHandler(log)
     try:
-        arena = OfflineArena(load.rig, load.bodies)
+        arena = OfflineArena(rig or load.rig, load.bodies)
         for result in fuse_recording(arrivals(load, duration_s, faults, jitter_s), arena, summary):
             _add(outcome, load, result.poses)
             for name, use in result.cameras.items():

@@ -152,7 +152,7 @@ def test_the_controls_follow_the_recording(recording: Path):
     """The slider shows the position, the button its action."""
     with playing(recording) as (player, feed):
         view = View(feed, loopback())
-        controls = ReplayControls(view.server, player)
+        controls = ReplayControls(view.server.gui, player)
         view.add(controls)
         player.play(False)
         player.seek(7.5)

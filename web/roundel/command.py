@@ -91,14 +91,28 @@ COMMANDS = {
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras, set exposure, gain and masks",
-        _class_or_function("fusion.commands.cameras:cameras"),
+        "list, rename and forget cameras",
+        _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
-            "roundel cameras set north --exposure-us 4000",
-            "roundel cameras set north --mask 0 0 640 0 640 80 0 80",
         ),
+    ),
+    "settings": Command(
+        "show and change exposure, gain and mask of a running camera",
+        _class_or_function("camera_node.commands.adjust:ChangeSettings"),
+        (
+            "roundel settings north",
+            "roundel settings north --exposure-us 4000 --gain 2",
+            "roundel settings north --mask-detected",
+        ),
+        logging.WARNING,
+    ),
+    "snapshot": Command(
+        "save the image of a running camera",
+        _class_or_function("camera_node.commands.adjust:SaveSnapshot"),
+        ("roundel snapshot north north.jpg --draw",),
+        logging.WARNING,
     ),
     "detect": Command(
         "detect roundels in pictures",
@@ -106,9 +120,15 @@ COMMANDS = {
         ("roundel detect picture.png --draw seen.png", "roundel detect *.png --json"),
     ),
     "print": Command(
-        "print roundels",
+        "print roundels, wands, boards, L-frames and robots at true scale",
         _class_or_function("camera_node.commands.print:Sheet"),
-        ("roundel print roundels.svg", "roundel print roundels.svg --diameter 0.09 --paper letter"),
+        (
+            "roundel print roundels",
+            "roundel print roundels sheet.svg --diameter 0.12 --paper letter",
+            "roundel print wand",
+            "roundel print board board.pdf --columns 5 --rows 7 --square 0.035",
+            "roundel print robot rover.pdf --file robots.yaml --name rover",
+        ),
     ),
     "calibrate": Command(
         "calibrate lenses, camera poses and the floor",
@@ -151,6 +171,11 @@ COMMANDS = {
         "list, rename, remove and save the robots of the running server",
         _class_or_function("fusion.commands.robots:robots"),
         ("roundel robots list", "roundel robots rename robot-1 rover", "roundel robots save robots.yaml"),
+    ),
+    "simulate": Command(
+        "render a simulated recording into a folder",
+        _class_or_function("camera_node.simulation.__main__:simulate"),
+        ("roundel simulate configs/demo/scene.yaml recording --seconds 15",),
     ),
     "doctor": Command(
         "check this machine, the files of an arena and a running server",

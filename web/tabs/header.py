@@ -20,6 +20,7 @@ class Header:
 
     Attributes:
         tabs: by the names in `TABS`; controls that are added in a `with` block of one are in that tab.
+        recording: the name of the recording that is shown in the place of the arena; empty for none.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Header:
         """
         gui = server.gui
         self._endpoint = endpoint
+        self.recording = ""
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
         gui.set_panel_label(f"Roundel: {arena} at {endpoint}")
@@ -49,7 +51,8 @@ class Header:
     def update(self, state: ArenaState) -> None:
         """Show the condition of the arena, and the progress of the demo if it is recent."""
         condition = assess(state, self._endpoint)
-        set_content(self._status, status_line(condition.level, condition.text))
+        recorded = f"recording {self.recording}: " if self.recording else ""
+        set_content(self._status, status_line(condition.level, recorded + condition.text))
         recent = state.progress and state.age_s(state.progress) < PROGRESS_S
         progress = state.progress.message if state.progress and recent else None
         set_property(self._progress, "visible", progress is not None)

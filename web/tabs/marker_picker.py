@@ -37,12 +37,19 @@ class MarkerPicker:
             self._diameter = server.gui.add_number("Black disc, mm", 120.0, min=1.0, max=10_000.0, step=0.1)
             self._motion = server.gui.add_dropdown("Motion", ("aerial", "ground"))
             self._answer = Answer(server.gui)
-            self._define = ActionButton(
+            self._define_selected = ActionButton(
                 server.gui,
                 "Define robot",
                 self.define,
                 self._answer,
                 "measures the selected markers for 1.5 s",
+            )
+            self._everything = ActionButton(
+                server.gui,
+                "Define from everything stationary",
+                self.define_stationary,
+                self._answer,
+                "measures all unlabeled markers for 1.5 s and makes one robot of those that stand still",
             )
         self._cloud = server.scene.add_point_cloud(
             "/selected",
@@ -63,7 +70,8 @@ class MarkerPicker:
         is_next = next_step(state) == "robots"
         set_property(self._button, "color", PRIMARY if is_next and not self.selected else GREY)
         set_property(self._button, "disabled", not self._active and not len(self._unlabeled))
-        self._define.show(enabled=bool(self.selected), primary=bool(self.selected))
+        self._everything.show(enabled=len(self._unlabeled) > 0)
+        self._define_selected.show(enabled=bool(self.selected), primary=bool(self.selected))
         self._cloud.visible = bool(self.selected)
         if self.selected:
             self._cloud.points = np.array(self.selected, np.float32)
@@ -94,7 +102,15 @@ class MarkerPicker:
             raise FusionError("no marker is selected")
         measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
         standing = _match_selected(measured, np.array(self.selected))
-        robot = robot_from_markers(standing, self._diameter.value / 1e3, self._motion.value)
+        return self._define(name, standing)
+
+    def define_stationary(self) -> str:
+        """Have the server track a robot of all stationary unlabeled markers; returns and raises as `define`."""
+        name = require_name(self._name.value, "a robot")
+        return self._define(name, find_stationary_markers(self._subscription.collect_markers(MEASURE_S)))
+
+    def _define(self, name: str, markers: StationaryMarkers) -> str:
+        robot = robot_from_markers(markers, self._diameter.value / 1e3, self._motion.value)
         robots = self._subscription.define(name, robot)
         self.selected = []
         return describe(name, robots)

@@ -1,36 +1,236 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The tab Record: position and speed of a recording."""
+"""The tab Record: records the arena, lists recordings, exports one, and plays one in the place of the arena."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
 
 import viser
 
+from calib.rig.recording import RecordingWriter
+from camera_node.config import require_name
+from camera_node.errors import ConfigError, RoundelError
+from fusion.recordings.record import ArenaRecorder
+from fusion.recordings.summary import RecordingSummary, list_recordings
+from web.errors import WebError
 from web.feed import ArenaState
+from web.html_tables import Column, HtmlTable, TableRow
 from web.replay import RecordingPlayer
+from web.subscription import Subscription
+from web.widgets import ActionButton, Answer, set_content, set_property
 
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")
+STEP_S = 1 / 30  # of the button Step
+LIST_INTERVAL = 9  # updates from one look at the folder to the next: about 3 s
+NO_RECORDING = "no recording yet"
+EXPORT_S = 1800.0
+CLOSE_S = 5.0  # for a recording to be completed when the page closes
+RECORDING_COLUMNS = (
+    Column("recording"),
+    Column(
+        "length", "s", "unknown while it is written, and after a power failure; fusion repair restores it"
+    ),
+    Column("size", "MB"),
+    Column("cameras"),
+    Column("robots"),
+)
 
 
 class ReplayControls:
-    """Pauses a recording, and sets its position and speed."""
+    """Pauses a recording, steps through it, and sets its position and speed.
 
-    def __init__(self, server: viser.ViserServer, player: RecordingPlayer) -> None:
+    Attributes:
+        player: the recording that is played; None hides the controls.
+    """
+
+    def __init__(self, gui: viser.GuiApi, player: RecordingPlayer | None = None) -> None:
         self.player = player
-        gui = server.gui
-        end = max(0.1, round(player.duration_s, 1))
-        with gui.add_folder("Recording"):
+        self._folder = gui.add_folder("Replay", visible=player is not None)
+        with self._folder:
+            self._time = gui.add_markdown("")
             self._button = gui.add_button("Pause")
-            self._position = gui.add_slider("Seconds", 0.0, end, step=0.1, initial_value=0.0)
+            self._position = gui.add_slider("Seconds", 0.0, 1.0, step=0.1, initial_value=0.0)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1")
-        self._button.on_click(lambda _: player.play(not player.playing))
-        self._speed.on_update(lambda _: player.set_speed(float(self._speed.value)))
+            self._loop = gui.add_checkbox("Loop", False, hint="start again at the end")
+            step = gui.add_button("Step", hint="one frame of 30 Hz, paused")
+        self._button.on_click(lambda _: self._with(lambda player: player.play(not player.playing)))
+        step.on_click(lambda _: self._with(lambda player: player.step(STEP_S)))
+        self._speed.on_update(lambda _: self._with(lambda player: player.set_speed(float(self._speed.value))))
         self._position.on_update(self._seek)
 
     def update(self, state: ArenaState) -> None:
-        """Show the position, and label the button with its action."""
-        label = "Pause" if self.player.playing else "Play"
-        if self._button.label != label:
-            self._button.label = label
-        self._position.value = round(min(state.now_s, self.player.duration_s), 1)
+        """Show the position and the time of day, and label the button with its action."""
+        player = self.player
+        set_property(self._folder, "visible", player is not None)
+        if player is None:
+            return
+        if self._loop.value and not player.playing and player.seconds() >= player.duration_s:
+            player.play()
+        seconds = player.seconds()
+        time_of_day = datetime.fromtimestamp(player.start_s + seconds).isoformat(" ", "milliseconds")
+        set_content(self._time, time_of_day)
+        set_property(self._button, "label", "Pause" if player.playing else "Play")
+        set_property(self._position, "max", max(0.1, round(player.duration_s, 1)))
+        set_property(self._position, "value", round(min(seconds, player.duration_s), 1))
 
     def _seek(self, event: viser.GuiEvent) -> None:
         if event.client is not None:  # a user moved the slider; `update` moves it without a client
-            self.player.seek(float(self._position.value))
+            self._with(lambda player: player.seek(float(self._position.value)))
+
+    def _with(self, act: Callable[[RecordingPlayer], None]) -> None:
+        if self.player is not None:
+            act(self.player)
+
+
+class Recorder:
+    """Records the arena into a new file of a folder; `python -m fusion record` does so without a page."""
+
+    def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
+        self._subscription, self._folder = subscription, folder
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._writer: RecordingWriter | None = None
+        self._name = gui.add_text("Name", "", hint="of the file; empty for date and time")
+        self._answer = Answer(gui)
+        self._button = ActionButton(gui, "Start recording", self.toggle, self._answer)
+
+    def toggle(self) -> str:
+        """Start recording, or stop; returns the outcome. Raises ConfigError if the file can't be written."""
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                self._stop.set()
+                self._thread.join(CLOSE_S)
+                return self._describe("recorded")
+            name = self._name.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+            path = self._folder / f"{require_name(name, 'a recording').removesuffix('.mcap')}.mcap"
+            self._folder.mkdir(parents=True, exist_ok=True)
+            if path.exists():
+                raise ConfigError(f"{path} exists; give another name")
+            self._stop.clear()
+            self._writer = RecordingWriter(path, overwrite=False)
+            self._writer.__enter__()
+            self._thread = threading.Thread(target=self._record, args=(self._writer,), name="recorder")
+            self._thread.start()
+            return f"recording {path}"
+
+    def update(self, state: ArenaState) -> None:
+        """Show the progress."""
+        is_running = self._thread is not None and self._thread.is_alive()
+        label = "Stop recording" if is_running else "Start recording"
+        self._button.show(enabled=is_running or state.server_alive, primary=is_running, label=label)
+        if is_running:
+            self._answer.show(self._describe("recording"), "warn")
+
+    def close(self) -> None:
+        """Complete the recording."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_S)
+
+    def _record(self, writer: RecordingWriter) -> None:
+        recorder = ArenaRecorder(self._subscription.session, self._subscription.feed.keys.arena, writer)
+        try:
+            recorder.run(self._stop)
+            writer.__exit__()
+        except RoundelError as error:  # the disk is full
+            self._answer.show(str(error), "bad")
+
+    def _describe(self, verb: str) -> str:
+        if self._writer is None:
+            return ""
+        return f"{verb} {self._writer.path}: {sum(dict(self._writer.counts).values())} messages"
+
+
+class RecordingList:
+    """The recordings of a folder; the selected one can be played in the place of the arena, or exported.
+
+    Args:
+        gui: where the controls are added.
+        folder: the folder.
+        show: plays a recording in the page, or shows the arena again for None.
+    """
+
+    def __init__(self, gui: viser.GuiApi, folder: Path, show: Callable[[Path | None], None]) -> None:
+        self._folder, self._show = folder, show
+        self._updates = 0
+        self._is_shown = False
+        with gui.add_folder("Recordings"):
+            self._table = gui.add_html("")
+            self._selected = gui.add_dropdown("Recording", [NO_RECORDING])
+            answer = Answer(gui)
+            self._replay = ActionButton(gui, "Replay", self.replay, answer)
+            self._live = ActionButton(gui, "Back to the arena", self.back, answer)
+            hint = "fuses the recording again and writes poses as CSV beside it"
+            self._export = ActionButton(gui, "Export poses", self.export, answer, hint)
+
+    def update(self, state: ArenaState) -> None:
+        """Look at the folder every few seconds."""
+        if self._updates % LIST_INTERVAL == 0:
+            found = list_recordings(self._folder)
+            set_content(self._table, tabulate_recordings(found).html())
+            names = tuple(summary.path.name for summary in found) or (NO_RECORDING,)
+            if names != tuple(self._selected.options):
+                self._selected.options = names
+        self._updates += 1
+        is_any = self._selected.value != NO_RECORDING
+        self._replay.show(enabled=is_any)
+        self._export.show(enabled=is_any)
+        self._live.show(enabled=self._is_shown, primary=self._is_shown)
+
+    def replay(self) -> str:
+        """Play the selected recording."""
+        self._show(self._path)
+        self._is_shown = True
+        return f"the page shows {self._path.name}"
+
+    def back(self) -> str:
+        """Show the arena."""
+        self._show(None)
+        self._is_shown = False
+        return "the page shows the arena"
+
+    def export(self) -> str:
+        """Write the poses of the selected recording as CSV."""
+        out = self._path.with_suffix(".csv")
+        export_poses(self._path, out)
+        return f"wrote {out}"
+
+    @property
+    def _path(self) -> Path:
+        return self._folder / str(self._selected.value)
+
+
+def tabulate_recordings(found: list[RecordingSummary]) -> HtmlTable:
+    """One row for each recording."""
+    rows = [
+        TableRow(
+            (
+                summary.path.name,
+                "–" if summary.seconds is None else f"{summary.seconds:.1f}",
+                f"{summary.size_bytes / 1e6:.1f}",
+                str(len(summary.cameras)),
+                str(len(summary.robots)),
+            ),
+            "warn" if summary.seconds is None else "ok",
+        )
+        for summary in found
+    ]
+    return HtmlTable(RECORDING_COLUMNS, rows, "no recording in this folder yet")
+
+
+def export_poses(recording: Path, out: Path) -> None:
+    """Run `fusion replay`, in a process of its own because GTSAM holds the GIL.
+
+    Raises:
+        WebError: it failed, with its error message.
+    """
+    command = [sys.executable, "-m", "fusion", "replay", str(recording), "--out", str(out)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=EXPORT_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise WebError(f"the export of {recording} did not end within {EXPORT_S:.0f} s") from None
+    if done.returncode:
+        raise WebError(done.stderr.strip().removeprefix("error: ") or f"fusion replay failed on {recording}")

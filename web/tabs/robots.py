@@ -1,11 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The tab Robots: all declared robots with their state, and why a robot is not tracked."""
+"""The tab Robots: all declared robots with their state, why a robot is not tracked, and changes of one robot."""
+
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
 
 import viser
 
+from camera_node.config import require_name
+from fusion.errors import FusionError
+from fusion.model.robot_frame import move_origin, turn_heading
+from fusion.model.robots import save_robots
+from fusion.protocol.messages import Robots, RobotsRequest
 from web.feed import ArenaState
+from web.subscription import Subscription
 from web.tables import tabulate_robots
-from web.widgets import set_content
+from web.widgets import ActionButton, Answer, set_content
+
+NO_ROBOT = "no robot yet"
+CONFIRM = "Delete: click again"
 
 
 class RobotTable:
@@ -17,3 +30,95 @@ class RobotTable:
     def update(self, state: ArenaState) -> None:
         """Show the state."""
         set_content(self._table, tabulate_robots(state).html())
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """robots.yaml, robots-1.yaml, robots-2.yaml and so on."""
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{k}") for k in count(1))
+
+
+class RobotEditor:
+    """Renames, deletes and saves robots, and changes their frames.
+
+    Args:
+        gui: where the controls are added.
+        subscription: connected to the arena.
+        folder: where "Save" writes robots.yaml.
+    """
+
+    def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
+        self._subscription, self._file = subscription, folder / "robots.yaml"
+        self._confirmed = ""  # robot whose deletion the next click confirms
+        with gui.add_folder("One robot", expand_by_default=False):
+            self._robot = gui.add_dropdown("Robot", [NO_ROBOT])
+            self._name = gui.add_text("New name", "")
+            self._pivot = gui.add_vector3(
+                "Pivot, m", (0.0, 0.0, 0.0), step=0.001, hint="the new origin in the robot's present frame"
+            )
+            self._degrees = gui.add_number(
+                "Turn, degrees", 90.0, step=1.0, hint="of the x axis, counterclockwise seen from above"
+            )
+            answer = Answer(gui)
+            self._delete = ActionButton(gui, "Delete", self.delete, answer)
+            self._others = (
+                ActionButton(gui, "Rename", self.rename, answer),
+                ActionButton(gui, "Move the pivot", self.move_pivot, answer, "the robot is acquired again"),
+                ActionButton(gui, "Turn the heading", self.turn, answer, "the robot is acquired again"),
+                ActionButton(gui, "Save all robots", self.save, answer, f"writes {self._file}"),
+            )
+
+    def update(self, state: ArenaState) -> None:
+        """Offer the declared robots."""
+        names = state.declared_robots()
+        if (names or (NO_ROBOT,)) != tuple(self._robot.options):
+            self._robot.options = names or (NO_ROBOT,)
+        if self._confirmed != self._robot.value:
+            self._confirmed = ""
+        self._delete.show(enabled=bool(names), label=CONFIRM if self._confirmed else "Delete")
+        for button in self._others:
+            button.show(enabled=bool(names))
+
+    def rename(self) -> str:
+        """Rename the robot; it stays tracked."""
+        old, new = str(self._robot.value), require_name(self._name.value, "a robot")
+        robots = self._subscription.change_robots(RobotsRequest(rename={old: new}))
+        self._name.value = ""
+        return self._describe(robots, f"{old} is {new} now")
+
+    def delete(self) -> str:
+        """Remove the robot, with the second click."""
+        name = str(self._robot.value)
+        if self._confirmed != name:
+            self._confirmed = name
+            return f"click again to delete {name}"
+        self._confirmed = ""
+        return self._describe(
+            self._subscription.change_robots(RobotsRequest(remove=(name,))), f"{name} is deleted"
+        )
+
+    def move_pivot(self) -> str:
+        """Move the robot's origin."""
+        name, (x, y, z) = str(self._robot.value), self._pivot.value
+        robots = self._subscription.reframe_robot(name, lambda robot: move_origin(robot, (x, y, z)))
+        self._pivot.value = (0.0, 0.0, 0.0)
+        return self._describe(robots, f"the origin of {name} moved by {x:g}, {y:g}, {z:g} m")
+
+    def turn(self) -> str:
+        """Turn the robot's x axis."""
+        name, degrees = str(self._robot.value), float(self._degrees.value)
+        robots = self._subscription.reframe_robot(name, lambda robot: turn_heading(robot, degrees))
+        return self._describe(robots, f"the x axis of {name} turned by {degrees:g} degrees")
+
+    def save(self) -> str:
+        """Write all robots to robots.yaml; an existing file gets the next free number."""
+        robots = self._subscription.declared_robots().robots
+        if not robots:
+            raise FusionError("there is no robot to save")
+        path = next(path for path in _numbered(self._file) if not path.exists())
+        save_robots(robots, path)
+        return f"wrote {len(robots)} robots to {path}"
+
+    def _describe(self, robots: Robots, change: str) -> str:
+        unsaved = "; not saved on the server: use Save all robots" if robots.unsaved else ""
+        return f"{change}{unsaved}"

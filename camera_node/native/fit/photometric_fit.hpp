@@ -16,11 +16,11 @@ namespace roundel {
 struct InitialGuess {
     Ellipse outer;
     double ratio, dark, bright;
-    std::span<const Print> prints{};         // in use, if they are known
-    OcclusionMask occlusion{};               // sectors that the fit leaves out
-    std::optional<Parameters> model{};       // in the image's frame, within a third of a pixel, if known
-    double noise = 0;                        // noise that the fit of `model` estimated
-    double shading_sigma = 0;                // of the relative change of the light, per pixel; 0 for none
+    std::span<const Print> prints{};    // in use, if they are known
+    OcclusionMask occlusion{};          // sectors that the fit leaves out
+    std::optional<Parameters> model{};  // in the image's frame, within a third of a pixel, if known
+    double noise = 0;                   // noise that the fit of `model` estimated
+    double shading_sigma = 0;           // of the relative change of the light, per pixel; 0 for none
 };
 
 /// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is

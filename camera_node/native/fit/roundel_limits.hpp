@@ -34,16 +34,15 @@ struct RoundelLimits {
     double min_diameter = 8, max_diameter = 400;  // major axis of the outer ellipse, pixels
     double min_contrast = 25;                     // bright minus dark level, grey levels
 
-    // Prints that are not known in advance: least and greatest ratio, the tolerance of a measured one, and the
-    // least diameter, pixels, at which it tells a print from a letter.
+    // Prints that are not known in advance: least and greatest ratio, the tolerance of a measured one, and
+    // the least diameter, pixels, at which it tells a print from a letter.
     static constexpr std::pair kAnyPrint{0.3, 0.7};
     static constexpr double kAnyTolerance = 0.05, kMinAnyPrint = 14;
 
     /// The smallest and the largest ratio that a search must find, of `any` print or of those in use.
     std::pair<double, double> ratio_range(bool any) const {
-        const auto [low, high] =
-            std::minmax_element(prints.begin(), prints.end(),
-                                [](const Print& a, const Print& b) { return a.ratio < b.ratio; });
+        const auto [low, high] = std::minmax_element(
+            prints.begin(), prints.end(), [](const Print& a, const Print& b) { return a.ratio < b.ratio; });
         const double least = low->ratio - ratio_tolerance, most = high->ratio + ratio_tolerance;
         if (!any) return {least, most};
         return {std::min(least, kAnyPrint.first), std::max(most, kAnyPrint.second)};

@@ -30,7 +30,10 @@ constexpr double kSameLevel = 0.2;         // of the contrast: the ground is as 
 constexpr double kMinCard = 1.1;           // outer diameters: least diameter of a card whose edge shows
 constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
 constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
-constexpr double kMaxWrong = 0.2;          // share of samples of ring and hole with a wrong level
+// Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
+constexpr double kHidden = 0.3;
+constexpr int kMinHidden = 3;
+constexpr double kMaxWrong = 0.2;  // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
 struct Tolerance {
@@ -72,10 +75,19 @@ bool has_elliptic_edges(const EdgeMisfit& misfit, const RoundelFit& fit, double 
     return is_small(outer, radius) && is_small(inner, fit.ratio * radius);
 }
 
+/// The first test that a fit does not pass.
+std::optional<Refusal> first_failure(const ImageView& image, const RoundelFit& fit,
+                                     const AcceptanceContext& context, const Tolerance& tolerance) {
+    if (const auto exceeded = exceeded_limit(fit, context.limits)) return exceeded;
+    if (!has_card(fit)) return Refusal::kCard;
+    if (!has_small_residuals(fit, context.noise, tolerance)) return Refusal::kResiduals;
+    if (!has_levels(image, fit)) return Refusal::kInside;
+    return std::nullopt;
+}
+
 bool passes(const ImageView& image, const RoundelFit& fit, const AcceptanceContext& context,
             const Tolerance& tolerance) {
-    return is_within_limits(fit, context.limits) && has_card(fit) &&
-           has_small_residuals(fit, context.noise, tolerance) && has_levels(image, fit);
+    return !first_failure(image, fit, context, tolerance);
 }
 
 /// Whether ragged edges may be the reason that a fit was rejected.
@@ -110,11 +122,31 @@ bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
     return limits.print_error(fit.ratio) <= std::hypot(limits.ratio_tolerance, chance);
 }
 
+std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits) {
+    if (!has_known_ratio(fit, limits) && !limits.may_be_print(fit.ratio, fit.outer.major))
+        return Refusal::kRatio;
+    if (fit.contrast() < limits.min_contrast) return Refusal::kContrast;
+    const double brightest = 255 + (fit.clipped ? kOverflow : kUnderflow);
+    if (fit.dark <= -kUnderflow || fit.bright >= brightest) return Refusal::kLevels;
+    const double major = fit.outer.major;
+    if (major < limits.min_diameter || major > limits.max_diameter) return Refusal::kSize;
+    return std::nullopt;
+}
+
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
-    return (has_known_ratio(fit, limits) || limits.may_be_print(fit.ratio, fit.outer.major)) &&
-           fit.contrast() >= limits.min_contrast && fit.dark > -kUnderflow &&
-           fit.bright < 255 + (fit.clipped ? kOverflow : kUnderflow) &&
-           fit.outer.major >= limits.min_diameter && fit.outer.major <= limits.max_diameter;
+    return !exceeded_limit(fit, limits);
+}
+
+std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fit,
+                                    const AcceptanceContext& context) {
+    const EdgeMisfit misfit(image, fit.p);
+    const OcclusionMask hidden = misfit.occlusion(context.noise, kHidden * fit.contrast());
+    const bool covered = count_sectors(hidden.outer | hidden.inner) >= kMinHidden;
+    const auto failure = first_failure(image, fit, context, {kMisfit, kMaxGrowth});
+    // A cover biases ratio, card, residuals and levels, but neither contrast nor size.
+    if (failure == Refusal::kContrast || failure == Refusal::kSize || (failure && !covered)) return failure;
+    if (covered) return Refusal::kCover;
+    return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt : std::optional(Refusal::kEdges);
 }
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,

@@ -12,6 +12,24 @@ namespace roundel {
 /// roundels.
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits);
 
+/// The test that a ring-like shape fails. The numbers are those of `camera_node.detection.refusals`.
+enum class Refusal {
+    kNoFit,      // the model of a roundel does not converge on it
+    kRatio,      // not a print's
+    kContrast,   // too low
+    kLevels,     // ink or paper beyond what the camera can show
+    kSize,       // out of limits
+    kCard,       // no white around the ring
+    kResiduals,  // too large at the edges
+    kEdges,      // not elliptic
+    kInside,     // ring or hole have places with a wrong level
+    kCover,      // a part is covered, and the rest does not suffice
+    kBullseye    // further rings around it
+};
+
+/// The limit that a fit exceeds, if any.
+std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits);
+
 /// Whether contrast, ratio and size are within their limits, and the grey levels within a camera's range.
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 
@@ -31,5 +49,9 @@ struct AcceptanceContext {
 /// the first fit is tried: if it fails, the caller needs another guess.
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known);
+
+/// The first test that a fit of all of a ring does not pass, if any.
+std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fit,
+                                    const AcceptanceContext& context);
 
 }  // namespace roundel

@@ -16,9 +16,10 @@ constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly n
 constexpr double kMaxCurvature = 1.4;             // of a tone curve between ink and paper
 constexpr double kMaxLogExponent = 1.2;           // 3.3
 constexpr int kHalvings = 16;                     // of the interval of exponents
-// A print that is only assumed or estimated: smaller roundels and more negative curvatures may be those of another print.
+// A print that is only assumed or estimated: smaller roundels and more negative curvatures may be those of
+// another print.
 constexpr double kMaxByCurvature = 0.06, kMinAssumed = -0.3;
-constexpr double kMinTone = 0.1;                  // logarithm of an exponent: smaller ones count as linear
+constexpr double kMinTone = 0.1;        // logarithm of an exponent: smaller ones count as linear
 constexpr double kMaxLinear = 0.1;      // logarithm, up to which a measurement is exact to a hundredth
 constexpr double kMinChange = 0.02;     // of the logarithm
 constexpr double kMaxSigma = 0.15;      // of the logarithm, from which it is used

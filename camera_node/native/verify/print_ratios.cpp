@@ -17,14 +17,14 @@ constexpr double kSecondOrder = 0.1;     // share of the tone curve's effect tha
 constexpr double kCurvaturePrior = 0.6;  // standard deviation; 0.7 is a gamma of 2.2
 constexpr double kMinCurvature = -0.25;  // of the tone curves of cameras
 constexpr double kMaxCurvature = 1.4;
-constexpr double kSameKind = 0.04;       // difference of ratios from the regression
+constexpr double kSameKind = 0.04;  // difference of ratios from the regression
 constexpr size_t kMaxKinds = 8;
-constexpr int kRecurring = 3;          // roundels of a kind in one frame
-constexpr int kMaxCount = 512;         // measurements that a regression remembers
-constexpr double kMinZoom = 0.05;      // relative change of the distance after which a roundel counts again
-constexpr double kContradiction = 3;   // standard deviations
-constexpr double kExact = 0.01;        // standard deviation, from which an assigned print may change
-constexpr double kReplaced = 0.15;     // distance at which a print that recurs replaces a usual one
+constexpr int kRecurring = 3;         // roundels of a kind in one frame
+constexpr int kMaxCount = 512;        // measurements that a regression remembers
+constexpr double kMinZoom = 0.05;     // relative change of the distance after which a roundel counts again
+constexpr double kContradiction = 3;  // standard deviations
+constexpr double kExact = 0.01;       // standard deviation, from which an assigned print may change
+constexpr double kReplaced = 0.15;    // distance at which a print that recurs replaces a usual one
 constexpr size_t kUsed = 256;
 const std::vector<Print> kUsual{{0.6}, {0.41}};
 
@@ -131,9 +131,8 @@ bool PrintRatios::collect() {
     for (const Kind& kind : kinds_)
         if (kind.assigned && is_new(*kind.assigned)) prints.push_back(*kind.assigned);
     std::vector<Print> own;
-    std::copy_if(prints.begin(), prints.end(), std::back_inserter(own), [](const Print& print) {
-        return nearest_print(kUsual, print.ratio).ratio != print.ratio;
-    });
+    std::copy_if(prints.begin(), prints.end(), std::back_inserter(own),
+                 [](const Print& print) { return nearest_print(kUsual, print.ratio).ratio != print.ratio; });
     for (const Print& usual : kUsual)
         if (is_new(usual) &&
             (own.empty() || std::abs(nearest_print(own, usual.ratio).ratio - usual.ratio) > kReplaced))

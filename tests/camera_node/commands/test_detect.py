@@ -52,8 +52,8 @@ def test_a_table_and_a_drawing(image: Path, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_contradictory_options_are_refused(image: Path, tmp_path: Path):
-    with pytest.raises(ConfigError, match="one image"):
-        Detect(images=(image, image), draw=tmp_path / "out.png").run()
+    with pytest.raises(ConfigError, match="name a folder"):
+        Detect(images=(image, image), draw=image).run()
     with pytest.raises(ConfigError, match="--diameter"):
         Detect(images=(image,), name="cam0").run()
     with pytest.raises(ConfigError, match="can't be written"):

@@ -22,6 +22,32 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.parametrize(
+    ("extra", "arguments"),
+    [
+        ("", ("vrpn", "--port", "0")),
+        ("", ("ros2",)),
+        ("pymavlink", ("mavlink", "rover", "--to", "udp:127.0.0.1:9")),
+        ("foxglove", ("foxglove", "--port", "0")),
+    ],
+)
+def test_a_bridge_needs_only_its_own_extra(extra: str, arguments: tuple[str, ...], endpoint: str):
+    packages = {"gtsam", "scipy", "viser", "mcap", "psutil", "websockets", "ezc3d", "rosbags"}
+    missing = (packages | {"pymavlink", "foxglove", "av"}) - {extra}
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({missing}))\nfrom fusion.__main__ import main; main()"
+    )
+    words = [sys.executable, "-c", code, *arguments, "--connect", endpoint]
+    with (
+        PoseServer(endpoint),
+        subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process,
+    ):
+        try:
+            assert first_line(process)
+        finally:
+            process.kill()
+
+
 def test_the_page_exports(tmp_path: Path):
     with RecordingWriter(tmp_path / "monday.mcap") as writer:
         for k in range(10):

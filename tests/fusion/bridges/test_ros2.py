@@ -22,9 +22,9 @@ from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.bridges.ros2 import Ros2Node, ros_name
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transform
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
 from fusion.client.arena import Arena
-from fusion.commands.ros2 import ros2
+from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.messages import RobotPose
 
 DEADLINE_S = 60.0
@@ -66,7 +66,7 @@ def test_type_hashes_are_those_of_ros(kind):
     [
         ("geometry_msgs/msg/PoseStamped", lambda frame: pose_stamped(POSE, frame)),
         ("nav_msgs/msg/Odometry", lambda frame: odometries([POSE], frame, ["rover"])[0]),
-        ("tf2_msgs/msg/TFMessage", lambda frame: transform(POSE, frame, "rover")),
+        ("tf2_msgs/msg/TFMessage", lambda frame: transforms([POSE, POSE], frame, ["rover", "drone1"])),
     ],
 )
 def test_bytes_are_those_of_ros(kind, write, frame):
@@ -77,7 +77,7 @@ def test_bytes_are_those_of_ros(kind, write, frame):
 def test_messages_have_the_values_of_the_pose():
     stamped = read(pose_stamped(POSE, "world"), "geometry_msgs/msg/PoseStamped")
     odom = read(odometries([POSE], "world", ["rover"])[0], "nav_msgs/msg/Odometry")
-    (tf,) = read(transform(POSE, "world", "rover"), "tf2_msgs/msg/TFMessage").transforms
+    (tf,) = read(transforms([POSE], "world", ["rover"]), "tf2_msgs/msg/TFMessage").transforms
     for message in (stamped, odom, tf):
         stamp = message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == POSE.t_ns

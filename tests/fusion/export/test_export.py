@@ -22,6 +22,7 @@ from fusion.commands.export import export
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, Robots
 from tests.conftest import ROOT
+from tests.fusion.bridges.foxglove_reader import read_mcap
 from tests.fusion.bridges.pose_server import moving_pose
 from tests.waiting import DEADLINE_S
 
@@ -171,6 +172,23 @@ def test_a_ros_2_bag_has_the_messages_of_the_bridge(recording: Path, tmp_path: P
         "/drone/odometry": n_drone,
         "/tf": N + n_drone,
     }
+
+
+def test_a_file_for_foxglove_has_the_arena(recording: Path, tmp_path: Path):
+    export(recording, tmp_path / "out.mcap")
+    found = read_mcap(tmp_path / "out.mcap")
+    poses = recorded_poses()
+    assert set(found) == {"/tf", "/cameras/tf", "/scene", "/robots/rover/pose", "/robots/drone/pose", "/log"}
+    for robot in BODIES:
+        expected = [p for p in poses if p.robot == robot and p.state != "lost"]
+        messages = found[f"/robots/{robot}/pose"]
+        assert [t_ns for t_ns, _ in messages] == [p.t_ns for p in expected]
+        positions = [(m.pose.position.x, m.pose.position.y, m.pose.position.z) for _, m in messages]
+        assert positions == [p.position for p in expected]
+    assert len(found["/tf"]) == 2 * N - len(LOST)
+    ((_, scene),) = found["/scene"]
+    assert {(e.id, len(e.cylinders)) for e in scene.entities} == {("rover", 3), ("drone", 1)}
+    assert [m.message for _, m in found["/log"]] == ["drone is lost", "drone is tracked"]
 
 
 def test_what_can_not_be_exported_is_refused(

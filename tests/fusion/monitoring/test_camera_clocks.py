@@ -9,7 +9,7 @@ import pytest
 from fusion.model.frames import MAX_CLOCK_ERROR_S, clock_sigma_s
 from fusion.monitoring.stamp_check import StampCheck
 from tests.benchmarks.fusion_load import Load
-from tests.fusion.clock_faults import GRACE_S, Outcome, drift, fuse, step
+from tests.fusion.clock_faults import GRACE_S, Outcome, drift, fuse, inaccurate, step
 
 LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=1.0, crossing=True)
 FAULT_S, DURATION_S = 2.0, 4.5
@@ -69,6 +69,29 @@ def test_a_clock_that_drifts_is_reported_before_it_harms():
     faulty = {"cam1": drift(FAULT_S, 2000.0)}
     outcome = fuse(LOAD, 8.0, faulty)
     require_harmless(outcome, faulty)
+
+
+@pytest.mark.parametrize(
+    ("ppm", "reported_s", "duration_s"),
+    [(200.0, 12.0, 16.0), (-200.0, 12.0, 16.0), pytest.param(50.0, 30.0, 36.0, marks=pytest.mark.slow)],
+)
+def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, duration_s: float):
+    """Before: 200 ppm after 23 to 30 s, 50 ppm never. Windows of 2 s show the offset with a sigma of about 0.1 ms."""
+    faulty = {"cam1": drift(FAULT_S, ppm)}
+    outcome = fuse(replace(LOAD, robots=4), duration_s, faulty)
+    require_harmless(outcome, faulty)
+    assert FAULT_S < outcome.reported_s("cam1") < FAULT_S + reported_s
+    *_, (at_s, line) = outcome.log
+    corrected_ms = float(line.split("now by ")[1].split()[0])
+    assert corrected_ms == pytest.approx(-ppm * 1e-3 * (at_s - FAULT_S), abs=0.6)
+    assert outcome.worst_m(FAULT_S) < 0.007  # 4.6 mm without a drift
+
+
+@pytest.mark.parametrize("speed_m_s", [0.3, 1.0])
+def test_an_inaccurate_calibration_is_no_drift(speed_m_s: float):
+    """Camera poses and focal lengths that are wrong by 0.2 px bias all offsets, but do not change them."""
+    load = replace(LOAD, robots=4, speed_m_s=speed_m_s)
+    assert fuse(load, 20.0, {}, rig=inaccurate(load.rig, 0.2)).log == []
 
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.3, 2.0])

@@ -165,16 +165,16 @@ def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
     assert acquired > 0.5 * 60 * load.robots
 
 
-@pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_BODIES", "MAX_DETECTIONS"])
+@pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_BODIES", "MAX_PAIRS"])
 def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.MonkeyPatch, limit: str):
-    """Each limit is a tenth of what the twelve robots need."""
+    """Each limit is a tenth of what the twelve robots need, or half of what they need among false detections."""
     module, value = {
         "MAX_COMPARED": (identification, 3),
         "MAX_BODIES": (acquisition, 1),
-        "MAX_DETECTIONS": (acquisition, 10),
+        "MAX_PAIRS": (acquisition, 1),
     }[limit]
     monkeypatch.setattr(module, limit, value)
-    load = Load(12, 4, 6, 30.0, seed=5)
+    load = Load(12, 4, 6, 30.0, seed=5, false=60.0 if limit == "MAX_PAIRS" else 1.0)
     tracker = Tracker(load.rig, load.bodies)
     tracked = [
         tracker.track(frame_set) and int(tracker.table.tracked.sum()) for frame_set in frame_sets(load, 3.0)

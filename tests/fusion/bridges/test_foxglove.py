@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A live server in Foxglove's websocket, read by the schemas that it sends."""
+
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.geometry.pose import rotation_from_wxyz
+from camera_node.protocol.messages import Preview, encode
+from camera_node.protocol.session import open_client
+from fusion.client.arena import Arena
+from fusion.protocol.messages import RobotPose
+from tests.conftest import ROOT
+from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
+from tests.fusion.bridges.foxglove_reader import FoxgloveClient
+from tests.fusion.bridges.pose_server import bridge, first_line
+from tests.fusion.serving import KEYS
+from tests.fusion.synthetic import TRIANGLE
+from tests.waiting import DEADLINE_S, Inbox
+
+
+def place(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
+
+
+def wxyz(q: Any) -> list[float]:
+    return [q.w, q.x, q.y, q.z]
+
+
+def nanoseconds(stamp: Any) -> int:
+    return stamp.seconds * 10**9 + stamp.nanos
+
+
+def test_foxglove_shows_the_arena_and_continues_after_a_restart(tmp_path: Path):
+    server = ServerProcess(tmp_path)
+    try:
+        with (
+            cameras_at(server.endpoint),
+            Arena.connect(server.endpoint, arena="test") as arena,
+            bridge("foxglove", "--connect", server.endpoint, "--port", "0") as process,
+        ):
+            inbox = Inbox()
+            arena.robot("a").on_pose(inbox.put)
+            match = re.search(r":(\d+)$", first_line(process))
+            assert match
+            with FoxgloveClient(int(match[1])) as client:
+                check_poses(client, inbox)
+                check_cameras(client)
+                check_scene(client)
+                _, _, update = client.next("/markers")
+                (unlabeled,) = update.entities
+                assert unlabeled.frame_id == "world"
+                assert len(unlabeled.spheres) <= 4  # those of the robot that the server does not know
+            check_images(int(match[1]), server.endpoint)
+            since_ns = inbox.items[-1].t_ns
+            server.kill()
+            server.start(server.endpoint)
+            with FoxgloveClient(int(match[1])) as client:
+                while client.next("/tf")[1] <= since_ns:
+                    pass
+    finally:
+        server.kill()
+
+
+def check_poses(client: FoxgloveClient, inbox: Inbox) -> None:
+    _, log_ns, content = client.next("/tf")
+    (transform,) = content.transforms
+    assert nanoseconds(transform.timestamp) == log_ns
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "a")
+    assert inbox.until(lambda poses: any(p.t_ns == log_ns for p in poses))
+    (pose,) = [p for p in inbox.items if p.t_ns == log_ns]
+    assert isinstance(pose, RobotPose)
+    assert place(transform.translation) == list(pose.position)
+    assert wxyz(transform.rotation) == list(pose.quaternion_wxyz)
+    topic, log_ns, stamped = client.next("/robots/")
+    assert (topic, stamped.frame_id) == ("/robots/a/pose", "world")
+    assert inbox.until(lambda poses: any(p.t_ns == log_ns for p in poses))
+    (pose,) = [p for p in inbox.items if p.t_ns == log_ns]
+    assert place(stamped.pose.position) == list(pose.position)
+
+
+def check_cameras(client: FoxgloveClient) -> None:
+    names = set()
+    while len(names) < len(ARENA.cameras):
+        topic, _, content = client.next("/cameras/")
+        if topic == "/cameras/tf":
+            names |= {transform.child_frame_id for transform in content.transforms}
+            for transform in content.transforms:
+                T = ARENA.cameras[transform.child_frame_id.removeprefix("camera/")].matrix()
+                assert place(transform.translation) == pytest.approx(T[:3, 3], abs=1e-6)
+                assert rotation_from_wxyz(wxyz(transform.rotation)) == pytest.approx(T[:3, :3], abs=1e-6)
+    topic, _, content = client.next("/cameras/")
+    while not topic.endswith("/calibration"):
+        topic, _, content = client.next("/cameras/")
+    camera = ARENA.cameras[topic.split("/")[2]]
+    assert (content.width, content.height, content.frame_id) == (
+        camera.width,
+        camera.height,
+        f"camera/{topic.split('/')[2]}",
+    )
+    assert np.array(content.K).reshape(3, 3) == pytest.approx(
+        np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    )
+    assert list(content.D) == pytest.approx(camera.distortion)
+
+
+def check_scene(client: FoxgloveClient) -> None:
+    _, _, update = client.next("/scene")
+    (body,) = update.entities
+    assert (body.id, body.frame_id, body.frame_locked) == ("a", "a", True)
+    points = [place(disc.pose.position) for disc in body.cylinders]
+    assert np.array(points) == pytest.approx(TRIANGLE.points)
+
+
+def check_images(port: int, endpoint: str) -> None:
+    """Previews are asked for only while a client looks at them."""
+    camera = sorted(ARENA.cameras)[0]
+    picture = cv2.imencode(".jpg", np.full((48, 64), 90, np.uint8))[1].tobytes()
+    preview = encode(Preview(camera=camera, t_ns=123, width=640, height=480, jpeg=picture))
+    done = threading.Event()
+    with open_client([endpoint]) as session:
+        publisher = session.declare_publisher(KEYS.preview(camera))
+        assert not publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
+
+        def repeat() -> None:
+            while not done.wait(0.05):
+                publisher.put(preview)
+
+        thread = threading.Thread(target=repeat)
+        thread.start()
+        try:
+            with FoxgloveClient(port, images=True) as client:
+                topic, t_ns, image = client.next(f"/cameras/{camera}/image")
+        finally:
+            done.set()
+            thread.join(DEADLINE_S)
+    assert (topic, t_ns, image.format, image.data) == (f"/cameras/{camera}/image", 123, "jpeg", picture)
+
+
+def test_a_port_in_use_is_reported_in_one_line(endpoint: str):
+    with bridge("foxglove", "--connect", endpoint, "--port", "0") as process:
+        port = first_line(process).strip().rpartition(":")[2]
+        words = [sys.executable, "-m", "fusion", "foxglove", "--port", port]
+        program = subprocess.run(
+            words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+        )
+    assert program.returncode == 75
+    assert len(program.stderr.splitlines()) == 1
+    assert f"can't listen on 127.0.0.1 port {port}" in program.stderr
+
+
+def test_without_the_sdk_one_line_says_what_to_install():
+    code = "import sys; sys.modules['foxglove'] = None; from fusion.__main__ import main; main()"
+    words = [sys.executable, "-c", code, "foxglove"]
+    program = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert program.returncode == 2
+    assert len(program.stderr.splitlines()) == 1
+    assert "pip install 'roundel[foxglove]'" in program.stderr

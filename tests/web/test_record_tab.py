@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The tabs Record and Status: record, list, replay in the page and export, by clicks, with a real server."""
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from camera_node.protocol.session import open_client
+from fusion.commands.record import recordings
+from fusion.recordings.summary import list_recordings
+from tests.fusion.serving import serving_an_unknown_robot
+from tests.waiting import wait_for
+from tests.web.arena import LiveArena
+from tests.web.browser import browsing, drawing, loopback
+from web.condition import Condition
+from web.feed import Feed
+from web.history import LENGTH_S, EventLog, FigureHistory
+from web.html_tables import HtmlTable
+from web.page import add_live_page
+from web.subscription import Subscription
+from web.tabs.record import tabulate_recordings
+from web.view import View
+
+EXPORT_MS = 120_000  # on a busy machine: a process starts and fuses the recording
+
+
+@pytest.fixture
+def view(tmp_path: Path) -> Iterator[View]:
+    """The page of a running arena."""
+    with serving_an_unknown_robot(tmp_path) as (endpoint, _), open_client([endpoint]) as session:
+        subscription = Subscription(session, Feed("test"))
+        view = View(subscription.feed, loopback())
+        with ExitStack() as closing, drawing(view):
+            add_live_page(view, subscription, endpoint, None, closing, tmp_path / "recordings")
+            yield view
+        subscription.close()
+
+
+def test_a_recording_is_made_shown_and_exported(
+    view: View, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Its messages are counted; the page shows it in the place of the arena, and the arena again."""
+    folder = tmp_path / "recordings"
+    with browsing(view) as page:
+        page.set_default_timeout(60_000)
+        page.get_by_role("tab", name="Record").click()
+        page.get_by_text("no recording in this folder yet").wait_for()
+        page.get_by_role("button", name="Start recording").click()
+        page.wait_for_function("/mcap: [1-9][0-9]{2,} messages/.test(document.body.innerText)")
+        page.get_by_role("button", name="Stop recording").click()
+        page.get_by_text("recorded").first.wait_for()
+        (summary,) = wait_for(lambda: list_recordings(folder))
+        assert summary.seconds is not None
+        assert summary.seconds > 0
+        assert len(summary.cameras) == 4
+        page.get_by_role("cell", name=summary.path.name).wait_for()
+        page.get_by_role("button", name="Replay").click()
+        page.get_by_text(f"recording {summary.path.name}:").wait_for()
+        page.get_by_role("button", name="Step").click()
+        page.get_by_role("button", name="Play", exact=True).wait_for()
+        assert view.shown is not view.feed
+        page.get_by_role("button", name="Back to the arena").click()
+        page.get_by_text("the page shows the arena").wait_for()
+        assert view.shown is view.feed
+        page.get_by_role("button", name="Export poses").click()
+        page.get_by_text(f"wrote {summary.path.with_suffix('.csv')}").wait_for(timeout=EXPORT_MS)
+    assert summary.path.with_suffix(".csv").read_text().startswith("t_ns,robot,x,y,z")
+    capsys.readouterr()
+    recordings(folder)
+    assert f"{summary.path.name}: {summary.seconds:.1f} s" in capsys.readouterr().out
+
+
+def test_a_file_without_an_index_is_listed(tmp_path: Path):
+    """It is being written, was cut off, or is no recording at all."""
+    (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n cut")
+    (summary,) = list_recordings(tmp_path)
+    assert (summary.seconds, summary.cameras) == (None, ())
+    table: HtmlTable = tabulate_recordings([summary])
+    assert table.rows[0].level == "warn"
+    assert list_recordings(tmp_path / "absent") == []
+
+
+def test_the_log_has_one_line_for_each_change():
+    """Changing figures are no change; a return to normal is one."""
+    log = EventLog()
+    for seconds in range(3, 8):
+        log.add(Condition("bad", f"camera north silent for {seconds} s"))
+    log.add(Condition("ok", "4 cameras"))
+    log.add(Condition("ok", "3 cameras, 9 poses/s"))
+    assert [event.condition.level for event in log.events] == ["ok", "bad"]
+    for k in range(200):
+        log.add(Condition("warn", "a" * k))
+    assert len(log.events) == 50
+
+
+def test_the_history_has_each_status_once_and_the_last_minute_only(arena: LiveArena, feed: Feed):
+    history = FigureHistory()
+    arena.status()
+    wait_for(lambda: feed.state().status)
+    state = feed.state()
+    assert history.add(state)
+    assert not history.add(state)
+    seconds, latency, rate, residual = history.columns(state.now_s)
+    assert -LENGTH_S < seconds[0] <= 0
+    assert (latency[0], rate[0]) == (7.7, 30.0)
+    assert math.isclose(residual[0], 0.08)
+    assert len(history.columns(state.now_s + LENGTH_S + 1)[0]) == 0
