@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
 
-.PHONY: demo test check setup format clean
+.PHONY: demo test check docs setup format clean
 
 demo: .venv/ready
 	@$(BIN)/python -m web --demo $(ARGS)
@@ -18,6 +18,10 @@ check: .venv/ready
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
+
+docs: .venv/ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "open build/site/index.html"
 
 format: .venv/ready
 	$(BIN)/ruff format .

@@ -75,6 +75,7 @@ class Trial:
         advice: where to wave next, by camera.
         expected_mm: expected error of points across the arena; None for a rig without scale.
         grade: of the trial.
+        rig: the cameras that it placed, for a preview; None if it failed.
     """
 
     fault: str = ""
@@ -84,6 +85,7 @@ class Trial:
     advice: dict[str, str] = field(default_factory=dict)
     expected_mm: float | None = None
     grade: str = "D"
+    rig: Rig | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,4 +287,5 @@ def compute_trial(settings: WandSession, part: Sequence[Detections], share: floa
         advice={c.name: c.wave_next for c in quality.cameras},
         expected_mm=quality.expected.typical_mm if quality.expected else None,
         grade=quality.grade,
+        rig=result.rig,
     )

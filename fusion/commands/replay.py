@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+from camera_node.errors import ConfigError
 from camera_node.terminal import say, track
 from fusion.model.limits import Limits
 from fusion.recordings.frame_sets import recorded_frame_sets
@@ -34,6 +35,8 @@ def replay(
         rate_hz: poses a second; without it the rate of the fastest camera.
         smooth: estimate each pose from the whole recording, not only from the frames before it.
     """
+    if out.exists() and recording.exists() and out.samefile(recording):
+        raise ConfigError(f"--out {out} is the recording itself; give another file, which is then replaced")
     recorded = read_recording(recording)
     cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
     arena = OfflineArena(cameras, declared, rate_hz, recorded.limits or Limits(), smooth)

@@ -71,8 +71,11 @@ class TrackingPipeline:
         return self.active_rig.rig.placed() if self.active_rig.rig else {}
 
     def restart(self) -> None:
-        """Drop all frames and tracks; the tracker acquires all robots again."""
+        """Drop all frames and tracks; the tracker acquires all robots again, with the clocks as they are known."""
+        old = self.tracker
         self._start(self.cameras)
+        if old is not None and self.tracker is not None:
+            self.tracker.clocks.inherit(old.clocks)
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wand session that is started and ended in a real browser calibrates the cameras."""
 
+import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -39,8 +40,29 @@ def files(tmp_path: Path) -> CalibrationFiles:
 def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
     """A view that draws, with the button."""
     view = View(subscription.feed, loopback())
-    with drawing(view), closing(WandSessionPanel(view.server, subscription, files)):
-        yield view
+    with closing(WandSessionPanel(view.server, subscription, files)) as panel:
+        view.add(panel)
+        with drawing(view):
+            yield view
+
+
+@contextmanager
+def cameras_present(arena: LiveArena) -> Iterator[None]:
+    """Send the status of all cameras ten times a second."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.1):
+            for name in ARENA.truth.cameras:
+                arena.camera(name)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def test_a_wand_session_in_the_page_calibrates_the_cameras(
@@ -49,8 +71,9 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
     """The rig and the recording are written; the page shows the grade, and that no server has the rig in force."""
     sent = record(ARENA, 8.0)  # no noise
     with browsing(view) as page, open_client([arena.endpoint]) as session:
-        page.get_by_role("button", name="Start wand session").click()
-        page.get_by_text("waiting for cameras").wait_for(timeout=20_000)
+        with cameras_present(arena):  # without cameras the button is disabled
+            page.get_by_role("button", name="Start wand session").click(timeout=30_000)
+            page.get_by_text("waiting for cameras").wait_for(timeout=20_000)
         for message in sent:
             key = arena.keys.detections(message.camera)
             session.put(key, encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
@@ -58,12 +81,16 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
             page.get_by_text(name).first.wait_for(timeout=20_000)
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
         page.get_by_role("button", name="End wand session").click()
+        page.get_by_text("accept or discard").wait_for(timeout=CALIBRATION_MS)
+        assert not load_rig(files.rig).placed(), "nothing changes before the user accepts"
+        page.get_by_role("button", name="Accept the calibration").click()
         page.get_by_text("but not in force: no server answers").wait_for(timeout=CALIBRATION_MS)
         page.get_by_text("grade").first.wait_for(timeout=20_000)
         page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
     saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
     assert saved <= {(m.camera, m.t_ns) for m in sent}
     assert len(saved) > len(sent) / 2
+    assert not files.candidate.exists()
     rig = load_rig(files.rig)
     assert_near(rig, ARENA.truth, 1e-3, 1e-3)
 
@@ -77,6 +104,20 @@ def test_a_failed_calibration_names_the_recording(tmp_path: Path, files: Calibra
     with pytest.raises(WebError, match=r"symmetric.*rig\.wave\.mcap"):
         calibrate_cameras(recording, files)
     assert files.rig.read_bytes() == before
+
+
+def test_a_discarded_calibration_changes_nothing(subscription: Subscription, files: CalibrationFiles):
+    """The preview and the candidate's file disappear; there is nothing left to accept."""
+    view, before = View(subscription.feed, loopback()), files.rig.read_bytes()
+    with closing(WandSessionPanel(view.server, subscription, files)) as panel:
+        save_rig(ARENA.truth, files.candidate)
+        panel._candidate = load_rig(files.candidate)
+        assert "discarded" in panel.discard()
+        assert not files.candidate.exists()
+        assert files.rig.read_bytes() == before
+        with pytest.raises(WebError, match="no calibration to accept"):
+            panel.accept()
+    view.close()
 
 
 def test_missing_files_are_found_before_the_page_opens(files: CalibrationFiles):

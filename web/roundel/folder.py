@@ -7,7 +7,7 @@ robots.yaml    the robots
 wand.yaml      the wand
 cameras/       name, id and settings of each camera
 recordings/    recordings
-zenoh.json5    how the server is reached over the network; the place for TLS and access rights
+zenoh.json5    how the server is found in the network
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ audit: audit.jsonl
 """
 ZENOH = """\
 // Written by `roundel up`; edit it freely. By multicast scouting, `roundel camera` on other machines finds the server.
-// TLS and access rights: docs/security.md.
+// docs/security.md describes how to protect the arena.
 {{ scouting: {{ multicast: {{ enabled: {scouting} }} }} }}
 """
 PORT = 7447

@@ -120,6 +120,7 @@ class ArenaUp:
         words = [*connect, "--host", options.host, "--port", str(options.port)]
         words += ["--tokens", str(tokens)] if tokens else []
         words += ["--rig", str(self._folder.rig), "--wand", str(self._folder.wand)]
+        words += ["--folder", str(self._folder.path / "recordings")]
         PageAccess.create(options.host, options.port, tokens)  # writes the tokens before the page reads them
         supervisor.start("page", "web", words)
 

@@ -31,15 +31,14 @@ class CameraDrawing:
         self._scene, self._root, self._colour = scene, root, colour
         self._rig: Rig | None = None
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
-        self._labels: list[viser.LabelHandle] = []
 
     def draw(self, rig: Rig | None) -> None:
         """Draw the placed cameras of a rig; None removes them."""
         if rig is self._rig:
             return
-        for handle in (*self._frustums.values(), *self._labels):
-            handle.remove()
-        self._rig, self._frustums, self._labels = rig, {}, []
+        for frustum in self._frustums.values():
+            frustum.remove()  # with its label
+        self._rig, self._frustums = rig, {}
         for name, camera in (rig.placed() if rig else {}).items():
             self._add(name, camera)
 
@@ -61,14 +60,13 @@ class CameraDrawing:
             wxyz=wxyz_from_rotation(T[:3, :3]),
             position=T[:3, 3],
         )
-        label = self._scene.add_label(
+        self._scene.add_label(
             f"{self._root}/{name}/name",
             name,
             position=(0.0, -LABEL_ABOVE_M, 0.0),
             anchor="bottom-center",
             font_screen_scale=LABEL_SCALE,
         )
-        self._labels.append(label)
 
 
 def show_jpeg(handle: Any, jpeg: bytes | None) -> None:

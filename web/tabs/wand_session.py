@@ -15,16 +15,18 @@ from calib.live.camera_sizes import running_camera_sizes
 from calib.live.rig_requests import set_rig
 from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
-from calib.rig.rig import load_rig
+from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
 from camera_node.geometry.body import Body
+from web.colours import PREVIEW
 from web.condition import next_step
 from web.errors import WebError
 from web.feed import ArenaState
 from web.html_tables import Column, HtmlTable, TableRow
+from web.scene.cameras import CameraDrawing
 from web.subscription import Subscription
-from web.widgets import GREY, PRIMARY, Answer, set_content, set_property
+from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
 SOLVE_S = 600.0  # limit for `calib wand`
 CLOSE_S = 5.0  # for the recording to be saved when the page closes
@@ -43,6 +45,11 @@ class CalibrationFiles:
 
     rig: Path
     wand: Path
+
+    @property
+    def candidate(self) -> Path:
+        """The rig that is calibrated but not accepted yet, beside the rig."""
+        return self.rig.with_name(f"{self.rig.stem}.candidate.yaml")
 
     def check(self) -> None:
         """Raise ConfigError or CalibrationError if a file is missing or invalid."""
@@ -63,16 +70,24 @@ class WandSessionPanel:
         with server.gui.add_folder("Wand"):
             self._button = server.gui.add_button(START, color=GREY)
             self._answer = Answer(server.gui)
+            self._accept = ActionButton(server.gui, "Accept the calibration", self.accept, self._answer)
+            self._discard = ActionButton(server.gui, "Discard it", self.discard, self._answer)
             self._cameras = server.gui.add_html("")
+        self._candidate: Rig | None = None
+        self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
         self._button.on_click(lambda _: self.toggle())
 
     def update(self, state: ArenaState) -> None:
         """Enable the button while cameras send, and colour it while it is the next step."""
         step = next_step(state)
         is_running = self._thread is not None and self._thread.is_alive()
-        set_property(self._button, "color", PRIMARY if step == "calibrate" or is_running else GREY)
+        is_next = step == "calibrate" and self._candidate is None
+        set_property(self._button, "color", PRIMARY if is_running or is_next else GREY)
         if not is_running:
             set_property(self._button, "disabled", step == "cameras")
+        is_ready = self._candidate is not None and not is_running
+        self._accept.show(enabled=is_ready, primary=is_ready)
+        self._discard.show(enabled=is_ready)
 
     def toggle(self) -> None:
         """Start a wand session, or end the current one."""
@@ -81,9 +96,39 @@ class WandSessionPanel:
                 self._end_requested.set()
                 return
             self._end_requested.clear()
+            self._forget()
             self._button.label = END
             self._thread = threading.Thread(target=self._run, name="wand session", daemon=True)
             self._thread.start()
+
+    def accept(self) -> str:
+        """Write the calibrated rig and have the server use it; returns the outcome.
+
+        Raises:
+            WebError: there is none.
+            CalibrationError, ConfigError: the file can't be written.
+        """
+        candidate = self._candidate
+        if candidate is None:
+            raise WebError("there is no calibration to accept; record a wand first")
+        save_rig(candidate, self._files.rig)
+        self._forget()
+        outcome = describe_calibration(candidate.calibration)
+        try:
+            set_rig(self._subscription.session, self._subscription.feed.keys.arena, candidate, "web")
+        except RoundelError as error:
+            return f"{outcome}; {self._files.rig} is written, but not in force: {error}"
+        return f"{outcome}; in force on the server"
+
+    def discard(self) -> str:
+        """Forget the calibrated rig; the recording stays."""
+        self._forget()
+        return f"discarded; the recording is {wand_recording_path(self._files.rig)}"
+
+    def _forget(self) -> None:
+        self._candidate = None
+        self._preview.draw(None)
+        self._files.candidate.unlink(missing_ok=True)
 
     def close(self) -> None:
         """End the session and save its recording, without calibrating."""
@@ -102,6 +147,8 @@ class WandSessionPanel:
             self._answer_with(f"the calibration failed: {error!r}")
         finally:
             self._button.label, self._button.disabled = START, False
+            if self._candidate is None:  # the session failed: the trials' poses in the scene are void
+                self._preview.draw(None)
 
     def _calibrate(self) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
@@ -116,31 +163,34 @@ class WandSessionPanel:
             return ""
         self._answer_with(f"wand session ended: {reason}; calibrating")
         calibrate_cameras(recording, files)
-        rig = load_rig(files.rig)
-        outcome = describe_calibration(rig.calibration)
-        try:
-            set_rig(session, arena, rig, "web")
-        except RoundelError as error:
-            return f"{outcome}; {files.rig} is written, but not in force: {error}"
-        return f"{outcome}; in force on the server"
+        self._candidate = load_rig(files.candidate)
+        self._preview.draw(self._candidate)
+        return (
+            f"{describe_calibration(self._candidate.calibration)}; the new poses are yellow in the scene: accept or "
+            "discard them"
+        )
 
     def _show(self, progress: SessionProgress) -> None:
         rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]
         table = HtmlTable(WAND_COLUMNS, rows, "no roundel yet")
         set_content(self._cameras, table.html())
         self._answer_with(f"{progress.summary}: {progress.advice}")
+        if progress.trial is not None and progress.trial.rig is not None:
+            self._preview.draw(progress.trial.rig)
 
     def _answer_with(self, text: str) -> None:
         self._answer.show(text)
 
 
 def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
-    """Run `calib wand` on a recording, in its own process because GTSAM holds the GIL; it writes the rig file.
+    """Run `calib wand` on a recording, in its own process because GTSAM holds the GIL; it writes the
+    candidate file.
 
     Raises:
         WebError: it failed, with its error message.
     """
-    options = ["--recording", recording, "--wand", files.wand, "--rig", files.rig, "--out", files.rig]
+    files.candidate.unlink(missing_ok=True)  # of a session without a decision
+    options = ["--recording", recording, "--wand", files.wand, "--rig", files.rig, "--out", files.candidate]
     command = [sys.executable, "-m", "calib", "wand", *map(str, options)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SOLVE_S, check=False)

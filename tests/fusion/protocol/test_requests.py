@@ -166,3 +166,17 @@ def test_changed_robots_are_used_after_a_restart(tmp_path):
     os.utime(settings.robots, ns=(later, later))
     with serving(settings) as (server, _):
         assert set(server.pipeline.robots) == {"a"}
+
+
+def test_one_file_of_robots_for_the_user_and_the_server(tmp_path):
+    """As in the folder of `roundel up`: it may be missing, the server writes it, and an editor may change it."""
+    path = tmp_path / "one.yaml"
+    settings = msgspec.structs.replace(config(tmp_path), robots=str(path), saved_robots=str(path))
+    request = encode(RobotsRequest(define={"wide": WIDE}))
+    with serving(settings) as (server, client):
+        assert not server.pipeline.robots
+        reply = robots_of(request_reply(client, set_robots_key("test"), request)[0])
+        assert (set(reply.robots), reply.unsaved) == ({"wide"}, ())
+    path.write_text(path.read_text().replace("wide:", "edited:"))
+    with serving(settings) as (server, _):
+        assert set(server.pipeline.robots) == {"edited"}

@@ -21,7 +21,7 @@ from fusion.protocol.messages import Robots
 from fusion.recordings.record import read_recording
 from fusion.recordings.run import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
-from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
+from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
 
@@ -59,6 +59,17 @@ def test_a_replay_repeats_the_poses(tmp_path):
     replay(tmp_path / "in.mcap", out=tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
         assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in expected]
+
+
+@pytest.mark.parametrize("is_link", [False, True])
+def test_a_replay_does_not_overwrite_its_recording(tmp_path, is_link: bool):
+    write(tmp_path / "in.mcap", MOVING, 3)
+    content, out = (tmp_path / "in.mcap").read_bytes(), tmp_path / ("link.mcap" if is_link else "in.mcap")
+    if is_link:
+        out.symlink_to(tmp_path / "in.mcap")
+    with pytest.raises(ConfigError, match="is the recording itself"):
+        replay(tmp_path / "in.mcap", out=out)
+    assert (tmp_path / "in.mcap").read_bytes() == content
 
 
 def test_a_truncated_recording_is_read_up_to_its_end(tmp_path):
@@ -101,6 +112,43 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert recording.rig.cameras == ARENA.cameras
     assert recording.robots == server.pipeline.robots
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
+
+
+def test_a_recording_rotates_by_time_in_a_fresh_process(tmp_path):
+    """Every file holds the rig and the robots, so it replays by itself; together they hold all seconds."""
+    with serving(config(tmp_path)) as (server, client):
+        done = threading.Event()
+
+        def publish() -> None:
+            while not done.is_set():
+                send(server, live(ARENA.messages(3)))
+                client.status(60.0).next()
+
+        sender = threading.Thread(target=publish)
+        sender.start()
+        try:
+            words = (
+                "--rotate-minutes",
+                "0.03",
+                "--seconds",
+                "6",
+                "--arena",
+                "test",
+                "--connect",
+                *server.endpoints,
+            )
+            recorded = run_program("fusion", "record", str(tmp_path / "live.mcap"), *words)
+        finally:
+            done.set()
+            sender.join(60.0)
+    assert recorded.returncode == 0, recorded.stderr
+    files = sorted(tmp_path.glob("live-*.mcap"))
+    assert 3 <= len(files) <= 5
+    for file in files[1:-1]:
+        recording = read_recording(file)
+        assert recording.rig is not None
+        assert recording.rig.cameras == ARENA.cameras
+        assert recording.robots == ARENA.robots
 
 
 def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[TrackingResult]:

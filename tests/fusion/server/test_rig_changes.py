@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A rig reaches the running server from a fresh process, or the command says why not and exits with 2."""
 
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import pytest
+import zenoh
 
 from calib.rig.rig import Rig, load_rig, save_rig
+from camera_node.config import dump_yaml
+from camera_node.protocol.messages import Detections, encode
+from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.server.config import ArenaConfig
-from tests.fusion.serving import ARENA, DEADLINE_S, config, run_program, serving_process
+from tests.calib.synthetic import assert_near, record, ring
+from tests.conftest import free_port
+from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, run_program, serving_process
 
 OTHER = Rig(
     cameras={
@@ -45,20 +55,88 @@ def survey(folder: Path) -> Path:
     return folder / "positions.csv"
 
 
-@pytest.mark.parametrize("command", ["undo", "world"])
+@contextmanager
+def waving(endpoint: str, messages: list[Detections]) -> Iterator[None]:
+    """Cameras that publish a wand recording as soon as a program records the wand."""
+    recording = threading.Event()
+    with open_client([endpoint]) as session:
+        token = session.liveliness().declare_subscriber(
+            KEYS.wand, lambda sample: recording.set(), history=True
+        )
+
+        def publish() -> None:
+            if recording.wait(DEADLINE_S):
+                for message in messages:
+                    block = zenoh.CongestionControl.BLOCK  # nothing may be dropped at this rate
+                    session.put(KEYS.detections(message.camera), encode(message), congestion_control=block)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            yield
+        finally:
+            recording.set()
+            thread.join(DEADLINE_S)
+            token.undeclare()
+
+
+def require_in_force(endpoint: str, file: Path, done: subprocess.CompletedProcess[str]) -> None:
+    """The command succeeded, and the server answers with the rig in its file."""
+    assert done.returncode == 0, done.stderr
+    changed = load_rig(file)
+    assert changed.cameras != ARENA.cameras
+    assert rig_of(endpoint).cameras == changed.cameras
+    assert f"in force on the server at {endpoint}, arena 'test'" in done.stdout
+
+
+@pytest.mark.parametrize("command", ["undo", "redo", "world", "apply"])
 def test_a_command_in_a_fresh_process_changes_the_rig_of_the_server(tmp_path: Path, command: str):
     settings, file = saving(tmp_path), tmp_path / "mine.yaml"
-    save_rig(OTHER, file)
-    save_rig(Rig(cameras=ARENA.cameras), file)
-    words = {
-        "undo": ("undo", "--rig", str(file)),
-        "world": ("world", "--rig", str(file), "--out", str(file), "--positions", str(survey(tmp_path))),
-    }[command]
+    first, second = (
+        (OTHER, Rig(cameras=ARENA.cameras))
+        if command in ("undo", "world")
+        else (Rig(cameras=ARENA.cameras), OTHER)
+    )
+    save_rig(first, file)
+    save_rig(second, file)
+    if command == "redo":
+        assert run_program("calib", "undo", "--rig", str(file)).returncode == 0
+    words = [command, "--rig", str(file)]
+    words += ["--out", str(file), "--positions", str(survey(tmp_path))] if command == "world" else []
     with serving_process(settings) as (endpoint, _):
         assert rig_of(endpoint).cameras == ARENA.cameras
-        done = run_program("calib", *words, *to_server(endpoint))
-        assert done.returncode == 0, done.stderr
-        changed = load_rig(file)
-        assert changed.cameras != ARENA.cameras
-        assert rig_of(endpoint).cameras == changed.cameras
-        assert f"in force on the server at {endpoint}, arena 'test'" in done.stdout
+        server = to_server(endpoint)[command == "apply" :]  # it has no --live
+        require_in_force(endpoint, file, run_program("calib", *words, *server))
+
+
+def test_a_wand_calibration_in_a_fresh_process_is_in_force_on_the_server(tmp_path: Path):
+    arena, file = ring(3), tmp_path / "new.yaml"
+    save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
+    (tmp_path / "wand.yaml").write_text(dump_yaml(arena.wand))
+    files = ("--wand", tmp_path / "wand.yaml", "--rig", tmp_path / "lenses.yaml", "--out", file)
+    with serving_process(saving(tmp_path)) as (endpoint, _), waving(endpoint, record(arena, 10.0)):
+        done = run_program("calib", "wand", *map(str, files), "--seconds", "6", *to_server(endpoint))
+        require_in_force(endpoint, file, done)
+    assert_near(load_rig(file), arena.truth, 0.01, 0.005)
+
+
+def test_a_rig_that_the_server_can_t_save_is_refused(tmp_path: Path):
+    """The command exits with 2 and the reason; the old rig stays in force."""
+    settings = msgspec.structs.replace(config(tmp_path), saved_rig=str(tmp_path / "missing" / "rig.yaml"))
+    save_rig(OTHER, tmp_path / "mine.yaml")
+    with serving_process(settings) as (endpoint, _):
+        done = run_program("calib", "apply", "--rig", str(tmp_path / "mine.yaml"), *to_server(endpoint)[1:])
+        assert done.returncode == 2
+        assert "is not in force; the server refuses it" in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        assert rig_of(endpoint).cameras == ARENA.cameras
+
+
+@pytest.mark.parametrize("program", ["calib", "fusion"])
+def test_without_a_server_a_command_exits_with_2_and_one_line(tmp_path: Path, program: str):
+    save_rig(OTHER, tmp_path / "mine.yaml")
+    words = {"calib": ("apply", "--rig", str(tmp_path / "mine.yaml")), "fusion": ("robots", "list")}[program]
+    done = run_program(program, *words, *to_server(f"tcp/127.0.0.1:{free_port()}")[1:])
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "no server answers" in line
