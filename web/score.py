@@ -24,6 +24,7 @@ class RobotScore:
     max_mm: float
     rotation_deg: float  # RMS; NaN for a robot of one marker, whose heading is unobservable
     gap_s: float  # longest time without a tracked pose
+    normalized: float  # mean squared position error over the claimed variance, per coordinate: 1 is due
 
     def faults(self) -> list[str]:
         """Return the limits that the robot exceeds, as text."""
@@ -47,6 +48,7 @@ class RobotErrors:
     t_ns: list[int] = field(default_factory=list)
     position_mm: list[float] = field(default_factory=list)
     rotation_deg: list[float] = field(default_factory=list)
+    normalized: list[float] = field(default_factory=list)
 
 
 class PoseScore:
@@ -82,6 +84,7 @@ class PoseScore:
         errors.t_ns.append(pose.t_ns)
         errors.position_mm.append(1e3 * float(np.linalg.norm(position - T_true[:3, 3])))
         errors.rotation_deg.append(angle_deg(R, T_true[:3, :3]))
+        errors.normalized.append(_normalized(R.T @ (position - T_true[:3, 3]), pose))
 
     def all_tracked(self) -> bool:
         """Whether each robot had at least one tracked pose."""
@@ -105,7 +108,14 @@ class PoseScore:
             max_mm=max(errors.position_mm[:count], default=float("nan")),
             rotation_deg=rms(errors.rotation_deg[:count]) if has_heading else float("nan"),
             gap_s=longest_gap_s(errors.t_ns[:count], start_ns, end_ns),
+            normalized=float(np.mean(errors.normalized[:count])) if count else float("nan"),
         )
+
+
+def _normalized(error: Array, pose: RobotPose) -> float:
+    """The squared error of the position, in the body's axes as the covariance is, over its claim, per coordinate."""
+    covariance = pose.covariance_matrix[3:6, 3:6]
+    return float(error @ np.linalg.lstsq(covariance, error, rcond=None)[0] / 3)
 
 
 def longest_gap_s(t_ns: list[int], start_ns: int, end_ns: int) -> float:
@@ -142,5 +152,6 @@ def _describe(result: RobotScore) -> str:
     rotation = "" if np.isnan(result.rotation_deg) else f"rotation {result.rotation_deg:.2f} degrees RMS; "
     return (
         f"{result.robot}: position {result.rms_mm:.2f} mm RMS, {result.max_mm:.2f} mm max; {rotation}"
-        f"tracked {100 * result.tracked:.1f} %; longest gap {result.gap_s:.2f} s"
+        f"tracked {100 * result.tracked:.1f} %; longest gap {result.gap_s:.2f} s; "
+        f"squared error over claim {result.normalized:.2f}"
     )

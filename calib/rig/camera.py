@@ -14,9 +14,9 @@ AnyLens = TypeVar("AnyLens", bound=Lens)
 
 # The parameters of one camera, by their columns in every Jacobian and covariance: rotation and translation in the
 # camera's own frame, time offset, clock drift, and of the lens: log focal length (mean of fx and fy), cx, cy, k1,
-# log fx / fy, and the three distortion coefficients after k1.
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), tuple(range(8, 16))
-PER_CAMERA = 16
+# log fx / fy, and the four distortion coefficients after k1, of which a fisheye has three.
+POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), tuple(range(8, 17))
+PER_CAMERA = 17
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -77,24 +77,30 @@ def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array,
         J_point: (N, 2, 3) by the point, in the camera's frame.
         J_pose: (N, 2, 6) by a rotation w and a translation t of the camera in its own frame, which move points in
             that frame by p x w - t.
-        J_lens: (N, 2, 8) by the parameters of the lens (`LENS`).
+        J_lens: (N, 2, 9) by the parameters of the lens (`LENS`).
         All are NaN for points that are not in front of the camera.
     """
     lens, points = with_distortion(lens), np.asarray(points, float).reshape(-1, 3)
     uv, J_point, by_lens = lens.project_with_jacobians(points)
     J_pose = np.concatenate([J_point @ skew(points), -J_point], axis=2)
     fx, fy = by_lens[:, :, :1] * lens.fx, by_lens[:, :, 1:2] * lens.fy
-    J_lens = np.concatenate([fx + fy, by_lens[:, :, 2:5], (fx - fy) / 2, by_lens[:, :, 5:8]], axis=2)
+    higher = np.zeros((len(points), 2, len(LENS) - 5))
+    present = by_lens[:, :, 5:9]
+    higher[:, :, : present.shape[2]] = present
+    J_lens = np.concatenate([fx + fy, by_lens[:, :, 2:5], (fx - fy) / 2, higher], axis=2)
     return uv, J_point, J_pose, J_lens
 
 
 def with_distortion(lens: AnyLens) -> AnyLens:
-    """The same lens with explicit distortion coefficients: four zeros where it has none."""
-    return lens if lens.distortion else lens.with_parameters([*lens.parameters, 0.0, 0.0, 0.0, 0.0])
+    """The same lens with the distortion coefficients that are adjusted, zeros where it has none: k1, k2, p1, p2, k3 of
+    a pinhole lens, k1 to k4 of a fisheye."""
+    missing = (5 if lens.model == "pinhole" else 4) - len(lens.distortion)
+    return lens.with_parameters([*lens.parameters, *[0.0] * missing]) if missing > 0 else lens
 
 
 def lens_parameters(lens: Lens) -> Array:
-    """(8,) the parameters of a lens that `LENS` numbers."""
+    """(9,) the parameters of a lens that `LENS` numbers."""
     distortion = with_distortion(lens).distortion
     focal, ratio = np.log(lens.fx * lens.fy) / 2, np.log(lens.fx / lens.fy)
-    return np.array([focal, lens.cx, lens.cy, distortion[0], ratio, *distortion[1:4]])
+    higher = (*distortion[1:5], 0.0)[:4]
+    return np.array([focal, lens.cx, lens.cy, distortion[0], ratio, *higher])

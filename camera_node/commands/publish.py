@@ -55,7 +55,7 @@ class Publish:
         """Open the source and the session, publish until the source ends or a signal arrives, and close both."""
         import cv2
 
-        from camera_node.protocol.session import open_client
+        from camera_node.protocol.session import open_when_reachable
 
         require_name(self.arena, "an arena")
         if self.name is not None:
@@ -67,12 +67,12 @@ class Publish:
                 with contextlib.ExitStack() as stack:
                     source = open_source(self.source, self.settings, self.name)
                     stack.callback(source.close)
-                    session = stack.enter_context(open_client(self.connect, self.zenoh))
+                    session = stack.enter_context(open_when_reachable(self.connect, self.zenoh))
                     keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
                     self._node(self.name, source, session, keeps_stamps).run()
                 return
             identity, first_t_ns = identify(self.source), first_time(self.source, self.settings)
-            with open_client(self.connect, self.zenoh) as session:
+            with open_when_reachable(self.connect, self.zenoh) as session:
                 self._publish_registered(session, identity, first_t_ns)
 
     def _publish_registered(

@@ -4,8 +4,11 @@
 import json
 import logging
 import re
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 
 import zenoh
@@ -22,6 +25,7 @@ SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
 OVER = b"Timeout"  # Zenoh's own error reply
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
+OPEN_TIMEOUT_MS = 2000  # of one attempt; `close` waits this long for a listener that is not Zenoh
 LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
 ALWAYS = {
     "mode": "router",
@@ -85,19 +89,57 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
 
     The session is a Zenoh router without listeners. A Zenoh client does not open while no router answers, and a router
     does not relay the publications of a Zenoh peer to other peers (measured with 1.10). Publications are dropped while
-    the session is not connected.
+    the session is not connected. Programs that can wait for a server use `open_when_reachable`.
 
     Raises:
         NetworkError: an endpoint is invalid.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
+    return _open_connecting(connect, zenoh_config, "router")
+
+
+def open_when_reachable(
+    connect: Sequence[str], zenoh_config: Path | None = None, patience_s: float = PATIENCE_S
+) -> zenoh.Session:
+    """Open a session as a Zenoh client as soon as a server answers; it reconnects after every loss.
+
+    Sessions of `open_client` are routers, and several whose links were down sometimes stay without routes for good: 5
+    of 42 (measured with 1.10). Of 140 clients none did. Logs the server's absence once after `patience_s`; a signal
+    whose handler raises ends the wait.
+
+    Raises:
+        NetworkError: an endpoint is invalid.
+        ConfigError: the Zenoh configuration is missing or invalid.
+    """
+    future: Future[zenoh.Session] = Future()
+
+    def open_session() -> None:
+        try:
+            future.set_result(_open_connecting(connect, zenoh_config, "client"))
+        except (NetworkError, ConfigError) as error:
+            future.set_exception(error)
+
+    threading.Thread(target=open_session, daemon=True, name="open Zenoh session").start()
+    with suppress(TimeoutError):
+        return future.result(patience_s)
+    log.warning(
+        "the server is away: none answers at %s; retrying. Check that it runs and that --connect is right",
+        " ".join(connect),
+    )
+    session = future.result()
+    log.warning("the server is back")
+    return session
+
+
+def _open_connecting(connect: Sequence[str], zenoh_config: Path | None, mode: str) -> zenoh.Session:
     options = {
+        "mode": mode,
         "listen/endpoints": [],
         "connect/endpoints": list(connect),
         "connect/timeout_ms": -1,  # no limit; 0 is a single attempt
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
-        "transport/unicast/open_timeout": 2000,  # `close` waits this long for a listener that is not Zenoh
+        "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
         "transport/link/tcp/so_sndbuf": SEND_BUFFER,
         "transport/link/tls/so_sndbuf": SEND_BUFFER,
         "transport/link/tx/queue/size/real_time": 1,  # batches

@@ -14,7 +14,9 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body, Vector
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import look_at, rotation_from_vector
+from camera_node.simulation.sensor import SENSORS, Sensor, SensorName
 
+CLEAN_VIGNETTING = 0.3
 WAND = "wand"  # the name of the wand among the bodies
 
 
@@ -77,7 +79,8 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
         exposure_us: exposure time.
         motion_samples: number of times within an exposure whose images are averaged; 1 gives no motion blur.
         blur_px: standard deviation of the lens's blur, pixels.
-        noise: standard deviation of a pixel's noise, grey levels of 255.
+        noise: standard deviation of a pixel's noise, grey levels of 255, of a clean sensor.
+        sensor: "clean" (a machine-vision camera), "mild" (a good webcam: tone curve, shading, JPEG) or "harsh".
     """
 
     position_m: Vector
@@ -88,6 +91,7 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
     motion_samples: int = 1
     blur_px: float = 0.7
     noise: float = 2.5
+    sensor: SensorName = "clean"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,6 +100,13 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if not (0.2 <= self.blur_px <= 5 and 0 <= self.noise <= 50 and 1 <= self.motion_samples <= 64):
             raise ValueError("blur_px must be in [0.2, 5], noise in [0, 50] and motion_samples in [1, 64]")
         look_at(self.position_m, self.look_at_m)
+
+    @property
+    def sensor_model(self) -> Sensor:
+        """What the camera does to light; a clean one has `noise`, and 70 % of the light in the corners."""
+        if self.sensor == "clean":
+            return Sensor(vignetting=CLEAN_VIGNETTING, noise=self.noise)
+        return SENSORS[self.sensor]
 
     @property
     def T_world_cam(self) -> Array:

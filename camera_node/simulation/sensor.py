@@ -65,8 +65,11 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def expose(self, light: Array, rng: np.random.Generator) -> Grey:
         """The picture (h, w), uint8, of light (h, w) in grey levels of 255; light above 255 is possible."""
         level = light * (self.gain * self.falloff(light.shape))
-        noisy = level + np.sqrt(self.variance(level)) * rng.standard_normal(level.shape)
-        image = np.clip(noisy, 0, WHITE).astype(np.float32)
+        return self.develop(level, rng.standard_normal(level.shape))
+
+    def develop(self, level: Array | Picture, noise: Array | Picture) -> Grey:
+        """The picture (h, w), uint8, of exposed grey levels (h, w), with noise (h, w) of standard deviation 1."""
+        image = np.clip(level + np.sqrt(self.variance(level)) * noise, 0, WHITE).astype(np.float32)
         if self.bayer:
             image = _through_mosaic(image)
         if self.denoise_px:
@@ -77,7 +80,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         linear = np.clip(np.rint(image), 0, WHITE).astype(np.uint8)
         return _compress(tone_curve(self.tone)[linear], self.jpeg)
 
-    def variance(self, level: Array) -> Array:
+    def variance(self, level: Array | Picture) -> Array | Picture:
         """Variance of the noise at grey levels before the tone curve."""
         return self.noise**2 + self.shot_noise * np.maximum(level, 0)
 
@@ -105,7 +108,8 @@ HARSH = Sensor(
     tone="webcam",
     jpeg=50,
 )
-SENSORS = {"clean": CLEAN, "mild": MILD, "harsh": HARSH}
+SensorName = Literal["clean", "mild", "harsh"]
+SENSORS: dict[SensorName, Sensor] = {"clean": CLEAN, "mild": MILD, "harsh": HARSH}
 
 
 def tone_curve(tone: Tone) -> Grey:

@@ -89,14 +89,20 @@ class ArenaContent:
 
     def _refresh(self, status: FusionStatus) -> None:
         if status.rig_t_ns != self._rig_t_ns:
-            rig = self._client.rig(ANSWER_S)
-            self._cameras = dict(rig.cameras) if rig else {}
-            if self._rig_t_ns is not None:
-                self._channels.add_log("the server uses another calibration", status.t_ns)
-            self._rig_t_ns = status.rig_t_ns
+            self._load_rig(status)
         self._channels.add_cameras(self._cameras, status.t_ns)
         self._channels.add_bodies(self._client.declared_robots().robots, status.t_ns)
         self._subscribe_images(self._channels.wants_images(tuple(status.cameras)))
+
+    def _load_rig(self, status: FusionStatus) -> None:
+        """Request the rig in force; a server that is busy may not answer in time, and is asked again."""
+        rig = self._client.rig(ANSWER_S)
+        if rig is None and status.rig_t_ns is not None:
+            return
+        self._cameras = dict(rig.cameras) if rig else {}
+        if self._rig_t_ns is not None:
+            self._channels.add_log("the server uses another calibration", status.t_ns)
+        self._rig_t_ns = status.rig_t_ns
 
     def _subscribe_images(self, is_wanted: bool) -> None:
         """Cameras send previews only while somebody subscribes."""

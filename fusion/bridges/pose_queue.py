@@ -22,6 +22,7 @@ log = logging.getLogger("fusion.bridge")
 
 QUEUE_SIZE = 4096  # poses; four frame sets of 1024 robots
 SILENCE_S = 5.0
+GATHER_S = 0.0005  # after the first pose: the rest of its frame set arrives, and is passed on by one wake-up
 WAIT_S = 0.2  # for poses, until a bridge looks whether it was stopped
 
 
@@ -62,6 +63,7 @@ class PoseQueue:
     def take(self, timeout_s: float = 0.0) -> list[RobotPose]:
         """All poses that wait, in order of arrival; the first one is waited for up to `timeout_s`."""
         if select.select([self._reader], [], [], timeout_s)[0]:
+            time.sleep(GATHER_S)
             with contextlib.suppress(BlockingIOError):
                 self._reader.recv(64)
             self._is_signaled = False  # before the queue is emptied: a pose that arrives now signals again

@@ -5,6 +5,7 @@ A process publishes poses as the server does. This process receives each pose tw
 The added latency is the difference of both times of arrival. Each bridge is a process of its own.
 """
 
+import contextlib
 import socket
 import statistics
 import struct
@@ -77,7 +78,7 @@ def read_vrpn(endpoint: str, arrivals: Arrivals) -> Iterator[int]:
 
 def _read_vrpn(connection: socket.socket, arrivals: Arrivals) -> None:
     names: dict[int, str] = {}
-    with connection, connection.makefile("rb") as file:
+    with contextlib.suppress(OSError), connection, connection.makefile("rb") as file:
         file.read(24)
         while header := file.read(24):
             length, seconds, microseconds, sender, kind, _ = struct.unpack(">5iI", header)
@@ -109,7 +110,7 @@ def read_foxglove(endpoint: str, arrivals: Arrivals) -> Iterator[int]:
         done = threading.Event()
 
         def run() -> None:
-            with FoxgloveClient(port) as client:
+            with FoxgloveClient(port, only="/tf") as client:
                 while not done.is_set():
                     for transform in client.next("/tf")[2].transforms:
                         stamp = transform.timestamp

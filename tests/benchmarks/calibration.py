@@ -3,7 +3,7 @@
 
 Rows are simulated recordings (`tests.calib.recordings`), and the real recordings of ../shared/data if they are beside
 the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the
-same run.
+same run. `honesty` measures whether covariances are true (`calibration_honesty`).
 """
 
 import sys
@@ -25,6 +25,7 @@ from camera_node.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations
+from tests.benchmarks.calibration_honesty import run as run_honesty
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 
@@ -239,4 +240,7 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    if sys.argv[1:2] == ["honesty"]:
+        run_honesty(sys.argv[2:])
+    else:
+        main(sys.argv[1:])

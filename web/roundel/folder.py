@@ -7,7 +7,7 @@ robots.yaml    the robots
 wand.yaml      the wand
 cameras/       name, id and settings of each camera
 recordings/    recordings
-zenoh.json5    how the server is reached over the network; the place for TLS and access rights
+zenoh.json5    how the server is found in the network
 """
 
 from dataclasses import dataclass

@@ -23,11 +23,11 @@ from camera_node.geometry.lens import Lens
 # Usual standard deviations of the parameters of a lens whose file has none, between a data sheet, or a careless
 # calibration, and the true lens: log f, the principal point (share of the longer side), k1, log fx / fy, and the
 # distortion coefficients after k1.
-FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005)
+FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005, 0.1)
 # Factors of these for a lens that the recording shows to be farther off: a file of another lens, or none.
-WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0])
+WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
 # Least standard deviations: focus, temperature or remounting change a lens by more than its calibration accounts for.
-MIN_SIGMA = np.array([5e-4, 0.3, 0.3, 5e-4, 2e-5, 2e-4, 2e-5, 2e-5])
+MIN_SIGMA = np.array([5e-4, 0.3, 0.3, 5e-4, 2e-5, 2e-4, 2e-5, 2e-5, 2e-4])
 CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
 UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
 # Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
@@ -35,19 +35,19 @@ UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
 SHARES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
 SPIKE_AND_SLAB, UNIFORM = np.where(SHARES > 0, 0.5 / (len(SHARES) - 1), 0.5), SHARES / SHARES.sum()
 MIN_SHARE = 1e-5  # of the usual deviations: practically exact
-# Of the parameters: focal length, principal point, radial distortion, ratio, other distortion.
-KINDS = np.array([0, 1, 1, 2, 3, 2, 4, 4])
+# Of the parameters: focal length, principal point, k1 and k2, ratio, p1 and p2, k3 (of a fisheye: k3 and k4, none).
+KINDS = np.array([0, 1, 1, 2, 3, 2, 4, 4, 5])
 SWEEPS = 4  # over the kinds, each conditional on the others
 
 
 def usual_sigma(lens: Lens) -> Array:
-    """(8,) usual standard deviations of the parameters (`LENS`) of a lens whose file has none."""
+    """(9,) usual standard deviations of the parameters (`LENS`) of a lens whose file has none."""
     size = max(lens.width, lens.height)
     return np.array([FOCAL, CENTRE * size, CENTRE * size, K1, RATIO, *HIGHER])
 
 
 def calibrated_sigma(lens: Lens) -> Array | None:
-    """(8,) standard deviations of the parameters (`LENS`) from the lens's file; None where it has none.
+    """(9,) standard deviations of the parameters (`LENS`) from the lens's file; None where it has none.
 
     The file does not state how fx and fy are correlated. They are nearly equal in relative terms, so the part of their
     errors that is not common, and changes fx / fy, counts as a tenth.
@@ -57,7 +57,7 @@ def calibrated_sigma(lens: Lens) -> Array | None:
     fx, fy, cx, cy, *distortion = lens.lens_sigma
     focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
     k1, *higher = distortion or [K1]
-    higher = [*higher, 0.0, 0.0, 0.0][:3]
+    higher = [*higher, 0.0, 0.0, 0.0, 0.0][:4]
     return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SIGMA)
 
 
@@ -68,12 +68,13 @@ def parameter_sigma(lens: Lens, before: tuple[float, ...] | None, sigma: Array) 
         lens: the adjusted lens.
         before: `lens_sigma` of its file, which stays for parameters that are not adjusted; these count as exact
             without it.
-        sigma: (8,) standard deviations of the adjusted parameters (`LENS`).
+        sigma: (9,) standard deviations of the adjusted parameters (`LENS`).
     """
     focal, cx, cy, k1, ratio, *higher = sigma.tolist()
     focal = float(np.hypot(focal, ratio / 2))
-    rest = (*(before or ()), *[0.0] * len(lens.parameters))[8 : len(lens.parameters)]
-    return (focal * lens.fx, focal * lens.fy, cx, cy, k1, *higher, *rest)
+    count = len(lens.parameters)
+    rest = (*(before or ()), *[0.0] * count)[9:count]
+    return (focal * lens.fx, focal * lens.fy, cx, cy, k1, *higher, *rest)[:count]
 
 
 def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
@@ -97,7 +98,7 @@ def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
 
 
 def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
-    """(8S, 8S) information of the observations alone on the S estimated lenses, and (8S,) its product with their
+    """(9S, 9S) information of the observations alone on the S estimated lenses, and (9S,) its product with their
     maximum-likelihood estimate."""
     problem = adjusted.problem
     estimated, d = list(problem.estimated_cameras()), len(problem.free)
@@ -109,8 +110,8 @@ def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
 
 
 def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
-    """(S, 8) standard deviations of the estimated lenses: from their files where the recording does not contradict
-    them, else the usual ones, or wider ones where it contradicts these too; and which (S, 8) are the usual ones, of
+    """(S, 9) standard deviations of the estimated lenses: from their files where the recording does not contradict
+    them, else the usual ones, or wider ones where it contradicts these too; and which (S, 9) are the usual ones, of
     `unknown` size."""
     lenses, size = [problem.lenses[k] for k in problem.estimated_cameras()], len(KINDS)
     sigma, unknown = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), size), bool)
@@ -135,7 +136,7 @@ def _plausible(correction: Array, covariance: Array) -> bool:
 
 
 def _shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:
-    """(S, 8) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
+    """(S, 9) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
     root of the posterior mean of its square under `prior`, one kind after the other; 1 for other lenses."""
     shares = np.ones(len(KINDS))
     for kind in np.tile(np.unique(KINDS), SWEEPS if unknown.any() else 0):

@@ -60,7 +60,7 @@ class State:
     Attributes:
         cameras: (C, 4, 4) T_world_cam.
         clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
-        lenses: (C, 8) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
+        lenses: (C, 9) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
         motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
     """
 
@@ -76,7 +76,7 @@ class State:
         return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion)
 
     def retract(self, camera_step: Array, motion_step: Array) -> "State":
-        """Add a step: (C, 16) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
+        """Add a step: (C, 17) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
@@ -93,7 +93,8 @@ class State:
         parameters = with_distortion(lens).parameters
         parameters[:2] *= np.exp([scale + ratio / 2, scale - ratio / 2])
         parameters[2:5] += change[1:4]
-        parameters[5:8] += change[5:]
+        higher = parameters[5:9]  # a fisheye has three
+        higher += change[5 : 5 + len(higher)]
         return lens.with_parameters(parameters)
 
 
@@ -108,11 +109,11 @@ class Problem:
         gap_s: longest interval between knots over which the motion prior holds.
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: stamp at which time offsets are defined.
-        lens_sigma: (C, 8) prior standard deviations of the lenses' parameters in the estimate.
+        lens_sigma: (C, 9) prior standard deviations of the lenses' parameters in the estimate.
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
         estimated: cameras that are estimated, the others are fixed; None for all.
-        covariance_lens_sigma: (C, 8) prior standard deviations for the covariance; `lens_sigma` if None.
+        covariance_lens_sigma: (C, 9) prior standard deviations for the covariance; `lens_sigma` if None.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
     """
 

@@ -28,8 +28,8 @@ class CameraPoses:
         names: of the cameras.
         cameras: (C, 4, 4) T_world_cam.
         covariance: (6C, 6C) of all poses, each in its camera's frame, rotation then translation; without `lenses`.
-        lenses: by camera, the derivative (6C, 8) of all poses by its lens (`LENS`), and the standard
-            deviations (8,) of these in the file.
+        lenses: by camera, the derivative (6C, 9) of all poses by its lens (`LENS`), and the standard
+            deviations (9,) of these in the file.
         metric: whether the scale is known; otherwise only the shape is compared.
     """
 

@@ -27,6 +27,7 @@ WRONG_CLOCK_S = (
     1.0  # offset: synchronized clocks differ by milliseconds, unsynchronized ones by more than a second
 )
 SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another camera
+OTHER_LENS = 1e-9  # probability of the difference, below which a lens is not that of its own file
 
 
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
@@ -36,7 +37,7 @@ def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
     for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
         crossed = _distance(found[a], lenses[b], cov[a, :, a]), _distance(found[b], lenses[a], cov[b, :, b])
         straight = _distance(found[a], lenses[a], cov[a, :, a]), _distance(found[b], lenses[b], cov[b, :, b])
-        if max(crossed) < SAME_LENS < min(straight):
+        if max(crossed) < min(SAME_LENS, min(straight) / 2) and _probability(min(straight)) < OTHER_LENS:
             swapped = (
                 "its detections fit the intrinsics of '{}', and vice versa; swap the two in the rig file"
             )
@@ -47,6 +48,13 @@ def _distance(found: Lens, given: Lens, cov: Array) -> float:
     """Distance of two lenses in sigmas, root mean square of the adjusted parameters."""
     off = lens_parameters(found) - lens_parameters(given)
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
+
+
+def _probability(distance: float) -> float:
+    """Probability of a distance of two lenses in sigmas, root mean square, or of a larger one."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(len(LENS), len(LENS) * distance**2))
 
 
 def check_clocks(names: Sequence[str], adjusted: Adjusted) -> None:

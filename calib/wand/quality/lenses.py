@@ -15,7 +15,7 @@ from camera_node.geometry.lens import Lens
 
 CLEAR = 2.0  # sigmas, root mean square of the parameters, above which a lens is reported as changed
 FAR = 3.0  # sigmas of a single parameter besides focal length, centre and k1, above which it is named
-HIGHER = {"pinhole": ("fx / fy", "k2", "p1", "p2"), "fisheye": ("fx / fy", "k2", "k3", "k4")}
+HIGHER = {"pinhole": ("fx / fy", "k2", "p1", "p2", "k3"), "fisheye": ("fx / fy", "k2", "k3", "k4")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class LensChange:
 
     Attributes:
         before, after: the lens.
-        sigma: (8,) standard deviations of its parameters (`LENS`) after it.
+        sigma: (9,) standard deviations of its parameters (`LENS`) after it.
         sigmas: the change in these, root mean square.
     """
 
@@ -46,9 +46,8 @@ class LensChange:
 
     def _higher(self) -> list[tuple[str, float, float, float]]:
         """The other parameters that changed clearly: name, before, after and standard deviation."""
-        columns = zip(
-            HIGHER[self.before.model], _shape(self.before), _shape(self.after), self.sigma[4:], strict=True
-        )
+        names = HIGHER[self.before.model]  # a fisheye has one parameter less
+        columns = zip(names, _shape(self.before), _shape(self.after), self.sigma[4:], strict=False)
         return [row for row in columns if abs(row[2] - row[1]) > FAR * row[3]]
 
     def as_dict(self) -> dict[str, Any]:
@@ -57,9 +56,10 @@ class LensChange:
         names = HIGHER[self.before.model]
         before = {"fx": self.before.fx, "fy": self.before.fy, "cx": self.before.cx, "cy": self.before.cy}
         sigma = {"fx": f * self.after.fx, "fy": f * self.after.fy, "cx": cx, "cy": cy, "k1": k1}
-        sigma |= dict(zip(names, higher, strict=True))
+        sigma |= dict(zip(names, higher, strict=False))
         return {
-            "before": {**before, "k1": _k1(self.before)} | dict(zip(names, _shape(self.before), strict=True)),
+            "before": {**before, "k1": _k1(self.before)}
+            | dict(zip(names, _shape(self.before), strict=False)),
             "sigma": {name: round(value, 5) for name, value in sigma.items()},
             "sigmas": round(self.sigmas, 2),
         }
@@ -96,6 +96,6 @@ def _k1(lens: Lens) -> float:
 
 
 def _shape(lens: Lens) -> list[float]:
-    """The parameters of a lens after k1: fx / fy, and three distortion coefficients."""
+    """The parameters of a lens after k1: fx / fy, and the distortion coefficients after k1."""
     log_ratio, *higher = lens_parameters(lens)[4:].tolist()
     return [float(np.exp(log_ratio)), *higher]

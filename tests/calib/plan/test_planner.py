@@ -66,7 +66,8 @@ def test_the_shipped_plan_on_the_command_line(tmp_path: Path):
     command = [sys.executable, "-m", "calib", *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-    assert "north: level roundels of 0.14 m from" in done.stdout
+    diameter_m = load_yaml(ROOT / "configs" / "plan.yaml", Plan).diameter_m
+    assert f"north: level roundels of {diameter_m:g} m from" in done.stdout
     covered = re.search(r"two cameras or more see (\d+)% of the area", done.stdout)
     assert covered is not None
     assert int(covered[1]) >= 90

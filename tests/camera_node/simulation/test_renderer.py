@@ -16,6 +16,7 @@ from camera_node.simulation.renderer import (
     vignette,
 )
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.sensor import MILD
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 from tests.conftest import ROOT
 
@@ -193,3 +194,19 @@ def test_all_cameras_see_the_same_cluttered_floor():
         levels.append(Renderer(scene, name).render(scene.wave_s + 1, 0)[v.clip(0, 479), u.clip(0, 639)])
     assert np.corrcoef(levels)[0, 1] > 0.3
     assert np.std(levels[0]) > 15
+
+
+def test_a_mild_sensor_shows_what_its_model_makes_of_the_light(tmp_path):
+    """Without noise the picture of a clean camera, at the shares of light of both, through the model.
+
+    The clean picture is rounded to 8 bits, which gamma spreads to at most two levels at these levels; JPEG moves flat
+    areas by less than three.
+    """
+    clean = Renderer(load_disc(tmp_path, {"noise": 0.0}), "cam0")
+    mild = Renderer(load_disc(tmp_path, {"sensor": "mild"}), "cam0")
+    light = clean.render(0.0) / vignette(clean.camera) * vignette(mild.camera)
+    expected = MILD.develop(light, np.zeros_like(light)).astype(float)
+    shown = np.mean([mild.render(0.0, k) for k in range(20)], axis=0)
+    assert np.median(np.abs(shown - expected)) < 2
+    assert np.abs(shown.mean() - expected.mean()) < 2
+    assert np.abs(shown - clean.render(0.0)).mean() > 20

@@ -4,6 +4,7 @@
 import base64
 import json
 import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,18 @@ class Decoder:
 
 
 class FoxgloveClient:
-    """A client of a live server that subscribes to every topic except images; a context manager."""
+    """A client of a live server; a context manager.
 
-    def __init__(self, port: int, images: bool = False) -> None:
+    Args:
+        port: of the server.
+        images: subscribe to images, too.
+        only: subscribe only to topics that start so.
+    """
+
+    def __init__(self, port: int, images: bool = False, only: str = "") -> None:
         protocol = Subprotocol("foxglove.sdk.v1")
         self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], open_timeout=DEADLINE_S)
-        self._images, self._decoder = images, Decoder()
+        self._images, self._only, self._decoder = images, only, Decoder()
         self._channels: dict[int, dict] = {}
 
     def __enter__(self) -> "FoxgloveClient":
@@ -50,7 +57,8 @@ class FoxgloveClient:
 
     def next(self, topic: str) -> tuple[str, int, Any]:
         """Topic, log time (ns) and content of the next message of a topic, or of topics that start with `topic`."""
-        while True:
+        end = time.monotonic() + DEADLINE_S
+        while time.monotonic() < end:
             received = self._socket.recv(timeout=DEADLINE_S)
             if isinstance(received, str):
                 self._advertise(json.loads(received))
@@ -59,11 +67,13 @@ class FoxgloveClient:
                 channel = self._channels[number]
                 if channel["topic"].startswith(topic):
                     return channel["topic"], t_ns, self._decoder.decode(channel["schemaName"], received[13:])
+        raise TimeoutError(f"no message on {topic}")
 
     def _advertise(self, message: dict) -> None:
         if message["op"] != "advertise":
             return
-        channels = [c for c in message["channels"] if self._images or not c["topic"].endswith("/image")]
+        offered = [c for c in message["channels"] if c["topic"].startswith(self._only)]
+        channels = [c for c in offered if self._images or not c["topic"].endswith("/image")]
         for channel in channels:
             self._channels[channel["id"]] = channel
             self._decoder.add(channel["schemaName"], base64.b64decode(channel["schema"]))

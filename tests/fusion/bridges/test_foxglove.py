@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +88,9 @@ def check_poses(client: FoxgloveClient, inbox: Inbox) -> None:
 
 
 def check_cameras(client: FoxgloveClient) -> None:
-    names = set()
+    names, end = set(), time.monotonic() + DEADLINE_S
     while len(names) < len(ARENA.cameras):
+        assert time.monotonic() < end, "no transforms of the cameras"
         topic, _, content = client.next("/cameras/")
         if topic == "/cameras/tf":
             names |= {transform.child_frame_id for transform in content.transforms}

@@ -107,7 +107,9 @@ def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_ri
 
 def test_standard_deviations_of_a_lens_are_read_and_checked():
     camera = roughly(recorded(1).intrinsics, CAREFUL, with_sigma=True).cameras["cam00"]
-    assert calibrated_sigma(camera) == pytest.approx([6e-4, 0.5, 0.5, 5e-4, 6e-5, 2e-4, 2e-5, 2e-5], rel=0.01)
+    assert calibrated_sigma(camera) == pytest.approx(
+        [6e-4, 0.5, 0.5, 5e-4, 6e-5, 2e-4, 2e-5, 2e-5, 2e-4], rel=0.01
+    )
     assert calibrated_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
     with pytest.raises(ValueError, match="lens_sigma"):
         type(camera)(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, lens_sigma=(0.1,))
