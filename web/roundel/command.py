@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 
+# Before NumPy is loaded, as in fusion.__main__: `roundel server` runs in this process.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from camera_node.command_line import parse, run_command
 from camera_node.errors import ConfigError, check_command, run
 from camera_node.logs import set_up_logging
