@@ -13,6 +13,7 @@ import tyro
 
 from camera_node.config import example_file, require_name
 from camera_node.protocol.registration import CameraAssignment, CameraRegistration
+from camera_node.service import ServiceManager
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.address import is_url
 from camera_node.sources.frame import Source, SourceSettings
@@ -24,6 +25,7 @@ from camera_node.sources.v4l2 import V4l2Source, find_device
 if typing.TYPE_CHECKING:
     import zenoh
 
+    from camera_node.detection.detector import Detector
     from camera_node.node.node import Node
 
 
@@ -55,8 +57,6 @@ class Publish:
         """Open the source and the session, publish until the source ends or a signal arrives, and close both."""
         import cv2
 
-        from camera_node.protocol.session import open_when_reachable
-
         require_name(self.arena, "an arena")
         if self.name is not None:
             require_name(self.name, "a camera")
@@ -67,13 +67,31 @@ class Publish:
                 with contextlib.ExitStack() as stack:
                     source = open_source(self.source, self.settings, self.name)
                     stack.callback(source.close)
-                    session = stack.enter_context(open_when_reachable(self.connect, self.zenoh))
+                    self._detector()  # its settings may be invalid
+                    session = stack.enter_context(self._open_session())
                     keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
                     self._node(self.name, source, session, keeps_stamps).run()
                 return
             identity, first_t_ns = identify(self.source), first_time(self.source, self.settings)
-            with open_when_reachable(self.connect, self.zenoh) as session:
+            self._detector()
+            with self._open_session() as session:
                 self._publish_registered(session, identity, first_t_ns)
+
+    def _open_session(self) -> "zenoh.Session":
+        """Wait for the server; the service is ready while it waits."""
+        from camera_node.protocol.session import open_when_reachable
+
+        with contextlib.ExitStack() as stack:
+            service = stack.enter_context(ServiceManager())
+
+            def report() -> None:
+                service.ready()
+                service.report("waits for a server")
+                service.progress()
+
+            session = open_when_reachable(self.connect, self.zenoh, report)
+            stack.pop_all()  # the service goes on
+            return session
 
     def _publish_registered(
         self, session: "zenoh.Session", identity: SourceIdentity, first_t_ns: int | None
@@ -102,11 +120,14 @@ class Publish:
                     assignment = registered.run(node, assignment)
 
     def _node(self, name: str, source: Source, session: "zenoh.Session", keep_stamps: bool) -> "Node":
-        from camera_node.detection.detector import Detector
         from camera_node.node.node import Node
 
-        detector = Detector(detector=self.detector, inner_ratios=self.inner_ratios)
-        return Node(name, source, detector, session, self.arena, keep_stamps)
+        return Node(name, source, self._detector(), session, self.arena, keep_stamps)
+
+    def _detector(self) -> "Detector":
+        from camera_node.detection.detector import Detector
+
+        return Detector(detector=self.detector, inner_ratios=self.inner_ratios)
 
 
 def open_source(

@@ -6,9 +6,8 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from pathlib import Path
 
 import zenoh
@@ -19,6 +18,7 @@ log = logging.getLogger("camera_node.network")
 
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 CONNECT_S = 5.0  # for a server to accept a requester
+WAIT_S = 0.2  # between two looks at whether a session is open
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
@@ -99,13 +99,18 @@ def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zen
 
 
 def open_when_reachable(
-    connect: Sequence[str], zenoh_config: Path | None = None, patience_s: float = PATIENCE_S
+    connect: Sequence[str], zenoh_config: Path | None = None, on_wait: Callable[[], object] = lambda: None
 ) -> zenoh.Session:
     """Open a session as a Zenoh client as soon as a server answers; it reconnects after every loss.
 
     Sessions of `open_client` are routers, and several whose links were down sometimes stay without routes for good: 5
-    of 42 (measured with 1.10). Of 140 clients none did. Logs the server's absence once after `patience_s`; a signal
-    whose handler raises ends the wait.
+    of 42 (measured with 1.10). Of 140 clients none did. Logs the server's absence once; a signal whose handler raises
+    ends the wait.
+
+    Args:
+        connect: endpoints of the server.
+        zenoh_config: a file.
+        on_wait: called again and again during the wait.
 
     Raises:
         NetworkError: an endpoint is invalid.
@@ -120,14 +125,18 @@ def open_when_reachable(
             future.set_exception(error)
 
     threading.Thread(target=open_session, daemon=True, name="open Zenoh session").start()
-    with suppress(TimeoutError):
-        return future.result(patience_s)
-    log.warning(
-        "the server is away: none answers at %s; retrying. Check that it runs and that --connect is right",
-        " ".join(connect),
-    )
+    since_s, reported = time.monotonic(), False
+    while not wait([future], WAIT_S).done:
+        on_wait()
+        if not reported and time.monotonic() - since_s >= PATIENCE_S:
+            reported = True
+            log.warning(
+                "the server is away: none answers at %s; retrying. Check that it runs and that --connect is right",
+                " ".join(connect),
+            )
     session = future.result()
-    log.warning("the server is back")
+    if reported:
+        log.warning("the server is back")
     return session
 
 

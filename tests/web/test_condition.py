@@ -27,8 +27,9 @@ def healthy(arena: LiveArena, feed: Feed) -> ArenaState:
     wait_for(
         lambda: (s := feed.state()).rig and s.server_alive and s.poses and s.status and len(s.cameras) == 4
     )
+    state = feed.state()
     token.undeclare()
-    return feed.state()
+    return state
 
 
 def with_silent(state: ArenaState, camera: str, seconds: float) -> ArenaState:
