@@ -200,7 +200,11 @@ class RecordingList:
 
     @property
     def _path(self) -> Path:
-        return self._folder / str(self._selected.value)
+        """The selected recording; a browser may send any text, and only recordings of the folder are used."""
+        name = str(self._selected.value)
+        if name not in self._selected.options or name == NO_RECORDING:
+            raise ConfigError("no recording of this name is in the folder; select one of the list")
+        return self._folder / name
 
 
 def tabulate_recordings(found: list[RecordingSummary]) -> HtmlTable:
