@@ -40,7 +40,7 @@ class Options:
         rig: The arena's rig.yaml with at least the intrinsics; adds a button that calibrates with a wand.
         wand: The wand for that button.
         folder: Where the page saves recordings and robots, and lists recordings.
-        replay: Show a recording (MCAP, from python -m fusion record) instead of a running arena.
+        replay: Show a recording (MCAP, from roundel record) instead of a running arena.
         scene: The demo's scene, with arena.yaml, robots.yaml and wand.yaml beside it; by default the one in configs.
         listen: Zenoh endpoint of the demo's server; by default tcp/127.0.0.1:7447, or a free port if that is taken.
     """

@@ -60,7 +60,7 @@ def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
         yield Condition("wait", "connected; waiting for the server's first status")
     elif state.status is None:
         yield Condition(
-            "bad", f"no server at {endpoint}: start python -m fusion, and check --connect and --arena"
+            "bad", f"no server at {endpoint}: start roundel server, and check --connect and --arena"
         )
     else:
         yield Condition("bad", f"the server is silent for {age_s:.0f} s: check that it runs at {endpoint}")
@@ -73,7 +73,7 @@ def _camera_faults(state: ArenaState) -> Iterator[Condition]:
     for name, seconds in silent.items():
         yield Condition("bad", f"camera {name} {describe_silence(seconds)}")
     if not state.cameras:
-        yield Condition("warn", "no camera sends anything: start one with python -m camera_node")
+        yield Condition("warn", "no camera sends anything: start one with roundel camera")
         return
     if state.rig is None or not state.rig.placed():
         yield Condition("warn", "the cameras are not calibrated: open Calibrate and record a wand")

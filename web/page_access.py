@@ -173,7 +173,7 @@ class PageAccess:
         role = self.tokens.role(_token_of(request) or self._cookie(request))
         if role is None:
             raise Refusal(
-                HTTPStatus.UNAUTHORIZED, "open the address with the token that python -m web printed"
+                HTTPStatus.UNAUTHORIZED, "open the address with the token that roundel view printed"
             )
         return role
 

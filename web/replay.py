@@ -47,9 +47,7 @@ class RecordingPlayer:
                 if key == f"{found[1]}/rig":
                     self._rigs.append((t_ns, key, data))
         if not arenas:
-            raise ConfigError(
-                f"{path} has no messages of an arena; record it with python -m fusion record {path}"
-            )
+            raise ConfigError(f"{path} has no messages of an arena; record it with roundel record {path}")
         self.arena = arenas.most_common(1)[0][0]
         self._start_ns = times[0]
         self.start_s = times[0] / 1e9

@@ -103,7 +103,7 @@ def tabulate_cameras(state: ArenaState) -> HtmlTable:
     """
     server = state.status.message.cameras if state.status else {}
     rows = [_camera_row(state, name, server.get(name)) for name in sorted({*state.cameras, *server})]
-    return HtmlTable(CAMERA_COLUMNS, rows, "no camera yet; start one with python -m camera_node")
+    return HtmlTable(CAMERA_COLUMNS, rows, "no camera yet; start one with roundel camera")
 
 
 def _camera_row(state: ArenaState, name: str, health: CameraHealth | None) -> TableRow:

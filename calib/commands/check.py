@@ -89,7 +89,7 @@ def _compare_with_rig(rig: Rig, result: WandCalibration) -> Agreement | None:
         return None
     agreement = compare_calibrations(known, CameraPoses.of_calibration(result))
     sentence = agreement.sentence("the rig and the recording")
-    advice = "wave the wand again and run python -m calib wand"
+    advice = "wave the wand again and run roundel calibrate wand"
     say(sentence if agreement.holds else f"warning: {sentence}; {advice}")
     return agreement
 

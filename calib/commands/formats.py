@@ -86,8 +86,8 @@ class ImportData(_Conversion):
         say(f"wrote {path}: {len(points)} points, {markers} markers, {cameras} cameras, {frames} frames")
         clock = "--synchronised --fps RATE" if points.t_s is None else ""
         say(
-            f"next: python -m calib wand --rig {self.out / 'rig.yaml'} --observations {path} {clock} --wand WAND.yaml "
-            "--out CALIBRATED.yaml"
+            f"next: roundel calibrate wand --rig {self.out / 'rig.yaml'} --observations {path} {clock} "
+            "--wand WAND.yaml --out CALIBRATED.yaml"
         )
 
 

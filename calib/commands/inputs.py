@@ -35,7 +35,7 @@ class WandOptions:
     fps: float | None = None
     """Frames a second, for a CSV with numbers of frames."""
     recording: Path | None = None
-    """Or read a recording (MCAP) of calib wand --live or of python -m fusion record."""
+    """Or read a recording (MCAP) of calib wand --live or of roundel record."""
     distance: tuple[str, str, float] | None = None
     """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
     distance_sigma: float = SIGMA_M
@@ -117,7 +117,7 @@ def _check_folders(folder: Path, rig: Rig) -> None:
     if unknown := [name for name in names if name not in rig.cameras]:
         raise CalibrationError(
             f"camera '{unknown[0]}' of {folder} is not in the rig, which has {', '.join(sorted(rig.cameras))}; rename "
-            f"the folder, or run python -m calib intrinsics --camera {unknown[0]}"
+            f"the folder, or run roundel calibrate intrinsics --camera {unknown[0]}"
         )
     if len(names) == 1:
         raise CalibrationError(f"{folder} holds one camera, '{names[0]}'; triangulation needs two or more")

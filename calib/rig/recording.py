@@ -163,5 +163,5 @@ def read_detections(path: Path) -> list[Detections]:
         except MessageError:
             continue
     if not messages:
-        raise ConfigError(f"{path} holds no detections; record with python -m fusion record {path}")
+        raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return messages

@@ -43,7 +43,7 @@ class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """
         placed = self.placed()
         if not placed:
-            raise CalibrationError(f"no camera in {path} has a pose; run python -m calib wand --rig {path}")
+            raise CalibrationError(f"no camera in {path} has a pose; run roundel calibrate wand --rig {path}")
         return placed
 
 
@@ -63,11 +63,11 @@ def load_rig(path: Path) -> Rig:
         if missing := [key for key in INTRINSICS if key not in entry]:
             raise CalibrationError(
                 f"camera '{name}' in {path} has no intrinsics ({', '.join(missing)} missing); "
-                f"run python -m calib intrinsics --camera {name}"
+                f"run roundel calibrate intrinsics --camera {name}"
             )
     rig = _read(path, Rig)
     if not rig.cameras:
-        raise ConfigError(f"{path} names no camera; run python -m calib intrinsics")
+        raise ConfigError(f"{path} names no camera; run roundel calibrate intrinsics")
     return rig
 
 

@@ -77,7 +77,7 @@ def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
     if unknown := sorted(set(sizes) - set(rig.cameras)):
         raise CalibrationError(
             f"camera '{unknown[0]}' of the recording is not in the rig, which has "
-            f"{', '.join(sorted(rig.cameras))}; run python -m calib intrinsics --camera {unknown[0]}"
+            f"{', '.join(sorted(rig.cameras))}; run roundel calibrate intrinsics --camera {unknown[0]}"
         )
     if len(sizes) < 2:
         only = f"one camera, '{next(iter(sizes))}'" if sizes else "no camera"

@@ -90,7 +90,7 @@ def _label(
     """Label the detections of the camera and of all placed cameras."""
     if name not in rig.cameras:
         raise CalibrationError(
-            f"camera '{name}' is not in the rig; run python -m calib intrinsics --camera {name}"
+            f"camera '{name}' is not in the rig; run roundel calibrate intrinsics --camera {name}"
         )
     used = set(rig.placed()) | {name}
     messages = [message for message in messages if message.camera in used]

@@ -98,7 +98,7 @@ def send_request(
             raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
         time.sleep(min(RETRY_S, left))  # a session that was just opened knows no queryable yet
     raise NetworkError(
-        f"no server answers on {key} within {timeout_s:g} s; check that python -m fusion runs there, and check "
+        f"no server answers on {key} within {timeout_s:g} s; check that roundel server runs there, and check "
         "--connect and --arena"
     )
 

@@ -184,7 +184,7 @@ def open_requester(
         return zenoh.open(_config(zenoh_config, options))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"no server answers at {' '.join(connect)} within {timeout_s:g} s; check that python -m fusion runs there, "
+            f"no server answers at {' '.join(connect)} within {timeout_s:g} s; check that roundel server runs there, "
             f"and check --connect ({_brief(error)})"
         ) from None
 
@@ -258,7 +258,7 @@ class ServerWatch:
             self._reported = True
             log.warning(
                 "the server is away; detections are dropped until it returns; retrying. "
-                "Check that python -m fusion runs and that --connect and --arena are right (no %s)",
+                "Check that roundel server runs and that --connect and --arena are right (no %s)",
                 self._key,
             )
 

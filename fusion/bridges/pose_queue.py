@@ -79,7 +79,7 @@ class PoseQueue:
             self._received_s, self._is_silent = now_s, False
         elif not self._is_silent and now_s - self._received_s >= SILENCE_S:
             self._is_silent = True
-            message = "no pose %s within %g s; is python -m fusion running there?"
+            message = "no pose %s within %g s; is roundel server running there?"
             log.warning(message, self.client.origin, SILENCE_S)
 
     def _put(self, pose: RobotPose) -> None:

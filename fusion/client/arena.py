@@ -126,7 +126,7 @@ class Stream(Generic[T]):
 
     def _cause(self) -> str:
         """The likely cause of silence, with what to do."""
-        return "is roundel server, or python -m fusion, running there?"
+        return "is roundel server running there?"
 
     def _put(self, message: T) -> None:
         with self._changed:
@@ -323,9 +323,7 @@ class Arena:
             if is_reached:
                 return None
             time.sleep(min(RETRY_S, left))
-        raise NetworkError(
-            f"no rig {self._origin} within {timeout_s:g} s; is python -m fusion running there?"
-        )
+        raise NetworkError(f"no rig {self._origin} within {timeout_s:g} s; is roundel server running there?")
 
     def _read_rig(self, data: bytes) -> Rig | None:
         try:

@@ -23,7 +23,7 @@ from fusion.diagnosis.machine import (
 )
 from fusion.server.config import ArenaConfig, load_arena
 
-START = "start it with python -m fusion --config arena.yaml, or give its address with --connect"
+START = "start it with roundel server --config arena.yaml, or give its address with --connect"
 
 
 def doctor(

@@ -20,7 +20,7 @@ MAX_CAMERAS = 256
 MAX_CLOCK_ERROR_MS = 1.0  # a robot at 1 m/s moves 1 mm in this time
 REMEDIES = {
     "sends no frames": "check its program: journalctl -u roundel-camera@NAME",
-    "is not calibrated": "calibrate it: python -m calib wand --live --only NAME",
+    "is not calibrated": "calibrate it: roundel calibrate wand --live --only NAME",
     "was moved and is excluded": "drive a robot through its view, or calibrate it again",
     "two nodes use its name": "give each node a --name of its own",
 }
@@ -62,11 +62,7 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
         yield _check_clock(name, camera)
     yield check_rig(observation.rig, now)
     for name, state in status.robots.items():
-        remedy = (
-            ""
-            if state == "tracked"
-            else "check that cameras see it, and its markers: python -m fusion define"
-        )
+        remedy = "" if state == "tracked" else "check that cameras see it, and its markers: roundel define"
         yield Finding("warning" if remedy else "ok", f"robot {name}", state, remedy)
     for name, residual in status.geometry_residuals_px.items():
         yield Finding(
@@ -79,9 +75,7 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
 
 def _check_cameras(status: FusionStatus) -> Iterator[Finding]:
     if not status.cameras:
-        yield Finding(
-            "error", "cameras", "none sends frames", "start python -m camera_node on their machines"
-        )
+        yield Finding("error", "cameras", "none sends frames", "start roundel camera on their machines")
     for name, health in sorted(status.cameras.items()):
         problems = camera_problems(health)
         for problem in problems:

@@ -107,7 +107,7 @@ def describe_calibration(calibration: Calibration) -> str:
 def calibration_problems(calibration: Calibration) -> list[str]:
     """What needs attention at the calibration."""
     if not calibration.placed:
-        return ["no camera has a pose; run python -m calib wand --live"]
+        return ["no camera has a pose; run roundel calibrate wand --live"]
     problems = []
     if calibration.grade and calibration.grade in POOR_GRADES:
         problems.append(f"the calibration has grade {calibration.grade}; repeat it as its report advises")

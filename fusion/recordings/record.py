@@ -79,7 +79,7 @@ def read_recording(path: Path) -> ArenaRecording:
     for key, data, received_ns in read_messages(path, recording.faults):
         recording.add(key, data, received_ns)
     if not recording.detections:
-        raise ConfigError(f"{path} holds no detections; record with python -m fusion record {path}")
+        raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return recording
 
 

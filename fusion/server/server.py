@@ -81,7 +81,7 @@ class Server:
         verb = "listens on" if self.shard.leads else f"connects its shard {self.config.shard} to"
         log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.endpoints))
         if self.pipeline.tracker is None:
-            log.warning("no camera has a pose yet; calibrate with python -m calib wand --live, see --help")
+            log.warning("no camera has a pose yet; calibrate with roundel calibrate wand --live, see --help")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -195,9 +195,7 @@ class Server:
         self.pipeline.correct_rig(correction, self.clock.now_ns())
         if self.pipeline.active_rig.message is not None:
             self._publisher.publish_rig(self.pipeline.active_rig.message)
-        log.warning(
-            "camera %s is recalibrated and used again; python -m fusion undo reverts that", correction.name
-        )
+        log.warning("camera %s is recalibrated and used again; roundel undo reverts that", correction.name)
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""

@@ -144,7 +144,7 @@ def test_an_invalid_recording_is_an_error(tmp_path: Path):
         RecordingPlayer(tmp_path / "text.mcap")
     with RecordingWriter(tmp_path / "other.mcap") as writer:
         writer.put("weather", b"rain", START_NS)
-    with pytest.raises(ConfigError, match=r"other\.mcap.*python -m fusion record"):
+    with pytest.raises(ConfigError, match=r"other\.mcap.*roundel record"):
         RecordingPlayer(tmp_path / "other.mcap")
 
 

@@ -89,7 +89,7 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: Wand
         reason = (
             f"only {fitting[k]} of its {total[k]} detections fit those of the other cameras: if it has few, wave the "
             "wand in front of it; else check that its name and its intrinsics are its own and that it did not move; "
-            f"run python -m calib intrinsics --camera {names[k]}, or leave it out"
+            f"run roundel calibrate intrinsics --camera {names[k]}, or leave it out"
         )
         raise CameraFault({names[k]: reason}, certain=False)
 

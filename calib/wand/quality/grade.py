@@ -219,7 +219,7 @@ def _describe(criterion: str, value: float) -> str:
 
 
 def _advise_lens(subject: str, name: str) -> str:
-    return f"{subject} too uncertain: wave longer, or run python -m calib intrinsics --camera {name}"
+    return f"{subject} too uncertain: wave longer, or run roundel calibrate intrinsics --camera {name}"
 
 
 def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQuality:
