@@ -38,7 +38,7 @@ from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
 PAUSED = "no robot is acquired while the wand is recorded"
-CONTRADICTED = 0.4  # share of a robot's detections with a large misfit, above which none of them is its own
+CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
