@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import IO
 
 from camera_node.errors import USER_ERROR
 
@@ -61,7 +62,7 @@ class Supervisor:
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments` under a name."""
         arguments = tuple(arguments)
-        self._programs[name] = _Program(module, arguments, _spawn(module, arguments), time.monotonic())
+        self._programs[name] = _Program(module, arguments, spawn(module, arguments), time.monotonic())
 
     def tend(self) -> None:
         """Look at all children, and start those again that are due; called a few times a second."""
@@ -70,32 +71,21 @@ class Supervisor:
             if code is None:
                 continue
             if code in (0, USER_ERROR):
-                _close(self._programs.pop(name).process)
+                release(self._programs.pop(name).process)
                 self._on_end(name, code)
             elif program.due_s is None:
                 self._schedule(name, program, code)
             elif time.monotonic() >= program.due_s:
-                program.process = _spawn(program.module, program.arguments)
+                program.process = spawn(program.module, program.arguments)
                 program.since_s, program.due_s = time.monotonic(), None
 
     def stop(self) -> None:
         """Terminate all children, the newest first; kill those that do not end in time."""
-        processes = [program.process for program in reversed(self._programs.values())]
-        for process in processes:
-            if process.poll() is None:
-                process.terminate()
-        deadline_s = time.monotonic() + GRACE_S
-        for process in processes:
-            try:
-                process.wait(max(0.0, deadline_s - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-            _close(process)
+        stop_all([program.process for program in reversed(self._programs.values())], GRACE_S)
         self._programs.clear()
 
     def _schedule(self, name: str, program: _Program, code: int) -> None:
-        _close(program.process)
+        release(program.process)
         now_s = time.monotonic()
         if now_s - program.since_s >= STEADY_S:
             program.delay_s = FIRST_DELAY_S
@@ -104,16 +94,42 @@ class Supervisor:
         program.delay_s = min(2 * program.delay_s, LONGEST_DELAY_S)
 
 
-def _spawn(module: str, arguments: Sequence[str]) -> subprocess.Popen:
-    """A child in a session of its own, so that Ctrl-C reaches its parent only; it ends with its standard input."""
+def spawn(module: str, arguments: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen:
+    """Run `python -m module arguments`; it ends with its standard input, and so with this process.
+
+    In a session of its own: Ctrl-C reaches this process only, which then stops its children.
+
+    Args:
+        module, arguments: what to run.
+        output: for its stdout and stderr; those of this process unless given.
+    """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "camera_node.child", module, *arguments],
         stdin=subprocess.PIPE,
+        stdout=output,
+        stderr=output,
         env=os.environ | ENVIRONMENT,
         start_new_session=True,
     )
 
 
-def _close(process: subprocess.Popen) -> None:
+def stop_all(processes: Iterable[subprocess.Popen], grace_s: float) -> None:
+    """Terminate processes in their order; kill those that do not end within `grace_s`."""
+    processes = list(processes)
+    for process in processes:
+        if process.poll() is None:
+            process.terminate()
+    deadline_s = time.monotonic() + grace_s
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        release(process)
+
+
+def release(process: subprocess.Popen) -> None:
+    """Close this process's end of a child's standard input."""
     if process.stdin is not None:
         process.stdin.close()

@@ -4,7 +4,8 @@
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -22,6 +23,24 @@ def poll(
             act()
         time.sleep(INTERVAL_S)
     return value
+
+
+@contextmanager
+def repeating(act: Callable[[], object], interval_s: float = 0.0) -> Iterator[None]:
+    """Call `act` again and again in a thread, `interval_s` after its last end, until the block ends."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(interval_s):
+            act()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(DEADLINE_S)
 
 
 def wait_for(

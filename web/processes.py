@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Starts, watches and stops the programs of an arena as child processes."""
 
-import os
 import signal
 import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +11,7 @@ from types import FrameType
 import psutil
 
 from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR
+from camera_node.supervisor import release, spawn, stop_all
 from web.errors import WebError
 
 GRACE_S = 5.0  # between SIGTERM and SIGKILL
@@ -41,25 +39,10 @@ class Processes:
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments` until it ends, `stop` is called or this process ends, by whatever cause."""
-        command = [sys.executable, "-m", "camera_node.child", module, *arguments]
-        # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
-        environment = os.environ | {
-            "PYTHONUNBUFFERED": "1",
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-        }
         with self._log(name).open("wb") as log:
-            # In a session of its own: Ctrl-C reaches this program only, which then stops its children.
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,  # closed by the end of this process, which ends the child
-                stdout=log,
-                stderr=log,
-                env=environment,
-                start_new_session=True,
-            )
+            child = spawn(module, arguments, log)
         if name in self._children:
-            _release(self._children[name])
+            release(self._children[name])
         self._children[name] = child
         self._meters[name] = psutil.Process(child.pid)
 
@@ -87,17 +70,7 @@ class Processes:
 
     def stop(self) -> None:
         """Terminate all children, the newest first; kill those that do not end within `GRACE_S`."""
-        for child in reversed(self._children.values()):
-            if child.poll() is None:
-                child.terminate()
-        deadline = time.monotonic() + GRACE_S
-        for child in self._children.values():
-            try:
-                child.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
-            _release(child)
+        stop_all(reversed(self._children.values()), GRACE_S)
         self._children.clear()
 
     def pids(self) -> list[int]:
@@ -127,12 +100,6 @@ class Processes:
 
     def _log(self, name: str) -> Path:
         return self.folder / f"{name}.log"
-
-
-def _release(child: subprocess.Popen) -> None:
-    """Close this process's end of the child's standard input."""
-    if child.stdin is not None:
-        child.stdin.close()
 
 
 @contextmanager

@@ -13,22 +13,14 @@ from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.requests import RequestError
+from camera_node.protocol.server_address import LOCAL, ServerAddress
 from camera_node.protocol.session import open_client, open_requester
 from camera_node.terminal import say
 
-LOCAL = ("tcp/127.0.0.1:7447",)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Connection:
+class Connection(ServerAddress):
     """The running server and cameras, for --live."""
-
-    connect: tuple[str, ...] = LOCAL
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name in the keys."""
-    zenoh: Path | None = None
-    """A Zenoh configuration file."""
 
     def open(self) -> Session:
         """Open a session; it keeps trying to reach the server."""

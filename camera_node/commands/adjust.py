@@ -13,20 +13,14 @@ from camera_node.config import require_name
 from camera_node.errors import ConfigError
 from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings, request_snapshot
 from camera_node.protocol.messages import Settings
+from camera_node.protocol.server_address import ServerAddress
 from camera_node.protocol.session import open_requester
 from camera_node.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraConnection:
+class CameraConnection(ServerAddress):
     """Where a camera is reached."""
-
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name."""
-    zenoh: Path | None = None
-    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
 
     def open(self) -> Session:
         """Open a session for requests; raises as `open_requester`."""

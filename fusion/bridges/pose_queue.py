@@ -9,11 +9,11 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from camera_node.protocol.server_address import ServerAddress
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
@@ -93,15 +93,8 @@ class PoseQueue:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServerAddress:
-    """The arena's server."""
-
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """The server's Zenoh endpoints."""
-    arena: str = "arena"
-    """The arena's name."""
-    zenoh: Path | None = None
-    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+class PoseServer(ServerAddress):
+    """The server whose poses a bridge sends on."""
 
     @contextlib.contextmanager
     def receive_poses(self, robot: str | None = None) -> Iterator[PoseQueue]:
@@ -121,8 +114,8 @@ class ServerAddress:
                 log_faults(poses.faults + client.faults)
 
 
-Server = Annotated[ServerAddress, tyro.conf.arg(name="")]
-LOCAL = ServerAddress()
+Server = Annotated[PoseServer, tyro.conf.arg(name="")]
+LOCAL = PoseServer()
 
 
 def log_faults(faults: Counter[str]) -> None:

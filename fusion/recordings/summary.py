@@ -53,5 +53,5 @@ def list_recordings(folder: Path) -> list[RecordingSummary]:
     try:
         files = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
         return [summarize_recording(path) for path in files[:MAX_FILES]]
-    except OSError:  # a file was removed meanwhile: the next list is right
+    except OSError:  # a file was removed since it was listed: the next list is right
         return []

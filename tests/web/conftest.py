@@ -2,14 +2,18 @@
 """Fixtures: an arena on a real Zenoh router on loopback, and a feed that is connected to it."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 
 from camera_node.protocol.session import open_client
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
+from tests.web.browser import drawing, loopback
 from web.feed import Feed
+from web.page import add_live_page
 from web.subscription import Subscription
+from web.view import View
 
 
 @pytest.fixture
@@ -34,3 +38,12 @@ def subscription(arena: LiveArena) -> Iterator[Subscription]:
 def feed(subscription: Subscription) -> Feed:
     """The connected feed."""
     return subscription.feed
+
+
+@pytest.fixture
+def view(subscription: Subscription) -> Iterator[View]:
+    """A view of the arena that draws."""
+    view = View(subscription.feed, loopback())
+    with ExitStack() as closing, drawing(view):
+        add_live_page(view, subscription, "tcp/127.0.0.1:1", None, closing)
+        yield view

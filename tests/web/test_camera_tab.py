@@ -2,21 +2,16 @@
 """The tab Cameras in a real browser: live pictures on demand, and settings and mask of a camera."""
 
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack
 
 import cv2
 import msgspec
 import numpy as np
-import pytest
 import zenoh
 
 from camera_node.protocol.messages import Preview, Settings, decode, encode
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, drawing, loopback
-from web.page import add_live_page
-from web.subscription import Subscription
+from tests.web.browser import browsing
 from web.view import View
 
 ROUNDEL = (320.0, 240.0)
@@ -25,14 +20,6 @@ ROUNDEL = (320.0, 240.0)
 def is_matched(publisher: zenoh.Publisher) -> bool:
     """Whether someone subscribes."""
     return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
-
-
-@pytest.fixture
-def view(subscription: Subscription) -> Iterator[View]:
-    view = View(subscription.feed, loopback())
-    with ExitStack() as closing, drawing(view):
-        add_live_page(view, subscription, "tcp/127.0.0.1:1", None, closing)
-        yield view
 
 
 def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View):

@@ -5,7 +5,7 @@ import re
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -13,27 +13,16 @@ import pytest
 from playwright.sync_api import Page
 
 from camera_node.protocol.messages import encode
-from tests.waiting import wait_for
+from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, loopback
 from web.errors import WebError
 from web.feed import Feed
 from web.messages import DemoProgress, progress_key
-from web.page import add_live_page
 from web.scene.robots import cylinder_mesh
 from web.scene.surroundings import default_viewpoint
-from web.subscription import Subscription
 from web.tabs.cameras import decode_jpeg
 from web.view import View, check_port
-
-
-@pytest.fixture
-def view(subscription: Subscription) -> Iterator[View]:
-    """A view that draws."""
-    view = View(subscription.feed, loopback())
-    with ExitStack() as closing, drawing(view):
-        add_live_page(view, subscription, "tcp/127.0.0.1:1", None, closing)
-        yield view
 
 
 @pytest.fixture
@@ -59,19 +48,8 @@ def send_state(arena: LiveArena) -> None:
 @contextmanager
 def sending(arena: LiveArena) -> Iterator[None]:
     """Send the state ten times a second."""
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.wait(0.1):
-            send_state(arena)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
+    with repeating(lambda: send_state(arena), 0.1):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wand session that is started and ended in a real browser calibrates the cameras."""
 
-import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -16,7 +15,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from tests.calib.synthetic import assert_near, record, ring
-from tests.waiting import wait_for
+from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
@@ -49,20 +48,13 @@ def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
 @contextmanager
 def cameras_present(arena: LiveArena) -> Iterator[None]:
     """Send the status of all cameras ten times a second."""
-    stop = threading.Event()
 
-    def run() -> None:
-        while not stop.wait(0.1):
-            for name in ARENA.truth.cameras:
-                arena.camera(name)
+    def send() -> None:
+        for name in ARENA.truth.cameras:
+            arena.camera(name)
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
+    with repeating(send, 0.1):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def test_a_wand_session_in_the_page_calibrates_the_cameras(

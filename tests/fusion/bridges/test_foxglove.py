@@ -24,6 +24,7 @@ from tests.fusion.bridges.foxglove_reader import FoxgloveClient
 from tests.fusion.bridges.pose_server import bridge, first_line
 from tests.fusion.serving import KEYS
 from tests.fusion.synthetic import TRIANGLE
+from tests.missing_package import advice_without
 from tests.waiting import DEADLINE_S, Inbox
 
 
@@ -159,9 +160,5 @@ def test_a_port_in_use_is_reported_in_one_line(endpoint: str):
 
 
 def test_without_the_sdk_one_line_says_what_to_install():
-    code = "import sys; sys.modules['foxglove'] = None; from fusion.__main__ import main; main()"
-    words = [sys.executable, "-c", code, "foxglove"]
-    program = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert program.returncode == 2
-    assert len(program.stderr.splitlines()) == 1
-    assert "pip install 'roundel[foxglove]'" in program.stderr
+    advice = advice_without("foxglove", "fusion", "foxglove")
+    assert "pip install 'roundel[foxglove]'" in advice

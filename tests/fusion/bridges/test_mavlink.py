@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A robot's poses at an autopilot: pymavlink on its side of the UDP connection, frames from axes given by hand."""
 
-import subprocess
-import sys
 import time
 
 import msgspec
@@ -15,8 +13,9 @@ from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, 
 from fusion.bridges.mavlink import MavlinkVehicle, RateDivider, ResetCounter
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
 from fusion.protocol.messages import FusionStatus
-from tests.conftest import ROOT, free_port
+from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import PoseServer, bridge, moving_pose, restart
+from tests.missing_package import advice_without
 from tests.waiting import DEADLINE_S, wait_for
 
 ORIGIN, HEADING_DEG, FORWARD_DEG = (1.0, -2.0, 0.5), 30.0, 100.0
@@ -230,9 +229,5 @@ def test_an_invalid_address_is_refused(to: str):
 
 
 def test_without_pymavlink_one_line_says_what_to_install():
-    code = "import sys; sys.modules['pymavlink'] = None; from fusion.__main__ import main; main()"
-    words = [sys.executable, "-c", code, "mavlink", "rover", "--to", "udp:127.0.0.1:9"]
-    program = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert program.returncode == 2
-    assert len(program.stderr.splitlines()) == 1
-    assert "pip install 'roundel[mavlink]'" in program.stderr
+    advice = advice_without("pymavlink", "fusion", "mavlink", "rover", "--to", "udp:127.0.0.1:9")
+    assert "pip install 'roundel[mavlink]'" in advice

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a client is told when no pose arrives: a misspelt name is not a missing server."""
+"""What a client reports when no pose arrives: a misspelt name is not a missing server."""
 
 import pytest
 

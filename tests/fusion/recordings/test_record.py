@@ -2,7 +2,6 @@
 """Recordings: reading returns what was written, a replay repeats the poses, smoothing uses later frames."""
 
 import csv
-import threading
 from pathlib import Path
 
 import msgspec
@@ -24,6 +23,7 @@ from fusion.tracking.result import TrackingResult
 from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
+from tests.waiting import repeating
 
 MOVING = Arena(
     {"a": TRIANGLE}, {"a": line((0.2, -0.3, 0.4), (0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0))}, sigma_px=0.1
@@ -92,20 +92,13 @@ def test_files_that_are_no_recordings_are_refused(tmp_path, content):
 
 def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     with serving(config(tmp_path)) as (server, client):
-        done = threading.Event()
 
         def publish() -> None:
-            while not done.is_set():
-                send(server, live(ARENA.messages(3)))
-                client.status(60.0).next()
+            send(server, live(ARENA.messages(3)))
+            client.status(60.0).next()
 
-        sender = threading.Thread(target=publish)
-        sender.start()
-        try:
+        with repeating(publish):
             record(tmp_path / "live.mcap", connect=server.endpoints, arena="test", seconds=4.0)
-        finally:
-            done.set()
-            sender.join(60.0)
     recording = read_recording(tmp_path / "live.mcap")
     assert {message.camera for _, message in recording.detections} == ARENA.cameras.keys()
     assert recording.rig is not None
@@ -117,16 +110,12 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
 def test_a_recording_rotates_by_time_in_a_fresh_process(tmp_path):
     """Every file holds the rig and the robots, so it replays by itself; together they hold all seconds."""
     with serving(config(tmp_path)) as (server, client):
-        done = threading.Event()
 
         def publish() -> None:
-            while not done.is_set():
-                send(server, live(ARENA.messages(3)))
-                client.status(60.0).next()
+            send(server, live(ARENA.messages(3)))
+            client.status(60.0).next()
 
-        sender = threading.Thread(target=publish)
-        sender.start()
-        try:
+        with repeating(publish):
             words = (
                 "--rotate-minutes",
                 "0.03",
@@ -138,9 +127,6 @@ def test_a_recording_rotates_by_time_in_a_fresh_process(tmp_path):
                 *server.endpoints,
             )
             recorded = run_program("fusion", "record", str(tmp_path / "live.mcap"), *words)
-        finally:
-            done.set()
-            sender.join(60.0)
     assert recorded.returncode == 0, recorded.stderr
     files = sorted(tmp_path.glob("live-*.mcap"))
     assert 3 <= len(files) <= 5
