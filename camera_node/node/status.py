@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.arrays import Array, Grey
-from camera_node.detection.roundels import Roundels
+from camera_node.detection.roundels import DetectedRoundels
 from camera_node.detection.sharpness import edge_blur_px
 from camera_node.protocol.messages import CameraStatus
 from camera_node.sources.frame import Frame, Source
@@ -32,7 +32,7 @@ class DetectedFrame:
     """A frame, its roundels, and the duration of their detection in microseconds."""
 
     frame: Frame
-    roundels: Roundels
+    roundels: DetectedRoundels
     detect_us: float
 
 

@@ -46,6 +46,9 @@ class Keys:
     def detections(self, camera: str = "*") -> str:
         return f"{self.arena}/camera/{camera}/detections"
 
+    def relative(self, camera: str = "*") -> str:
+        return f"{self.arena}/camera/{camera}/relative"
+
     def camera_in(self, key: str) -> str | None:
         """The camera of a key on which detections are published; None for other keys."""
         camera = key.removeprefix(f"{self.arena}/camera/").removesuffix("/detections")
