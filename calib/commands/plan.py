@@ -13,7 +13,7 @@ from calib.commands.output import check_folder
 from calib.plan.camera_kind import CameraKind, PlannedCamera
 from calib.plan.catalogue import CATALOGUE
 from calib.plan.description import MAX_CAMERAS, Plan, PlannedRobots, Suggestion
-from calib.plan.placement import SuggestedPlaces, PlacementProblem, suggest_placement
+from calib.plan.placement import PlacementProblem, SuggestedPlaces, suggest_placement
 from calib.plan.planner import PlannedArena, evaluate
 from calib.plan.report import check_report, write_report
 from calib.plan.summary import describe, summarize

@@ -9,7 +9,23 @@ from numpy.typing import ArrayLike
 
 from camera_node.arrays import Array, Mask
 
-STEPS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # metres between grid points
+STEPS = (
+    0.05,
+    0.1,
+    0.15,
+    0.2,
+    0.25,
+    0.3,
+    0.4,
+    0.5,
+    0.75,
+    1.0,
+    1.5,
+    2.0,
+    3.0,
+    5.0,
+    10.0,
+)  # metres between grid points
 
 
 @dataclass(frozen=True, slots=True)
