@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The planner compared with the simulated arena: `python -m tests.benchmarks.plan [precision | coverage | placement]`.
+"""The planner compared with the simulated arena: `python -m tests.benchmarks.plan [PART]`; parts are named below.
 
 `precision` renders roundels all over an arena, detects and tracks them, and compares their errors with the prediction.
 `coverage` moves roundels through the predicted edges of what each camera sees, and finds where detection ends.
+`cut` compares the precision that the detector reports of roundels which the border cuts with that of complete ones.
 `placement` compares a suggested placement of eight cameras with a ring of eight, on one core.
 """
 
 import json
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from calib.plan.camera_kind import CameraKind
 from calib.plan.description import ImageQuality, Plan, PlannedRobots
 from calib.plan.placement import PlacementProblem, SuggestedPlaces, evaluate_placement, suggest_placement
 from calib.plan.planner import PlannedArena, evaluate
+from calib.plan.views import CUT_EXPONENT, RoundelSensor
 from calib.rig.camera import Camera
 from camera_node.arrays import Array
 from camera_node.detector import Detector
@@ -76,7 +78,7 @@ class CoverageResult:
 
 
 def main(
-    part: tyro.conf.Positional[Literal["precision", "coverage", "placement", "all"]] = "all",
+    part: tyro.conf.Positional[Literal["precision", "coverage", "cut", "placement", "all"]] = "all",
     frames: int = 100,
     edges: int = 40,
 ) -> None:
@@ -92,6 +94,8 @@ def main(
         _add_precision(table, measure_precision(frames))
     if part in ("coverage", "all"):
         _add_coverage(table, measure_coverage(edges))
+    if part in ("cut", "all"):
+        _add_cut(table, measure_cut(edges))
     if part in ("placement", "all"):
         _add_placement(table)
     Console(width=150).print(table)
@@ -230,12 +234,16 @@ def measure_coverage(edges: int, seed: int = 2) -> CoverageResult:
     """Find where each camera stops to detect roundels on paths through its predicted edges."""
     arena, rng = planned_arena(), np.random.default_rng(seed)
     rows, unbounded = [], 0
-    for name, camera in arena.cameras.items():
+    for name in arena.cameras:
         paths = find_edges(arena, name, edges, rng)
         for k in range(0, len(paths), 8):  # few at a time, so that they overlap rarely
-            for distance, by_image in _follow(name, camera, paths[k : k + 8]):
+            part = paths[k : k + 8]
+            steps = list(follow(arena, name, part))
+            found = np.array([np.isfinite(one.sigma_px) for one in steps])
+            for j, path in enumerate(part):
+                distance = _edge(np.array([one.step_m for one in steps]), found[:, j])
                 unbounded += not np.isfinite(distance)
-                rows.append((distance, by_image))
+                rows.append((distance, path.by_image))
     known = [row for row in rows if np.isfinite(row[0])]
     return CoverageResult(np.array([d for d, _ in known]), np.array([i for _, i in known], bool), unbounded)
 
@@ -269,21 +277,70 @@ def find_edges(arena: PlannedArena, name: str, count: int, rng: np.random.Genera
     return paths
 
 
-def _follow(name: str, camera: Camera, paths: Sequence[EdgePath]) -> list[tuple[float, bool]]:
-    """Where detection ends on paths, relative to the prediction, metres; infinite where it does not change."""
+@dataclass(frozen=True)
+class EdgeSteps:
+    """What one camera detects at one step of K paths.
+
+    Attributes:
+        step_m: the step, relative to the predicted edge.
+        inset: (K,) distances of the centres from the border of the image, in half extents.
+        sigma_px: (K,) standard deviations that the detector reports, NaN where it detects nothing.
+        expected_px: (K,) standard deviations of complete roundels of the same size.
+    """
+
+    step_m: float
+    inset: Array
+    sigma_px: Array
+    expected_px: Array
+
+
+def follow(arena: PlannedArena, name: str, paths: Sequence[EdgePath]) -> Iterator[EdgeSteps]:
+    """Render each step of all paths in one picture, and detect the roundels in it as in a first frame."""
+    camera, sensor = arena.cameras[name], arena.sensors()[name]
     steps = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
-    motions = {f"r{k}": _line(path) for k, path in enumerate(paths)}
-    found = np.zeros((len(steps), len(paths)), bool)
     with tempfile.TemporaryDirectory() as folder:
-        scene = write_scene(Path(folder), {name: camera}, motions)
-        renderer = Renderer(scene, name)
-        for row, s in enumerate(track(steps, f"edges of {name}")):
+        motions = {f"r{k}": _line(path) for k, path in enumerate(paths)}
+        renderer = Renderer(write_scene(Path(folder), {name: camera}, motions), name)
+        for frame, s in enumerate(track(steps, f"edges of {name}")):
             t_s = 1.0 + float(np.arcsin(s / (2 * REACH_M))) / (2 * np.pi)
-            roundels = Detector(inner_ratios=(0.6,)).detect(renderer.render(t_s, row))
-            expected, radius = _image(camera, np.array([path.middle + s * path.outward for path in paths]))
-            gaps = np.linalg.norm(roundels.uv[:, None] - expected[None], axis=2)
-            found[row] = (gaps < radius).any(axis=0)
-    return [(_edge(steps, found[:, k]), path.by_image) for k, path in enumerate(paths)]
+            roundels = Detector(inner_ratios=(0.6,)).detect(renderer.render(t_s, frame))
+            places = np.array([path.middle + s * path.outward for path in paths])
+            uv, radius = _image(camera, places)
+            inset, expected = _expected(sensor, camera, places)
+            sigma = np.full(len(paths), np.nan)
+            if len(roundels):
+                gaps = np.linalg.norm(roundels.uv[:, None] - uv[None], axis=2)
+                nearest = gaps.argmin(axis=0)
+                found = gaps.min(axis=0) < radius
+                sigma[found] = np.sqrt(np.trace(roundels.cov[nearest[found]], axis1=1, axis2=2))
+            yield EdgeSteps(float(s), inset, sigma, expected)
+
+
+def _expected(sensor: RoundelSensor, camera: Camera, places: Array) -> tuple[Array, Array]:
+    """Insets (K,) of roundels at places (K, 3), and standard deviations (K,), pixels, if they were complete."""
+    T = camera.matrix()
+    uv, J = camera.project_with_jacobian((places - T[:3, 3]) @ T[:3, :3])
+    affine = DIAMETER_M / 2 * (J @ T[:3, :3].T)[:, :, :2]
+    size = np.array([camera.width, camera.height])
+    inset = (np.minimum(uv + 0.5, size - 0.5 - uv) / np.linalg.norm(affine, axis=2)).min(axis=1)
+    axes = 2 * np.linalg.svd(affine)[1]
+    return inset, np.sqrt(sensor.centre_variances(axes).sum(axis=1))
+
+
+def measure_cut(edges: int, seed: int = 3) -> list[tuple[float, float, int]]:
+    """Of insets in steps of 0.2: the lower limit, the median reported sigma over that of complete roundels, and the
+    number of detections. Complete ones are those with an inset of 1 to 1.3 on the same paths."""
+    arena, rng = planned_arena(), np.random.default_rng(seed)
+    rows = []
+    for name in arena.cameras:
+        paths = find_edges(arena, name, edges, rng)
+        for k in range(0, len(paths), 8):
+            for one in follow(arena, name, paths[k : k + 8]):
+                rows += zip(one.inset, one.sigma_px / one.expected_px, strict=True)
+    inset, ratio = np.array([row for row in rows if np.isfinite(row[1])]).T
+    complete = np.median(ratio[(inset >= 1) & (inset < 1.3)])
+    bins = [(low, (inset >= low) & (inset < low + 0.2)) for low in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    return [(low, float(np.median(ratio[b]) / complete), int(b.sum())) for low, b in bins if b.any()]
 
 
 def _line(path: EdgePath) -> dict[str, Any]:
@@ -328,6 +385,13 @@ def _add_coverage(table: Table, got: CoverageResult) -> None:
                 "100%",
             )
     table.add_row(f"edges that are not within {100 * REACH_M:g} cm", str(got.unbounded), "0")
+
+
+def _add_cut(table: Table, rows: Sequence[tuple[float, float, int]]) -> None:
+    for low, ratio, n in rows:
+        goal = f"{min(low + 0.1, 1.0) ** -CUT_EXPONENT:.2f}"
+        what = f"inset {low:.1f} to {low + 0.2:.1f}: sigma relative to a complete roundel ({n} detections)"
+        table.add_row(what, f"{ratio:.2f}", goal)
 
 
 def _add_placement(table: Table) -> None:
