@@ -41,17 +41,18 @@ def paint_floor(seed: int) -> Picture:
     return np.asarray(floor * light * (1 + np.float32(0.04) * grain), np.float32)
 
 
-def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
+def view_floor(floor: Picture, rays: Picture, T_world_cam: Array, subsamples: int = SUBSAMPLES) -> Picture:
     """Render a camera's view (h, w) of the floor z = 0.
 
     Args:
         floor: grey levels from `paint_floor`.
         rays: (h, w, 2) x/z and y/z of each pixel's viewing ray.
         T_world_cam: (4, 4) pose of the camera.
+        subsamples: squared, of each pixel.
     """
     h, w = rays.shape[:2]
     T = T_world_cam.astype(np.float32)
-    fine = cv2.resize(rays, (w * SUBSAMPLES, h * SUBSAMPLES), interpolation=cv2.INTER_LINEAR)
+    fine = cv2.resize(rays, (w * subsamples, h * subsamples), interpolation=cv2.INTER_LINEAR)
     directions = cv2.transform(fine, T[:3, :3])  # cv2.transform extends (x, y) to (x, y, 1)
     down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # rays above the horizon end far away
     xy = T[:2, 3] - directions[..., :2] * (T[2, 3] / down)
