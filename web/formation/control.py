@@ -39,7 +39,7 @@ class Controller(Protocol):
 
 
 def place_of(side: int) -> Array:
-    """Pose (3,) of a follower in the leader's frame; `side` is 1 on the left of the leader's camera, -1 on the right."""
+    """Pose (3,) of a follower in the leader's frame: 1 is the left `side` of the leader's camera, -1 the right one."""
     angle = side * ANGLE
     return np.array([DISTANCE_M * np.cos(angle), DISTANCE_M * np.sin(angle), wrap(angle + np.pi)])
 

@@ -16,7 +16,10 @@ from web.formation.planar import between, moved, wrap
 
 ACCELERATION = np.array([0.4, 0.4, 0.6])  # of the other robot, as noise: m/s^2 and rad/s^2 per root hertz
 SLIP = np.array([0.01, 0.01, 0.02])  # of this robot, as noise: m/s and rad/s per root hertz
-POSITION_SIGMA_M, HEADING_SIGMA = 1e-3, 5e-3  # systematic errors: lens, diameter, mounting; added to the claimed ones
+POSITION_SIGMA_M, HEADING_SIGMA = (
+    1e-3,
+    5e-3,
+)  # systematic errors: lens, diameter, mounting; added to the claimed ones
 INITIAL_VELOCITY = np.array([0.3, 0.3, 0.3])  # standard deviations
 GATE = 25.0  # squared Mahalanobis distance, three degrees of freedom
 NUMERIC = 1e-6
@@ -35,13 +38,12 @@ def sightings(seen: LocatedRoundels) -> list[PlanarSighting]:
     """All roundels with both normals, projected to the floor. The camera's z is the robot's x, its x the robot's -y."""
     result = []
     for row, k in product(range(len(seen)), range(2)):
-        x, y, z = seen.position[row]
-        normal = seen.normals[row, k]
+        (right, _, ahead), normal = seen.position[row], seen.normals[row, k]
         cov = np.zeros((3, 3))
         to_plane = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         cov[:2, :2] = to_plane @ seen.cov[row] @ to_plane.T + POSITION_SIGMA_M**2 * np.eye(2)
         cov[2, 2] = seen.normal_sigma[row, k] ** 2 + HEADING_SIGMA**2
-        pose = np.array([z, -x, np.arctan2(-normal[0], normal[2])])
+        pose = np.array([ahead, -right, np.arctan2(-normal[0], normal[2])])
         result.append(PlanarSighting(pose, cov, float(seen.probability[row, k])))
     return result
 
@@ -119,5 +121,3 @@ class RelativeEstimator:
         keep = np.eye(6)
         keep[:, :3] -= gain
         self._state, self._cov = state, keep @ self._cov @ keep.T + gain @ sighting.cov @ gain.T
-
-

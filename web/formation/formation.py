@@ -17,7 +17,7 @@ SIDES = {LEFT: 1, RIGHT: -1}
 START = np.array([1.0, 0.0, np.pi])  # of the leader in the world
 START_ERROR = np.array([0.12, 0.12, 0.1])  # of the followers: standard deviations
 RADIUS_M = 0.15  # of a robot
-SETTLED_S = 10.0  # from the start; later distances count
+SETTLED_S = 5.0  # from the start; later distances count
 LIMIT_M = 0.02
 
 
@@ -32,7 +32,7 @@ def start_world(seed: int = 0) -> World:
 
 def controllers() -> dict[str, Controller]:
     """The control of each robot."""
-    return {LEADER: Leader()} | {name: Follower(side) for name, side in SIDES.items()}
+    return {LEADER: Leader(), **{name: Follower(side) for name, side in SIDES.items()}}
 
 
 def wanted_distances() -> dict[tuple[str, str], float]:
@@ -77,7 +77,9 @@ class FormationScore:
 
     def summarize(self) -> list[str]:
         """One line for each pair of robots."""
-        lines = [f"the leader drove {self.travelled_m:.1f} m; no two robots came nearer than {self.nearest_m:.2f} m"]
+        lines = [
+            f"the leader drove {self.travelled_m:.1f} m; no two robots came nearer than {self.nearest_m:.2f} m"
+        ]
         for (a, b), wanted in wanted_distances().items():
             e = 1e3 * np.array(self.errors_m.get((a, b), []))
             if len(e):

@@ -56,7 +56,9 @@ class RobotCamera:
         T_cam_world = invert(camera_matrix(pose))
         image = self._model.view(self._floor, camera_matrix(pose), subsamples=1)
         others = [self._world.at(name, t_s).pose for name in self._world.names if name != self._name]
-        discs = [disc for other in others for disc in place_discs(ROUNDEL, T_cam_world @ roundel_matrix(other))]
+        discs = [
+            disc for other in others for disc in place_discs(ROUNDEL, T_cam_world @ roundel_matrix(other))
+        ]
         for disc in sorted(discs, key=lambda disc: -float(np.linalg.norm(disc.T[:3, 3]))):
             if disc.faces_camera:
                 self._model.paint(image, [disc])

@@ -121,5 +121,3 @@ def _mean(a: Array, b: Array, share: float) -> Array:
     """The pose between a and b, with `share` of b."""
     change = np.array([*(b - a)[:2], wrap(b[2] - a[2])])
     return np.array([*(a + share * change)[:2], wrap(a[2] + share * change[2])])
-
-
