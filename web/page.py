@@ -45,7 +45,7 @@ def add_live_page(
         pictures = LivePictures(view.server, subscription, view.cameras)
         closing.callback(pictures.close)
         view.add(pictures, is_live=True)
-        view.add(CameraSettings(gui, subscription), is_live=True)
+        view.add(CameraSettings(view.server, subscription), is_live=True)
     with header.tabs["Calibrate"]:
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)

@@ -37,6 +37,9 @@ class ActionButton:
         act: returns the outcome as text; a RoundelError is shown, any other exception is logged and shown.
         answer: the line for the outcome.
         hint: explanation that is shown when the pointer is on the button.
+
+    Attributes:
+        client: the browser of the latest click; None before.
     """
 
     def __init__(
@@ -45,14 +48,15 @@ class ActionButton:
         self._act, self._answer = act, answer
         self._running = threading.Lock()
         self._enabled = True
+        self.client: viser.ClientHandle | None = None
         self.handle = gui.add_button(label, color=GREY, hint=hint)
-        self.handle.on_click(lambda _: self.run())
+        self.handle.on_click(lambda event: self.run(event.client))
 
-    def run(self) -> None:
-        """Run the action, unless it runs already or can not act."""
+    def run(self, client: viser.ClientHandle | None = None) -> None:
+        """Run the action for a browser, unless it runs already or can not act."""
         if not self._enabled or not self._running.acquire(blocking=False):
             return
-        self.handle.disabled = True
+        self.client, self.handle.disabled = client, True
         try:
             self._answer.show(self._act(), "ok")
         except RoundelError as error:
