@@ -46,6 +46,9 @@ class Supervisor:
         on_end: called with the name and the exit code of a child that ended and is not started again.
         logs: a folder for files `log_path(name)`, to which the children write instead.
         restarts: whether children that failed are started again.
+
+    Attributes:
+        folder: in which the children run; that of this process if None.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class Supervisor:
     ) -> None:
         self._programs: dict[str, _Program] = {}
         self._on_end, self._logs, self._restarts = on_end, logs, restarts
+        self.folder: Path | None = None
 
     def __enter__(self) -> "Supervisor":
         return self
@@ -98,7 +102,7 @@ class Supervisor:
         with contextlib.ExitStack() as stack:
             log = log_path(self._logs, name) if self._logs else None
             output = stack.enter_context(log.open("wb")) if log else None
-            return spawn(module, arguments, output)
+            return spawn(module, arguments, output, self.folder)
 
     def stop(self) -> None:
         """Terminate all children, the newest first; kill those that do not end in time."""
@@ -120,7 +124,9 @@ def log_path(folder: Path, name: str) -> Path:
     return folder / f"{re.sub('[^A-Za-z0-9_.-]+', '-', name)}.log"
 
 
-def spawn(module: str, arguments: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen:
+def spawn(
+    module: str, arguments: Sequence[str], output: IO[bytes] | None = None, folder: Path | None = None
+) -> subprocess.Popen:
     """Run `python -m module arguments`; it ends with its standard input, and so with this process.
 
     In a session of its own: Ctrl-C reaches this process only, which then stops its children.
@@ -128,9 +134,11 @@ def spawn(module: str, arguments: Sequence[str], output: IO[bytes] | None = None
     Args:
         module, arguments: what to run.
         output: for its stdout and stderr; those of this process unless given.
+        folder: in which it runs; that of this process unless given.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "camera_node.child", module, *arguments],
+        cwd=folder,
         stdin=subprocess.PIPE,
         stdout=output,
         stderr=output,

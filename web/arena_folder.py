@@ -57,6 +57,10 @@ class ArenaFolder:
     def recordings(self) -> Path:
         return self.path / "recordings"
 
+    def resolved(self) -> "ArenaFolder":
+        """The same folder by its absolute path."""
+        return ArenaFolder(self.path.resolve())
+
     def create(self, arena: str, listen: str | None, is_local: bool) -> bool:
         """Write the files that are missing; return whether the folder is new.
 

@@ -5,31 +5,38 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from camera_node.commands.camera import LocalCameras, given_options
 from camera_node.errors import NetworkError
 from camera_node.sources.frame import SourceSettings
 from camera_node.supervisor import Supervisor
+from fusion.server.config import ArenaConfig
 from web.arena_folder import ArenaFolder
 from web.page_access import PageAccess, is_loopback
 
 START_S = 120.0  # for the server to listen, on a loaded machine
 POLL_S = 0.05
+ENCRYPTED = ("tls/", "quic/")
 CALIBRATION = "calib"  # the name of its process
 
 
 class ArenaPrograms:
     """The server, the page and the cameras of an arena.
 
+    They run in the arena's folder, to which the paths of certificates in its Zenoh configuration are relative. Under
+    TLS all of them have the server's certificate: whoever starts them can read it.
+
     Args:
         supervisor: runs them; its user tends it.
         folder: the arena's files.
-        arena: its name.
+        config: the content of its arena.yaml.
     """
 
-    def __init__(self, supervisor: Supervisor, folder: ArenaFolder, arena: str) -> None:
-        self._supervisor, self._folder, self._arena = supervisor, folder, arena
+    def __init__(self, supervisor: Supervisor, folder: ArenaFolder, config: ArenaConfig) -> None:
+        self._supervisor, self._folder, self._config = supervisor, folder.resolved(), config
+        supervisor.folder = self._folder.path
         self._connect: list[str] = []
 
     def start_server(self, listen: str | None, stop: threading.Event) -> list[str]:
@@ -56,7 +63,10 @@ class ArenaPrograms:
                 if time.monotonic() > end_s:
                     raise NetworkError(f"the server did not listen within {START_S:.0f} s; see its log")
             endpoints = path.read_text().splitlines()
-        self._connect = ["--connect", endpoints[0].replace("0.0.0.0", "127.0.0.1"), "--arena", self._arena]
+        local = endpoints[0].replace("0.0.0.0", "127.0.0.1")
+        self._connect = ["--connect", local, "--arena", self._config.arena]
+        if self._config.zenoh is not None and local.startswith(ENCRYPTED):
+            self._connect += ["--zenoh", str(Path(self._config.zenoh).resolve())]
         return endpoints
 
     def start_page(self, host: str, port: int) -> PageAccess:
@@ -71,7 +81,10 @@ class ArenaPrograms:
 
     def cameras(self, sources: Sequence[str], settings: SourceSettings) -> LocalCameras:
         """The cameras of this machine, not started yet; all of them without sources."""
-        return LocalCameras(sources, [*self._connect, *given_options(settings)], self._supervisor)
+        if settings.scene is not None:
+            settings = replace(settings, scene=settings.scene.resolve())
+        paths = [str(Path(source).resolve()) if Path(source).exists() else source for source in sources]
+        return LocalCameras(paths, [*self._connect, *given_options(settings)], self._supervisor)
 
     def start_wand_calibration(self, seconds: float) -> None:
         """Start `calib wand` on the running cameras, which writes the folder's rig and has the server use it."""

@@ -23,6 +23,7 @@ from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import SourceSettings
 from camera_node.supervisor import Supervisor, log_path
 from fusion.protocol.messages import RobotPose
+from fusion.server.config import load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import CALIBRATION, ArenaPrograms
 from web.demo_progress import (
@@ -134,7 +135,7 @@ class Demo:
         )
         self._folder = create_folder(path, scene_path, self.scene)
         self._supervisor = Supervisor(self._ended, path, restarts=False)
-        self._programs = ArenaPrograms(self._supervisor, self._folder, ARENA)
+        self._programs = ArenaPrograms(self._supervisor, self._folder, load_arena(self._folder.config))
         self._score: PoseScore | None = None
         self._stack = contextlib.ExitStack()
 

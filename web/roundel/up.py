@@ -81,7 +81,7 @@ class ArenaUp:
         with contextlib.ExitStack() as stack:
             supervisor = stack.enter_context(Supervisor(self._note_end))
             service = stack.enter_context(ServiceManager())
-            programs = ArenaPrograms(supervisor, self._folder, self._config.arena)
+            programs = ArenaPrograms(supervisor, self._folder, self._config)
             endpoints = programs.start_server(options.listen, self._stop)
             if not endpoints:
                 return self._failed.get("server", 0)

@@ -185,13 +185,11 @@ class Operator:
         self._tab("Robots")
         label = self._page.get_by_text("Name", exact=True).and_(self._page.locator(":visible"))
         label.locator("xpath=ancestor::*[.//input][1]").locator("input").fill(name)
-        outcome = self._page.get_by_text(re.compile(rf"{name} .*markers?"))
+        outcome = self._page.get_by_text(f"the server now tracks {name}")
+        refusal = self._page.get_by_text(re.compile("no stationary|make no robot|no markers"))
         for _ in range(60):
             self._click("Define from everything stationary")
-            answer = self._page.get_by_text(
-                re.compile(rf"no stationary|make no robot|no markers|{name} .*marker")
-            )
-            answer.wait_for(timeout=STEP_MS)
+            outcome.or_(refusal).first.wait_for(timeout=STEP_MS)
             if outcome.count():
                 break
         self._picture("robots")
@@ -200,7 +198,7 @@ class Operator:
     def program(self) -> str:
         """The program that the page offers."""
         self._tab("Status")
-        self._click("Poses for your program")
+        self._page.get_by_text("Poses for your program").click(timeout=STEP_MS)
         text = self._page.locator("pre").filter(has_text="Arena.connect")
         text.wait_for(timeout=STEP_MS)
         return text.inner_text()
