@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From four unknown cameras on two machines to poses in a program, by two commands and clicks in a browser.
 
-`python -m tests.benchmarks.first_arena [--pictures docs]` prints how accurate the result is, and can save the pictures of
-the documentation. It needs Chromium, iproute2 and the right to create network namespaces.
+`python -m tests.benchmarks.first_arena [--pictures docs]` prints how accurate the result is, and can save the pictures
+of the documentation. It needs Chromium, iproute2 and the right to create network namespaces.
 """
 
 import sys
@@ -44,8 +44,8 @@ def main(pictures: Path | None = None) -> None:
             outcome = play(arena, folder, show)
     circle = outcome.circle
     print(
-        f"{outcome.calibration}\n{outcome.n_poses} poses: radius {1e3 * circle.radius_m:.2f} of {1e3 * RADIUS_M:.0f} mm, "
-        f"{1e3 * circle.rms_m:.2f} mm RMS from the circle, {circle.round_s:.3f} s a round"
+        f"{outcome.calibration}\n{outcome.n_poses} poses: radius {1e3 * circle.radius_m:.2f} of "
+        f"{1e3 * RADIUS_M:.0f} mm, {1e3 * circle.rms_m:.2f} mm RMS from the circle, {circle.round_s:.3f} s a round"
     )
 
 
