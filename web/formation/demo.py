@@ -25,7 +25,7 @@ from web.errors import WebError
 from web.formation.formation import SETTLED_S, FormationScore, controllers, start_world
 from web.formation.live import LiveRobot, RobotDrive, RobotSource, WorldClock
 from web.formation.vision import FPS, RobotCamera, light, paint_background, roundel_matrix
-from web.formation.world import World
+from web.formation.world import RobotWorld
 from web.messages import DemoProgress, progress_key
 
 ARENA = "formation"
@@ -70,7 +70,7 @@ class Progress:
     """Scores the formation, reports it to terminal and page, and stops robots whose camera is silent."""
 
     def __init__(
-        self, session: zenoh.Session, world: World, clock: WorldClock, robots: Sequence[LiveRobot]
+        self, session: zenoh.Session, world: RobotWorld, clock: WorldClock, robots: Sequence[LiveRobot]
     ) -> None:
         self.score, self.robots = FormationScore(), robots
         self._session, self._world, self.clock = session, world, clock
@@ -118,7 +118,7 @@ def _open_router(listen: str | None) -> tuple[zenoh.Session, str]:
 
 
 def _start_robots(
-    stack: contextlib.ExitStack, router: zenoh.Session, arena: Arena, world: World, clock: WorldClock
+    stack: contextlib.ExitStack, router: zenoh.Session, arena: Arena, world: RobotWorld, clock: WorldClock
 ) -> list[LiveRobot]:
     """Start all robots; their cameras are not synchronized."""
     floor, robots = paint_background(), []

@@ -10,7 +10,7 @@ import numpy as np
 from camera_node.arrays import Array
 from web.formation.control import Controller, Follower, Leader, place_of
 from web.formation.planar import compose
-from web.formation.world import World
+from web.formation.world import RobotWorld
 
 LEADER, LEFT, RIGHT = "leader", "left", "right"
 SIDES = {LEFT: 1, RIGHT: -1}
@@ -21,13 +21,13 @@ SETTLED_S = 5.0  # from the start; later distances count
 LIMIT_M = 0.02
 
 
-def start_world(seed: int = 0) -> World:
+def start_world(seed: int = 0) -> RobotWorld:
     """The robots at rest; the followers are near their places."""
     rng = np.random.default_rng(seed)
     poses = {LEADER: START}
     for name, side in SIDES.items():
         poses[name] = compose(START, place_of(side)) + START_ERROR * rng.standard_normal(3)
-    return World(poses, seed)
+    return RobotWorld(poses, seed)
 
 
 def controllers() -> dict[str, Controller]:

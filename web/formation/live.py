@@ -16,7 +16,7 @@ from camera_node.sources.frame import Frame, Source
 from fusion.client import Arena
 from web.formation.control import BLIND_S, Controller
 from web.formation.vision import CAMERA, FPS, ROUNDEL, RobotCamera
-from web.formation.world import STANDSTILL, World
+from web.formation.world import STANDSTILL, RobotWorld
 
 WAKE_S = 0.2  # between looks at whether a camera that waits is to end
 
@@ -60,7 +60,7 @@ class RobotSource(Source):
         is_read: is set when the node begins to read frames; they come when the clock is started.
     """
 
-    def __init__(self, world: World, camera: RobotCamera, clock: WorldClock, phase_s: float) -> None:
+    def __init__(self, world: RobotWorld, camera: RobotCamera, clock: WorldClock, phase_s: float) -> None:
         self.dropped = 0
         self._world, self._camera, self._clock, self._phase_s = world, camera, clock, phase_s
         self.is_read, self._closed = threading.Event(), threading.Event()
@@ -99,7 +99,7 @@ class RobotDrive:
         clock: of the world.
     """
 
-    def __init__(self, world: World, name: str, controller: Controller, clock: WorldClock) -> None:
+    def __init__(self, world: RobotWorld, name: str, controller: Controller, clock: WorldClock) -> None:
         self._world, self._name, self._controller, self._clock = world, name, controller, clock
         self._lock = threading.Lock()
         self._heard_s = 0.0

@@ -13,7 +13,7 @@ from camera_node.protocol.relative import RelativePositions
 from web.formation.control import Controller
 from web.formation.formation import FormationScore, controllers, start_world
 from web.formation.vision import CAMERA, FPS, ROUNDEL, RobotCamera, paint_background
-from web.formation.world import World
+from web.formation.world import RobotWorld
 
 
 class RobotProgram:
@@ -24,7 +24,7 @@ class RobotProgram:
         self._detector = Detector()
         self._localizer = DiscLocalizer(CAMERA, ROUNDEL.diameter_m)
 
-    def see(self, world: World, t_s: float, frame: int) -> None:
+    def see(self, world: RobotWorld, t_s: float, frame: int) -> None:
         """Take a picture at `t_s`, and give the control what was located in it, through the message."""
         located = self._localizer.locate(self._detector.detect(self._camera.capture(t_s, frame)))
         message = RelativePositions.pack(
@@ -37,7 +37,7 @@ class RobotProgram:
         seen = decode(encode(message), RelativePositions).unpack()
         self._controller.see(seen, t_s, world.at(self._name, t_s).odometry)
 
-    def drive(self, world: World, t_s: float) -> None:
+    def drive(self, world: RobotWorld, t_s: float) -> None:
         """Give the robot the command for `t_s`."""
         world.drive(self._name, self._controller.command(t_s, world.at(self._name, t_s).odometry), t_s)
 

@@ -11,7 +11,7 @@ from camera_node.geometry.pose import invert
 from camera_node.simulation.background import Picture, paint_floor
 from camera_node.simulation.renderer import ImageModel, place_discs
 from camera_node.simulation.scene import SceneCamera
-from web.formation.world import World
+from web.formation.world import RobotWorld
 
 FPS = 30.0
 ROUNDEL = Body(diameter_m=0.14)  # the paper's
@@ -46,7 +46,7 @@ class RobotCamera:
         floor: from `paint_background`.
     """
 
-    def __init__(self, world: World, name: str, floor: Picture) -> None:
+    def __init__(self, world: RobotWorld, name: str, floor: Picture) -> None:
         self._world, self._name, self._floor = world, name, floor
         self._model = ImageModel(CAMERA, zlib.crc32(name.encode()))
 

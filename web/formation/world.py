@@ -35,7 +35,7 @@ class Moment:
 
 
 class SimulatedRobot:
-    """One robot; `World` moves it.
+    """One robot; `RobotWorld` moves it.
 
     Args:
         pose: initial pose (3,).
@@ -74,7 +74,7 @@ class SimulatedRobot:
         )
 
 
-class World:
+class RobotWorld:
     """All robots, from time 0 on; safe to use from several threads.
 
     Args:

@@ -16,7 +16,7 @@ from web.formation.formation import SETTLED_S, FormationScore, start_world, want
 from web.formation.lockstep import run_lockstep
 from web.formation.planar import between, compose, moved, wrap
 from web.formation.vision import DIMMEST, light
-from web.formation.world import STANDSTILL, World
+from web.formation.world import STANDSTILL, RobotWorld
 
 FRAME_S = 1 / 30
 TIGHT = np.full(3, 0.05)
@@ -135,7 +135,7 @@ def test_the_leader_waits_for_followers():
 
 def test_robots_reach_their_commanded_velocity_and_odometry_drifts():
     """After a second, ten time constants, within the slip (3 sigma); odometry within 5 % of the way."""
-    world = World({"a": np.array([0.0, 0.0, 0.5])}, seed=1)
+    world = RobotWorld({"a": np.array([0.0, 0.0, 0.5])}, seed=1)
     world.drive("a", np.array([0.3, 0.0, 0.0]), 0.0)
     world.advance(2.0)
     way = between(world.at("a", 1.0).pose, world.at("a", 2.0).pose)
