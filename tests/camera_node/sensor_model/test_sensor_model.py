@@ -60,11 +60,9 @@ def test_the_range_ends_where_the_pattern_fills_the_image_and_where_it_has_D_pix
     assert min(image_size(LENS, PAPER.d_o, far, 0.5)) == pytest.approx(PAPER_D)
 
 
-def test_the_base_of_the_operational_space_is_a_length():
-    """It scales with all lengths, and a disc anywhere in it is in the image. The printed fractions do neither."""
+def test_a_pattern_anywhere_in_the_base_of_the_operational_space_is_in_the_image():
+    """And one a margin of d_o beyond its corner is not. With the fractions as printed, neither would hold."""
     space = operational_space(LENS, PAPER.d_o)
-    twice = operational_space(LENS, 2 * PAPER.d_o)
-    assert (twice.v_y, twice.v_z) == pytest.approx((2 * space.v_y, 2 * space.v_z))
     y, z = np.meshgrid(np.linspace(-0.5, 0.5, 5) * space.v_y, np.linspace(-0.5, 0.5, 5) * space.v_z)
     points = np.column_stack([y.ravel(), z.ravel(), np.full(y.size, space.v_max)])
     normals = np.tile([0.0, 0.0, -1.0], (len(points), 1))
