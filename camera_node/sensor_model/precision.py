@@ -12,12 +12,14 @@ import numpy as np
 
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import skew
 from camera_node.sensor_model.imaging import Imaging
 from camera_node.sensor_model.operational_space import Pattern
 
 EDGE_POINTS = 32  # of each circle
 RATIO_SIGMA = 0.002  # of d_i / d_o between prints of one kind, as in the detector's fit
 NORMAL_SIGMA = 0.5  # rad; prior that keeps frontal discs regular, whose normal has no effect to first order
+ACROSS_POINTS = 8  # of the quadrature across an edge
 LEVEL_WIDTH = 2.5  # blurs from an edge up to which pixels determine the grey levels
 PIXEL_VARIANCE = 1 / 12  # of a pixel's own width, square pixels
 ROUNDING = 1 / 12  # variance of rounding to 8 bits, square grey levels
@@ -33,6 +35,8 @@ class PredictedPrecision:
     Attributes:
         position_cov: (N, 3, 3) covariance of the disc's centre, camera frame, square metres.
         centre_cov_px: (N, 2, 2) covariance of the image of the disc's centre, square pixels.
+        ellipse_cov_px: (N, 2, 2) covariance of the outer ellipse's centre, which detections hold, square pixels. Unlike
+            the disc's own centre it does not depend on the normal's uncertainty.
         distance_sigma_m: (N,) standard deviation of the distance from the camera, metres.
         normal_sigma_rad: (N,) of the normal about its worse axis, given the right one of both solutions; at most
             `NORMAL_SIGMA`. To first order: the normal of a frontal roundel is better than this.
@@ -40,6 +44,7 @@ class PredictedPrecision:
 
     position_cov: Array
     centre_cov_px: Array
+    ellipse_cov_px: Array
     distance_sigma_m: Array
     normal_sigma_rad: Array
 
@@ -95,7 +100,8 @@ def predict_precision(
     known = np.isfinite(information).all(axis=(1, 2))
     cov = np.full_like(information, np.nan)
     cov[known] = np.linalg.inv(information[known])
-    return _summarize(cov, position, J_centre)
+    to_ellipse = _ellipse_centre_jacobian(lens, pattern.d_o / 2, position, frame)
+    return _summarize(cov, position, J_centre, to_ellipse)
 
 
 def _disc_frames(normal: Array) -> Array:
@@ -138,24 +144,21 @@ def _information(outer: _Edge, inner: _Edge, pattern: Pattern, imaging: Imaging)
     """(N, 8, 8) information of both edges on pose, ratio and levels; lengths in metres, angles in radians."""
     noise = imaging.noise**2 + ROUNDING
     ratio = pattern.d_i / pattern.d_o
-    # The area of each level for each pixel of an edge's length, beyond the edge up to the next one.
+    # The width of each level's area beyond an edge, up to the middle of the area between two edges.
     ring, hole = outer.by_radius * (1 - ratio) / 2, inner.by_radius * ratio / 2
     margin = outer.by_radius * (pattern.d / pattern.d_o - 1)
     total = np.zeros((len(outer.blur_px), UNKNOWNS, UNKNOWNS))
-    for edge, sign, inside in ((outer, 1.0, margin), (inner, -1.0, hole)):
+    for edge, sign, bright in ((outer, 1.0, margin), (inner, -1.0, hole)):
         J = np.zeros((*edge.blur_px.shape, 6))
         J[..., :5] = edge.by_pose
         if edge is inner:
             J[..., RATIO] = edge.by_radius
-        weight = imaging.contrast**2 / (2 * np.sqrt(np.pi) * edge.blur_px) * edge.length_px
-        total[:, :6, :6] += np.einsum("nm,nmi,nmj->nij", weight, J, J)
-        # An outward displacement of the outer edge darkens by c phi(delta / b) / b; the share of a level there is the
-        # normal distribution. The integral of their product is c / 2.
-        cross = -sign * imaging.contrast / 2 * np.einsum("nm,nmi->ni", edge.length_px, J)
-        for level, width in ((BRIGHT, inside), (DARK, ring)):
-            reach = np.minimum(np.abs(width), LEVEL_WIDTH * edge.blur_px)
-            total[:, :6, level] += cross
-            total[:, level, level] += (edge.length_px * reach).sum(axis=1)
+        across = _across_edge(edge.blur_px, np.abs(ring), np.abs(bright)) * edge.length_px[..., None, None]
+        weight, contrast = across[..., 0, 0], imaging.contrast
+        total[:, :6, :6] += contrast**2 * np.einsum("nm,nmi,nmj->nij", weight, J, J)
+        # An outward displacement of the outer edge darkens by c phi(delta / b) / b, of the inner edge it brightens.
+        total[:, :6, BRIGHT:] -= sign * contrast * np.einsum("nma,nmi->nia", across[..., 0, 1:], J)
+        total[:, BRIGHT:, BRIGHT:] += across[..., 1:, 1:].sum(axis=1)
     total[:, BRIGHT:, :6] = total[:, :6, BRIGHT:].mT
     total /= noise
     total[:, RATIO, RATIO] += RATIO_SIGMA**-2
@@ -163,12 +166,45 @@ def _information(outer: _Edge, inner: _Edge, pattern: Pattern, imaging: Imaging)
     return total
 
 
-def _summarize(cov: Array, position: Array, J: Array) -> PredictedPrecision:
+def _across_edge(blur_px: Array, dark_px: Array, bright_px: Array) -> Array:
+    """(..., 3, 3) integrals across an edge of the products of its three derivatives, for each pixel of its length.
+
+    The derivatives are phi(delta / b) / b by the displacement, for a contrast of 1, and the shares of the bright and of
+    the dark level. A level reaches to the width of its area (...), pixels, or to `LEVEL_WIDTH` blurs.
+    """
+    low = -np.minimum(dark_px / blur_px, LEVEL_WIDTH)[..., None]
+    high = np.minimum(bright_px / blur_px, LEVEL_WIDTH)[..., None]
+    nodes, weights = np.polynomial.legendre.leggauss(ACROSS_POINTS)
+    u = low + (high - low) * (nodes + 1) / 2  # in blurs
+    density = np.exp(-(u**2) / 2) / np.sqrt(2 * np.pi) / blur_px[..., None]
+    bright = (1 + np.tanh(np.sqrt(2 / np.pi) * (u + 0.044715 * u**3))) / 2  # the normal distribution to 3e-4
+    columns = np.stack([density, bright, 1 - bright], axis=-1)
+    weighted = columns * (weights * (high - low) / 2 * blur_px[..., None])[..., None]
+    return columns.mT @ weighted
+
+
+def _ellipse_centre_jacobian(lens: Lens, radius: float, position: Array, frame: Array) -> Array:
+    """(N, 2, 5) derivative of the outer ellipse's centre by position and by rotations of the normal about e1 and e2.
+
+    The centre is the projection of q = c + r^2 / c_z (n_z n - e_z); see docs/fusion_filter.md, section 3.
+    """
+    n, z = frame[:, :, 2], np.array([0.0, 0.0, 1.0])
+    lift = (radius**2 / position[:, 2])[:, None]
+    s = lift * (n[:, 2:] * n - z)
+    by_position = np.eye(3) - (s / position[:, 2:])[:, :, None] * z
+    by_normal = lift[..., None] * (n[:, :, None] * z + n[:, 2, None, None] * np.eye(3))
+    by_turn = by_normal @ -skew(n) @ frame[:, :, :2]
+    J = lens.project_with_jacobian(position + s)[1]
+    return J @ np.concatenate([by_position, by_turn], axis=2)
+
+
+def _summarize(cov: Array, position: Array, J: Array, to_ellipse: Array) -> PredictedPrecision:
     p = cov[:, POSITION, POSITION]
     line = position / np.linalg.norm(position, axis=1, keepdims=True)
     return PredictedPrecision(
         p,
         J @ p @ J.mT,
+        to_ellipse @ cov[:, :5, :5] @ to_ellipse.mT,
         np.sqrt(np.einsum("ni,nij,nj->n", line, p, line)),
         np.sqrt(np.linalg.eigvalsh(cov[:, NORMAL, NORMAL])[:, -1]),
     )

@@ -22,7 +22,9 @@ from web.html_tables import MARGIN_PX
 from web.scene.cameras import CameraDrawing
 from web.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
+from web.tabs.lens import LensPanel
 from web.tabs.mask_editor import MaskEditor
+from web.tabs.rig_change import CalibrationFiles
 from web.widgets import ActionButton, Answer, set_content, set_property
 
 NO_CAMERA = "no camera yet"
@@ -90,9 +92,14 @@ def picture_grid(previews: Mapping[str, Preview], state: ArenaState) -> str:
 
 
 class CameraSettings:
-    """The name and the settings of one camera, its mask, and its image in full resolution."""
+    """The name and the settings of one camera, its mask, its lens, and its image in full resolution."""
 
-    def __init__(self, server: viser.ViserServer, subscription: Subscription) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        subscription: Subscription,
+        files: CalibrationFiles | None = None,
+    ) -> None:
         gui = server.gui
         self._gui, self._subscription = gui, subscription
         self._folder = gui.add_folder("One camera")
@@ -118,6 +125,7 @@ class CameraSettings:
             )
             self._image: viser.GuiImageHandle | None = None
             self._mask = MaskEditor(server, subscription, lambda: self._name, self._request_picture)
+            self._lens = LensPanel(gui, subscription, files, lambda: self._name) if files else None
 
     def update(self, state: ArenaState) -> None:
         """Offer the cameras that publish."""
@@ -127,6 +135,13 @@ class CameraSettings:
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
         self._mask.update(state)
+        if self._lens is not None:
+            self._lens.update(state)
+
+    def close(self) -> None:
+        """End a capture of a board."""
+        if self._lens is not None:
+            self._lens.close()
 
     def rename(self) -> str:
         """Have the server rename the camera, in the rig too. Raises ConfigError, RequestError or NetworkError."""
