@@ -51,21 +51,12 @@ class Result:
     flipped: float
 
 
-def _with_noise(noise: float) -> Condition:
-    return Condition(sensor=monochrome(noise))
-
-
-def monochrome(noise: float) -> Sensor:
-    """A monochrome machine-vision camera of this noise, grey levels."""
-    return Sensor(noise=noise)
-
-
 SWEEPS: Mapping[str, Mapping[str, Condition]] = {
     "distance (m)": {f"{x:g}": Condition(x) for x in (1.5, 2.5, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)},
     "slant (degrees)": {f"{x:g}": Condition(slant=x) for x in (0.0, 15.0, 30.0, 45.0, 60.0, 70.0)},
     "blur (sigma, px)": {f"{x:g}": Condition(blur=x) for x in (0.5, 1.0, 1.5, 2.0, 3.0)},
     "motion during the exposure (px)": {f"{x:g}": Condition(motion=x) for x in (0.0, 4.0, 8.0, 16.0, 24.0)},
-    "noise (grey levels)": {f"{x:g}": _with_noise(x) for x in (1.0, 3.0, 6.0, 12.0, 20.0)},
+    "noise (grey levels)": {f"{x:g}": Condition(sensor=Sensor(noise=x)) for x in (1.0, 3.0, 6.0, 12.0, 20.0)},
     "camera": {name: Condition(sensor=sensor) for name, sensor in SENSORS.items()},
 }
 
@@ -163,7 +154,7 @@ def measure(views: int = 16, folder: Path = PLOTS, progress: Callable[[str], Non
         f"Each sheet has {1e4 * AREA_M2:.0f} cm² with its margin: a roundel of d_o = 14 cm, an AprilTag of 12.8 cm, an "
         f"ArUco tag of 12.0 cm. Simulated: f = 600 px, 640x480, {views} views for each point at random positions and "
         f"rotations on clutter; unless it is varied, {Condition().distance:g} m, {Condition().slant:g} degrees, blur "
-        "0.7 px, noise 3. Tags: pupil's AprilTag 3 without decimation, ArUco with sub-pixel corners, poses by "
+        "0.7 px, noise 3. Tags: AprilTag 3 (pyapriltags) without decimation, ArUco with sub-pixel corners, poses by "
         "IPPE_SQUARE. Cells: found / centre px / distance % / normal degrees / share of wrong normals.",
         tables,
     )

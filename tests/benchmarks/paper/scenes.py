@@ -153,15 +153,6 @@ def trace_print(view: View, sheet: Print, rng: np.random.Generator | None = None
     return Picture(pixels[margin : h - margin, margin : w - margin], lens)
 
 
-def whole_image(view: View, picture: Picture, rng: np.random.Generator) -> Picture:
-    """The picture in its place in the camera's image, on clutter drawn by `rng`."""
-    w, h = view.lens.width, view.lens.height
-    light = np.asarray(cv2.GaussianBlur(dead_leaves((h, w), rng), (0, 0), view.blur_px), float)
-    u, v = round(view.lens.cx - picture.lens.cx), round(view.lens.cy - picture.lens.cy)
-    light[v : v + picture.lens.height, u : u + picture.lens.width] = picture.light
-    return Picture(light, view.lens)
-
-
 def _normalised(lens: Lens, margin: int) -> Array:
     """(V, U, 2) x/z and y/z of the rays of all samples, linear between the pixels' centres."""
     u, v = (np.arange(-margin, n + margin, dtype=float) for n in (lens.width, lens.height))

@@ -9,11 +9,12 @@ import numpy as np
 
 from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
+from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, paste
 from tests.benchmarks.detector.table import milliseconds, milliseconds_prepared
 from tests.benchmarks.paper import published
 from tests.benchmarks.paper.reference import PaperDetector
 from tests.benchmarks.paper.report import Section, name_of, table
-from tests.benchmarks.paper.scenes import BRIGHT, DARK, View, roundel, trace_print, whole_image
+from tests.benchmarks.paper.scenes import BRIGHT, DARK
 
 DISTANCE_M, NOISE = 1.5, 3.0
 FRAMES = 16  # the interval of searches of unchanged parts: the unit in which tracking is timed
@@ -21,14 +22,12 @@ STEP_PX = 0.8  # motion from frame to frame
 
 
 def render(resolution: tuple[int, int]) -> list[Grey]:
-    """Frames of a pattern that moves slowly across the optical axis, on clutter."""
-    lens, frames = published.paper_lens(resolution), []
+    """Frames of a pattern that moves slowly across the optical axis, on clutter at rest."""
+    (w, h), lens = resolution, published.paper_lens(resolution)
+    ground, frames = dead_leaves((h, w), np.random.default_rng(1)), []
     for k in range(4):
-        uv = lens.cx + k * STEP_PX, lens.cy
-        view = View(lens, uv, DISTANCE_M, slant=0.2)
-        part = trace_print(view, roundel(published.PATTERN), np.random.default_rng(1))
-        image = whole_image(view, part, np.random.default_rng(2))
-        frames.append(image.expose(NOISE, np.random.default_rng(k)))
+        card = Card((lens.cx + k * STEP_PX, lens.cy), lens.fx * published.PATTERN.d_o / DISTANCE_M, 0.2)
+        frames.append(expose(paste(ground, [card], focal=lens.fx), NOISE, np.random.default_rng(k)))
     return frames
 
 

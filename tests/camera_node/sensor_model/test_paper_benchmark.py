@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera_node.sensor_model.visibility import detection_range
 from camera_node.simulation.sensor import SENSORS
 from tests.benchmarks.paper import comparison, distances, published, ranges, speed, threshold
 from tests.benchmarks.paper.markers import markers
@@ -60,7 +61,7 @@ def test_every_marker_is_found_close_by_at_its_pose():
 
 def test_ours_is_more_precise_than_the_reference_and_the_distance_repeats_as_predicted():
     done, predicted = distances.measure_resolution((320, 240), 12)
-    ours, reference = done["ours"].table(), done["reference"].table()
+    ours, reference = done["ours"].table(3.2), done["reference"].table(3.2)
     near = [x for x in ours if x in reference and 1 <= x <= 3]
     assert len(near) == 5
     ratios = [ours[x][1] / predicted[x] for x in near]
@@ -70,12 +71,11 @@ def test_ours_is_more_precise_than_the_reference_and_the_distance_repeats_as_pre
 
 
 def test_v_max_of_the_model_is_within_a_pixel_of_the_measured_range():
-    """The measured range is in steps of one pixel, on patterns with the paper's larger margin."""
-    lens, pattern = published.paper_lens((480, 360)), published.PATTERN
-    measured = ranges.largest_distances(lens, pattern, 10)["ours"]
-    focal = min(lens.fx, lens.fy)
-    smallest = pattern.d_o * focal / measured
-    assert smallest <= float(threshold.threshold.threshold_D(0.0, 0.7)) + 1
+    """Of the pattern's size in the image."""
+    lens, pattern = published.paper_lens((752, 480)), published.PATTERN
+    ends = ranges.largest_distances(lens, pattern, 10)["ours"], detection_range(lens, pattern)[1]
+    measured, predicted = (pattern.d_o * lens.fx / end for end in ends)
+    assert measured == pytest.approx(predicted, abs=1.0)
 
 
 def test_detection_ends_where_the_threshold_says():
