@@ -94,6 +94,7 @@ def _may_be_rings(stats: Index, w: int, h: int) -> Mask:
     # A ring has 1 - ratio^2 of the disc's area, a slanted and turned one less of its box.
     ring = np.pi / 4 * (1 - INNER_RATIO**2) * width * height
     large = (width >= 6) & (height >= 4)
+    large[0] = False  # label 0 is all bright pixels
     return inside & large & (area > (1 - BOX_TOLERANCE) * ring * 0.5) & (area < (1 + BOX_TOLERANCE) * ring)
 
 
