@@ -15,7 +15,8 @@ from calib.live.rig_requests import set_rig
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
 from fusion.protocol.messages import RobotPose
 from web.demo_progress import (
@@ -101,11 +102,12 @@ class Demo:
             server: the server, which `processes` runs.
         """
         self.scene, self.files, self.processes, self.endpoint = scene, files, processes, server.endpoint
-        self.session = open_client([self.endpoint])
+        self.connection = ServerConnection([self.endpoint])
+        self.session = self.connection.session(CONNECT_S)
         self.delay_s = start_delay_s(len(scene.cameras) + 2, server.startup_s)  # cameras, page, calibration
         self.clock = SceneClock(scene, time.time_ns() + round(self.delay_s * 1e9))
         self.feed = Feed(ARENA, self._add_to_score)
-        self.subscription = Subscription(self.session, self.feed)
+        self.subscription = Subscription(self.connection, self.feed)
         self._reporter = ProgressReporter(self.session, ARENA, self.clock)
         self._score: PoseScore | None = None
 
@@ -119,7 +121,7 @@ class Demo:
             return self._track_and_score(seconds)
         finally:
             self.subscription.close()
-            self.session.close()
+            self.connection.close()
 
     def _start_programs(self, page: tuple[str, int] | None) -> None:
         """Start the cameras, the viewer and the calibration."""

@@ -14,7 +14,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings, request_snapshot
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 
@@ -23,9 +23,9 @@ class CameraConnection(ServerAddress):
     """Where a camera is reached."""
 
     def open(self) -> Session:
-        """Open a session for requests; raises as `open_requester`."""
+        """Open a session for requests; raises as `open_client`."""
         require_name(self.arena, "an arena")
-        return open_requester(self.connect, self.zenoh)
+        return open_client(self.connect, self.zenoh)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from camera_node.protocol.registration import (
     registered_key,
 )
 from camera_node.protocol.requests import RequestError, RequestSource, send_request
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME"}
@@ -44,7 +44,7 @@ def cameras(
     """
     if len(arguments) != N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         if action == "list":
             reply = send_request(session, registered_key(arena))
         else:

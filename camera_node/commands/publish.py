@@ -79,7 +79,7 @@ class Publish:
 
     def _open_session(self) -> "zenoh.Session":
         """Wait for the server; the service is ready while it waits."""
-        from camera_node.protocol.session import open_when_reachable
+        from camera_node.protocol.connection import ServerConnection
 
         with contextlib.ExitStack() as stack:
             service = stack.enter_context(ServiceManager())
@@ -89,7 +89,7 @@ class Publish:
                 service.report("waits for a server")
                 service.progress()
 
-            session = open_when_reachable(self.connect, self.zenoh, report)
+            session = ServerConnection(self.connect, self.zenoh).wait(report)
             stack.pop_all()  # the service goes on
             return session
 
