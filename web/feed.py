@@ -23,6 +23,7 @@ from web.messages import DemoProgress, progress_key
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
 REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
+REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
 
@@ -160,6 +161,10 @@ class Feed:
         ):  # renamed or removed, unless it is new
             if self._clock() - state.poses[robot].received_s > REMOVED_S:
                 del state.poses[robot]
+        for camera in state.cameras.keys() - status.cameras.keys():  # renamed or forgotten, unless it is new
+            if self._clock() - state.cameras[camera].received_s > REMOVED_CAMERA_S:
+                for messages in (state.cameras, state.previews, state.detections, state.coverage):
+                    messages.pop(camera, None)
 
     def _store_camera_status(self, status: CameraStatus, key: str) -> None:
         self._store_named(self._state.cameras, status.camera, status, key)
