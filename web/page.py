@@ -17,6 +17,7 @@ from web.tabs.rig_change import CalibrationFiles
 from web.tabs.robots import RobotEditor, RobotTable
 from web.tabs.status import StatusTab
 from web.tabs.wand_session import WandSessionPanel
+from web.tabs.world import WorldPanel
 from web.view import View
 
 
@@ -54,6 +55,7 @@ def add_live_page(
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
             closing.callback(panel.close)
+            view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistory(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))

@@ -157,7 +157,8 @@ def open_source(
         text: the value of `--source`.
         settings: each kind of source uses those that apply to it.
         name: the camera's name in a simulated arena, unless `text` has it, as in `sim:north`.
-        arena_time: recordings and simulations play as live cameras in this time, whatever `settings` say.
+        arena_time: recordings play as live cameras in this time, whatever `settings` say, and so do simulations
+            without an epoch.
 
     Raises:
         CameraError: the source does not exist or does not open.
@@ -190,6 +191,6 @@ def first_time(text: str, settings: SourceSettings) -> int | None:
 def _open_simulation(settings: SourceSettings, name: str, arena_time: ArenaTime | None) -> Source:
     scene = settings.scene or example_file("demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
-    if arena_time is not None:
+    if arena_time is not None and settings.epoch_ns is None:
         epoch_ns = arena_time.shift_ns - arena_time.ahead_ns
     return SimulatedCamera(scene, name, epoch_ns)
