@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <array>
-#include <vector>
 #include <bit>
 #include <cstdint>
+#include <vector>
 
 #include "fit/edge_pixels.hpp"
 #include "numeric/image.hpp"
