@@ -68,6 +68,7 @@ class Update:
         prediction, tracked: see `AssociatedFrames`.
         detections: of all cameras that are not excluded.
         assignments: of the detections, with residuals.
+        associated: the assignments before those were dropped that do not fit.
         summary: of the assignments.
         poses: by row of the robot; acquisition does not change these.
     """
@@ -77,6 +78,7 @@ class Update:
     tracked: Mask
     detections: DetectionTable
     assignments: Assignments
+    associated: Assignments
     summary: ObservationSummary
     poses: dict[int, RobotPose]
 
@@ -207,20 +209,23 @@ class Tracker:
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, assignments = self._collect(associated, self._admitted(frame_set))
-        assignments = self._update_states(associated.prediction, detections, assignments)
+        detections, all_assigned = self._collect(associated, self._admitted(frame_set))
+        assignments = self._update_states(associated.prediction, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         self.geometry.note(summary.residual_px)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
-        return Update(t_ns, associated.prediction, tracked, detections, assignments, summary, poses)
+        return Update(
+            t_ns, associated.prediction, tracked, detections, assignments, all_assigned, summary, poses
+        )
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         update, found = self._acquire(update)
         table = self.table
-        self.clocks.observe(update.t_ns, table.states, table.tracked, update.detections, update.assignments)
+        robots, is_doubtful = (table.states, table.tracked), bool(self._in_doubt(update.t_ns))
+        self.clocks.observe(update.t_ns, robots, update.detections, update.associated, is_doubtful)
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
@@ -234,7 +239,13 @@ class Tracker:
         for correction in corrections:
             if correction.camera is not None:
                 self.cameras.place(correction.name, correction.camera)
+                self.consistency.forget(correction.name)
+                self.clocks.rebase()
         return corrections
+
+    def _in_doubt(self, t_ns: int) -> set[str]:
+        """Cameras that contradict the others, or whose poses are unknown."""
+        return self.consistency.in_doubt(t_ns) | self.extrinsics.excluded
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
