@@ -27,11 +27,8 @@ RECENT_NS, MIN_NS = 10_000_000_000, 3_000_000_000  # of the windows that show an
 MIN_BEFORE = 3  # windows before a change
 FOLLOWED_PX = 0.15  # that a change of a camera explains which departed before
 OFFSET_PX = 0.4  # RMS image motion that an offset explains
-SHORT_PX, LONG_PX, LONG_PATH_PX = (
-    0.45,
-    0.2,
-    1500.0,
-)  # that a change explains; after markers moved so far, the second
+SHORT_PX, LONG_PX = 0.45, 0.2  # that a change explains: at first, and after
+LONG_PATH_PX = 1500.0  # of image motion since the change, over which calibration errors are independent
 MIN_CHANGE_S = 0.0005
 MIN_CHI2 = 36.0  # that a change explains, with any of some hundred onsets
 NOISE_CHI2 = 11.0  # 99 % of chi-square with three degrees of freedom

@@ -220,6 +220,10 @@ class TrackingPipeline:
         """Cameras that were moved, whose detections are excluded."""
         return set(self.tracker.extrinsics.excluded) if self.tracker else set()
 
+    def frozen_cameras(self) -> set[str]:
+        """Cameras that repeat an old image."""
+        return self.tracker.frozen.names if self.tracker else set()
+
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""
         return self.tracker.not_acquired() if self.tracker else dict.fromkeys(self.robots, NOT_CALIBRATED)

@@ -211,6 +211,7 @@ class Server:
             limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            frozen=frozenset(self.pipeline.frozen_cameras()),
             clocks=self.pipeline.clocks(),
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
