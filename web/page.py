@@ -7,6 +7,7 @@ from pathlib import Path
 
 from web.feed import Feed
 from web.replay import RecordingPlayer
+from web.scene.coverage import CoverageVolume
 from web.subscription import Subscription
 from web.tabs.calibrate import RigHistory
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
@@ -17,6 +18,7 @@ from web.tabs.rig_change import CalibrationFiles
 from web.tabs.robots import RobotEditor, RobotTable
 from web.tabs.status import StatusTab
 from web.tabs.wand_session import WandSessionPanel
+from web.tabs.world import WorldPanel
 from web.view import View
 
 
@@ -43,6 +45,7 @@ def add_live_page(
     view.add(header)
     with header.tabs["Cameras"]:
         view.add(CameraTable(gui))
+        view.add(CoverageVolume(view.server, view.feed.count_fault))
         pictures = LivePictures(view.server, subscription, view.cameras)
         closing.callback(pictures.close)
         view.add(pictures, is_live=True)
@@ -54,6 +57,7 @@ def add_live_page(
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
             closing.callback(panel.close)
+            view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistory(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))

@@ -13,7 +13,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.camera_requests import change_camera, request_cameras, request_snapshot
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
 from camera_node.protocol.requests import RequestSource
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME", "why": "NAME [PICTURE.jpg]"}
@@ -40,7 +40,7 @@ def cameras(
     """
     if len(arguments) not in N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         if action == "why":
             name = require_name(arguments[0], "a camera")
             out = Path(arguments[1] if len(arguments) > 1 else f"{name}_why.jpg")

@@ -92,7 +92,8 @@ class Publish:
 
     def _open_session(self) -> "zenoh.Session":
         """Wait for the server, if there is to be one; the service is ready while it waits."""
-        from camera_node.protocol.session import open_router, open_when_reachable
+        from camera_node.protocol.connection import ServerConnection
+        from camera_node.protocol.session import open_router
 
         if self.listen:
             return open_router(self.listen, self.zenoh)
@@ -104,7 +105,7 @@ class Publish:
                 service.report("waits for a server")
                 service.progress()
 
-            session = open_when_reachable(self.connect, self.zenoh, report)
+            session = ServerConnection(self.connect, self.zenoh).wait(report)
             stack.pop_all()  # the service goes on
             return session
 
@@ -156,7 +157,8 @@ def open_source(
         text: the value of `--source`.
         settings: each kind of source uses those that apply to it.
         name: the camera's name in a simulated arena, unless `text` has it, as in `sim:north`.
-        arena_time: recordings and simulations play as live cameras in this time, whatever `settings` say.
+        arena_time: recordings play as live cameras in this time, whatever `settings` say, and so do simulations
+            without an epoch.
 
     Raises:
         CameraError: the source does not exist or does not open.
@@ -189,6 +191,6 @@ def first_time(text: str, settings: SourceSettings) -> int | None:
 def _open_simulation(settings: SourceSettings, name: str, arena_time: ArenaTime | None) -> Source:
     scene = settings.scene or example_file("demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
-    if arena_time is not None:
+    if arena_time is not None and settings.epoch_ns is None:
         epoch_ns = arena_time.shift_ns - arena_time.ahead_ns
     return SimulatedCamera(scene, name, epoch_ns)

@@ -13,6 +13,7 @@ from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
 STEPS = 4  # Gauss-Newton iterations; the poses from the conic are close to the solution
+MAX_SIGMA = np.pi / 2  # of a normal, radians: nothing is known
 STEP = 0.2  # largest step: of the normal in radians, of the position relative to the distance
 
 
@@ -24,12 +25,14 @@ class AdjustedDiscs:
         position, normal: (N, 3).
         chi2: (N,) weighted sum of squared residuals, with two degrees of freedom.
         cov: (N, 3, 3) covariance of `position`, squared unit of `position`, to first order.
+        normal_sigma: (N,) standard deviation of `normal` in its least certain direction, radians, to first order.
     """
 
     position: Array
     normal: Array
     chi2: Array
     cov: Array
+    normal_sigma: Array
 
 
 def shape_of(dual: Array) -> Array:
@@ -99,12 +102,17 @@ def adjust(
     c, n = np.where(valid, c, position), np.where(valid, n, normal)
     predicted, J, _ = _predict(c, n, radius)
     residual = to_white @ (measured - predicted)[..., None]
-    return AdjustedDiscs(c, n, (residual**2).sum(axis=(1, 2)), _position_covariance(c, to_white @ J))
+    return AdjustedDiscs(c, n, (residual**2).sum(axis=(1, 2)), *_precision(c, to_white @ J))
 
 
-def _position_covariance(c: Array, J: Array) -> Array:
-    """(N, 3, 3) covariance of positions c (N, 3) from the whitened derivatives (N, 7, 5) of `_predict`."""
-    return (c * c).sum(axis=1)[:, None, None] * np.linalg.inv(J.mT @ J)[:, :3, :3]
+def _precision(c: Array, J: Array) -> tuple[Array, Array]:
+    """Covariances (N, 3, 3) of positions c (N, 3), and standard deviations (N,) of normals.
+
+    `J` are the whitened derivatives (N, 7, 5) of `_predict`.
+    """
+    cov = np.linalg.inv(J.mT @ J)
+    sigma = np.sqrt(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, 1])
+    return (c * c).sum(axis=1)[:, None, None] * cov[:, :3, :3], np.minimum(sigma, MAX_SIGMA)
 
 
 def _predict(c: Array, n: Array, radius: float) -> tuple[Array, Array, Array]:

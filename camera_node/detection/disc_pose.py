@@ -43,7 +43,8 @@ class DiscPoses:
     """Both poses of N discs, the likelier first; rows are NaN where the lens has no inverse at the ellipse.
 
     Shapes: position_m and normal (N, 2, 3), centre_uv (N, 2, 2), probability (N, 2); as in `DiscPose`. `cov`
-    (N, 2, 3, 3) is the covariance of `position_m`, square metres; NaN unless the roundels are `DetectedRoundels`.
+    (N, 2, 3, 3) is the covariance of `position_m`, square metres, and `normal_sigma` (N, 2) the standard deviation of
+    `normal`, radians; NaN unless the roundels are `DetectedRoundels`.
     """
 
     position_m: Array
@@ -51,6 +52,7 @@ class DiscPoses:
     centre_uv: Array
     probability: Array
     cov: Array
+    normal_sigma: Array
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -148,6 +150,7 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | 
     valid = np.isfinite(xy).all(axis=(1, 2))
     position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
     odds, cov = np.full((n, 2), 0.5), np.full((n, 2, 3, 3), np.nan)
+    sigma = np.full((n, 2), np.nan)
     if valid.any():
         Q, radius = _fit_conics(xy[valid]), diameter_m / 2
         position[valid], normal[valid] = decompose(Q, radius)
@@ -158,9 +161,10 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | 
             )
             position[valid], normal[valid] = both.position.reshape(-1, 2, 3), both.normal.reshape(-1, 2, 3)
             odds[valid], cov[valid] = _odds(both.chi2.reshape(-1, 2)), both.cov.reshape(-1, 2, 3, 3)
+            sigma[valid] = both.normal_sigma.reshape(-1, 2)
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
     pick = np.arange(n)[:, None], np.argsort(-odds, axis=1, kind="stable")
-    return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick], cov[pick])
+    return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick], cov[pick], sigma[pick])
 
 
 def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[Array, Array]:

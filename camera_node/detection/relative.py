@@ -30,6 +30,7 @@ class LocatedRoundels:
         normals: (N, 2, 3) unit normals out of the printed side, the more probable one first. Both are equal where the
             image determines one.
         probability: (N, 2) of the normals.
+        normal_sigma: (N, 2) standard deviation of each normal in its least certain direction, radians, to first order.
         axis_distance: (N,) distance by the principal axis, Section III-C of Faigl et al., ICRA 2013.
         id, track: (N,) as in `Roundels`.
     """
@@ -38,6 +39,7 @@ class LocatedRoundels:
     cov: Array
     normals: Array
     probability: Array
+    normal_sigma: Array
     axis_distance: Array
     id: NDArray[np.int32]
     track: NDArray[np.int32]
@@ -94,6 +96,7 @@ class DiscLocalizer:
             cov=cov[valid],
             normals=poses.normal[valid],
             probability=poses.probability[valid],
+            normal_sigma=poses.normal_sigma[valid],
             axis_distance=distance[valid],
             id=roundels.id[valid],
             track=roundels.track[valid],

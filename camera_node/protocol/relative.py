@@ -19,6 +19,7 @@ COLUMNS = {  # type and number of values in each row
     "cov": (F8, 6),
     "normals": (F4, 6),
     "probability": (F4, 1),
+    "normal_sigma": (F4, 2),
     "axis_distance": (F4, 1),
     "id": (I4, 1),
     "track": (I4, 1),
@@ -30,8 +31,8 @@ class RelativePositions(msgspec.Struct, frozen=True, kw_only=True):
     """The roundels of one frame relative to the camera. `camera`, `seq` and the times are those of its `Detections`.
 
     Columns with one row for each roundel, as in `LocatedRoundels`: `position` (N, 3) <f8; `cov` (N, 6) <f8 xx, xy, xz,
-    yy, yz, zz; `normals` (N, 2, 3) <f4; `probability` (N,) <f4 of the first normal; `axis_distance` (N,) <f4;
-    `id` and `track` (N,) <i4, -1 for none.
+    yy, yz, zz; `normals` (N, 2, 3) <f4; `probability` (N,) <f4 of the first normal; `normal_sigma` (N, 2) <f4;
+    `axis_distance` (N,) <f4; `id` and `track` (N,) <i4, -1 for none.
     """
 
     version: int = VERSION
@@ -46,6 +47,7 @@ class RelativePositions(msgspec.Struct, frozen=True, kw_only=True):
     cov: bytes
     normals: bytes
     probability: bytes
+    normal_sigma: bytes
     axis_distance: bytes
     id: bytes
     track: bytes
@@ -98,8 +100,9 @@ class RelativePositions(msgspec.Struct, frozen=True, kw_only=True):
         if not (np.abs(np.linalg.norm(normals, axis=1) - 1) < NORM_ERROR).all():
             raise MessageError("a normal is not of length 1")
         probability = self._column("probability")
-        if not ((probability >= 0) & (probability <= 1)).all():
-            raise MessageError("a probability is not in [0, 1]")
+        sigma = self._column("normal_sigma")
+        if not ((probability >= 0) & (probability <= 1)).all() or not (sigma >= 0).all():
+            raise MessageError("a probability is not in [0, 1], or a standard deviation not above 0")
 
     def _check_positions(self) -> None:
         if not (np.abs(self._column("position")) < MAX_DISTANCE_M).all():

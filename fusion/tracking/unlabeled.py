@@ -19,6 +19,7 @@ from fusion.model.states import POSITION, States, reset_unobservable
 from fusion.tracking.company import Company
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import (
+    ANY_DIAMETERS,
     FORGET_NS,
     MAX_CHI2,
     POSITION_GATE,
@@ -152,7 +153,7 @@ class UnlabeledTracker:
 
     Args:
         cameras: cameras of the rig.
-        radii: (R,) of the markers in use, one or more.
+        radii: (R,) of the markers in use; where there is none, a marker has its apparent size.
     """
 
     def __init__(self, cameras: CameraArray, radii: Array) -> None:
@@ -242,9 +243,12 @@ class UnlabeledTracker:
 
     def _radius(self, marker: Marker) -> float:
         """The radius in use that is closest to the apparent size of the marker."""
-        if not np.isfinite(marker.diameter_m):
+        apparent = marker.diameter_m / 2
+        if not len(self._radii):
+            return apparent if np.isfinite(apparent) else ANY_DIAMETERS[0] / 2
+        if not np.isfinite(apparent):
             return float(self._radii[0])
-        return float(self._radii[np.argmin(np.abs(self._radii - marker.diameter_m / 2))])
+        return float(self._radii[np.argmin(np.abs(self._radii - apparent))])
 
 
 def _pair(states: States, position: Array, covariance: Array) -> Index:

@@ -18,6 +18,7 @@ def random_positions(n: int, seed: int = 0) -> LocatedRoundels:
         cov=root @ root.mT + 1e-3 * np.eye(3),
         normals=normals / np.linalg.norm(normals, axis=2, keepdims=True),
         probability=np.stack([first, 1 - first], axis=1),
+        normal_sigma=rng.uniform(0, 1, (n, 2)),
         axis_distance=rng.uniform(1, 9, n),
         id=np.full(n, -1, np.int32),
         track=np.arange(n, dtype=np.int32),

@@ -25,7 +25,7 @@ def test_positions_are_decoded_as_they_were_encoded(n: int, seed: int):
         assert np.array_equal(
             getattr(got, name), getattr(sent, name) if name != "cov" else symmetric(sent.cov)
         )
-    for name in ("normals", "probability", "axis_distance"):
+    for name in ("normals", "probability", "normal_sigma", "axis_distance"):
         np.testing.assert_allclose(getattr(got, name), getattr(sent, name), rtol=0, atol=9 * 2.0**-24)
 
 
@@ -59,6 +59,7 @@ def changed(name: str, row: int, value: float) -> dict[str, bytes]:
         changed("normals", 0, 3.0),
         changed("probability", 0, 1.1),
         changed("probability", 1, math.nan),
+        changed("normal_sigma", 1, -0.1),
         changed("axis_distance", 0, -1.0),
         {"camera": "a/b"},
         {"diameter_m": 0.0},
