@@ -3,7 +3,7 @@
 
 import os
 
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
 from camera_node.terminal import say
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
@@ -36,8 +36,10 @@ def ros2(
     with (
         stopped_by_signals() as stop,
         server.receive_poses() as poses,
-        open_client(ros or server.connect, None if ros else server.zenoh) as session,
+        ServerConnection(ros or server.connect, None if ros else server.zenoh) as connection,
     ):
+        if (session := connection.wait_unless(stop)) is None:
+            return 0
         node = Ros2Node(session, ros_domain, prefix, humble)
         say(f"ROS 2, domain {ros_domain}")
         for camera in relative:
