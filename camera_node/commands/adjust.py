@@ -21,7 +21,7 @@ from camera_node.protocol.camera_requests import (
 )
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 
@@ -30,9 +30,9 @@ class CameraConnection(ServerAddress):
     """Where a camera is reached."""
 
     def open(self) -> Session:
-        """Open a session for requests; raises as `open_requester`."""
+        """Open a session for requests; raises as `open_client`."""
         require_name(self.arena, "an arena")
-        return open_requester(self.connect, self.zenoh)
+        return open_client(self.connect, self.zenoh)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.camera_requests import change_camera, request_cameras
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
 from camera_node.protocol.requests import RequestSource
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME"}
@@ -38,7 +38,7 @@ def cameras(
     """
     if len(arguments) != N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         registered = (
             request_cameras(session, arena)
             if action == "list"

@@ -12,6 +12,7 @@ from calib.live.rig_requests import request_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.node.clock_sync import ClockSync
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import ClockReply, encode
 from camera_node.protocol.session import listening_endpoints, open_client, open_router
 from fusion.protocol.messages import Robots, robots_key
@@ -93,7 +94,8 @@ def test_a_false_rig_is_not_believed(tmp_path: Path):
         rig = request_rig(session, KEYS.arena)
         assert rig is not None
         assert "false" not in rig.cameras
-        subscription = Subscription(session, Feed(KEYS.arena))
+        connection = stack.enter_context(ServerConnection(server.endpoints))
+        subscription = Subscription(connection, Feed(KEYS.arena))
         stack.callback(subscription.close)
         wait_for(lambda: subscription.feed.state().rig)
         assert subscription.feed.state().rig == rig

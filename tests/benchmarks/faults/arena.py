@@ -80,7 +80,7 @@ class LiveArena:
             self.client = stack.enter_context(Client.connect(self.endpoint, arena=ARENA))
             self.client.poses().on_message(self.judge.receive)
             self.client.status().on_message(lambda status: setattr(self, "status", status))
-            self.session = self.client._session
+            self.session = self.client.session
             subscriber = self.session.declare_subscriber(self.keys.camera_status(), self._take_camera_status)
             stack.callback(subscriber.undeclare)
             self._stack = stack.pop_all()
