@@ -145,9 +145,13 @@ COMMANDS = {
         logging.WARNING,
     ),
     "plan": Command(
-        "predict range, coverage and precision before you mount cameras",
+        "predict coverage and precision, and where to mount cameras",
         _plan,
-        ("roundel plan plan.yaml",),
+        (
+            "roundel plan configs/plan.yaml --report plan.html",
+            "roundel plan configs/plan.yaml --suggest 6 --out suggested.yaml",
+            "roundel plan --rig rig.yaml --json",
+        ),
         logging.WARNING,
     ),
     "server": Command(
