@@ -95,11 +95,12 @@ COMMANDS = {
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras",
+        "list, rename and forget cameras; show what one refuses, and why",
         _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
+            "roundel cameras why north refused.jpg",
         ),
     ),
     "settings": Command(
@@ -145,9 +146,13 @@ COMMANDS = {
         logging.WARNING,
     ),
     "plan": Command(
-        "predict range, coverage and precision before you mount cameras",
+        "predict coverage and precision, and where to mount cameras",
         _plan,
-        ("roundel plan plan.yaml",),
+        (
+            "roundel plan configs/plan.yaml --report plan.html",
+            "roundel plan configs/plan.yaml --suggest 6 --out suggested.yaml",
+            "roundel plan --rig rig.yaml --json",
+        ),
         logging.WARNING,
     ),
     "server": Command(
