@@ -4,7 +4,7 @@
 import logging
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -32,9 +32,7 @@ Command = (
     | Annotated[Redo, tyro.conf.subcommand("redo")]
     | Annotated[Apply, tyro.conf.subcommand("apply")]
 )
-
-
-COMMANDS = ("intrinsics", "wand", "world", "check", "plan", "undo", "redo", "apply")
+COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
 
 
 def main() -> None:

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Runs programs as child processes, and starts those again that fail."""
 
+import contextlib
 import logging
 import os
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO
 
 from camera_node.errors import USER_ERROR
@@ -41,11 +44,22 @@ class Supervisor:
 
     Args:
         on_end: called with the name and the exit code of a child that ended and is not started again.
+        logs: a folder for files `log_path(name)`, to which the children write instead.
+        restarts: whether children that failed are started again.
+
+    Attributes:
+        folder: in which the children run; that of this process if None.
     """
 
-    def __init__(self, on_end: Callable[[str, int], object] = lambda name, code: None) -> None:
+    def __init__(
+        self,
+        on_end: Callable[[str, int], object] = lambda name, code: None,
+        logs: Path | None = None,
+        restarts: bool = True,
+    ) -> None:
         self._programs: dict[str, _Program] = {}
-        self._on_end = on_end
+        self._on_end, self._logs, self._restarts = on_end, logs, restarts
+        self.folder: Path | None = None
 
     def __enter__(self) -> "Supervisor":
         return self
@@ -62,7 +76,8 @@ class Supervisor:
     def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
         """Run `python -m module arguments` under a name."""
         arguments = tuple(arguments)
-        self._programs[name] = _Program(module, arguments, spawn(module, arguments), time.monotonic())
+        process = self._spawn(name, module, arguments)
+        self._programs[name] = _Program(module, arguments, process, time.monotonic())
 
     def tend(self) -> None:
         """Look at all children, and start those again that are due; called a few times a second."""
@@ -70,14 +85,24 @@ class Supervisor:
             code = program.process.poll()
             if code is None:
                 continue
-            if code in (0, USER_ERROR):
+            if code in (0, USER_ERROR) or not self._restarts:
                 release(self._programs.pop(name).process)
                 self._on_end(name, code)
             elif program.due_s is None:
                 self._schedule(name, program, code)
             elif time.monotonic() >= program.due_s:
-                program.process = spawn(program.module, program.arguments)
+                program.process = self._spawn(name, program.module, program.arguments)
                 program.since_s, program.due_s = time.monotonic(), None
+
+    def pids(self) -> list[int]:
+        """The process ids of the children."""
+        return [program.process.pid for program in self._programs.values()]
+
+    def _spawn(self, name: str, module: str, arguments: Sequence[str]) -> subprocess.Popen:
+        with contextlib.ExitStack() as stack:
+            log = log_path(self._logs, name) if self._logs else None
+            output = stack.enter_context(log.open("wb")) if log else None
+            return spawn(module, arguments, output, self.folder)
 
     def stop(self) -> None:
         """Terminate all children, the newest first; kill those that do not end in time."""
@@ -94,7 +119,14 @@ class Supervisor:
         program.delay_s = min(2 * program.delay_s, LONGEST_DELAY_S)
 
 
-def spawn(module: str, arguments: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen:
+def log_path(folder: Path, name: str) -> Path:
+    """The file to which a supervisor with logs in `folder` writes the output of the child `name`."""
+    return folder / f"{re.sub('[^A-Za-z0-9_.-]+', '-', name)}.log"
+
+
+def spawn(
+    module: str, arguments: Sequence[str], output: IO[bytes] | None = None, folder: Path | None = None
+) -> subprocess.Popen:
     """Run `python -m module arguments`; it ends with its standard input, and so with this process.
 
     In a session of its own: Ctrl-C reaches this process only, which then stops its children.
@@ -102,9 +134,11 @@ def spawn(module: str, arguments: Sequence[str], output: IO[bytes] | None = None
     Args:
         module, arguments: what to run.
         output: for its stdout and stderr; those of this process unless given.
+        folder: in which it runs; that of this process unless given.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "camera_node.child", module, *arguments],
+        cwd=folder,
         stdin=subprocess.PIPE,
         stdout=output,
         stderr=output,

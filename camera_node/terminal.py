@@ -5,10 +5,12 @@ Lines are wrapped only on a terminal, so that output in a pipe does not depend o
 """
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import IO, TypeVar
 
 from rich.console import Console
+from rich.progress import Progress
 from rich.progress import track as _track
 
 T = TypeVar("T")
@@ -33,6 +35,14 @@ def say(text: str, on: Console | None = None) -> None:
 def track(steps: Iterable[T], description: str, total: float | None = None) -> Iterable[T]:
     """Yield the steps and show a progress bar, which disappears at the end."""
     return _track(steps, description, total, console=progress_console(), transient=True)
+
+
+@contextmanager
+def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar that disappears at the end; yields a function that sets it to a share of the work, 0 to 1."""
+    with Progress(console=progress_console(), transient=True) as progress:
+        task = progress.add_task(description, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
 
 
 def _console_on(stream: IO[str], quiet: bool = False) -> Console:

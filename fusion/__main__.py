@@ -20,6 +20,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "record": "record",
     "recordings": "record",
     "repair": "repair",
+    "trim": "trim",
     "health": "health",
     "doctor": "doctor",
     "define": "define",

@@ -10,9 +10,7 @@ from pathlib import Path
 import psutil
 
 from tests.waiting import wait_for
-from web.demo import conclude
-from web.demo_server import USUAL, start_server
-from web.processes import Processes
+from web.demo import USUAL, Demo, conclude
 
 
 def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:
@@ -76,13 +74,9 @@ def test_a_second_demo_finds_another_port(scene: Path, tmp_path: Path):
     folders = [tmp_path / name for name in ("first", "second")]
     for folder in folders:
         folder.mkdir()
-    with Processes(folders[0]) as first, Processes(folders[1]) as second:
-        servers = [start_server(processes, scene.parent / "arena.yaml") for processes in (first, second)]
-        assert servers[0].endpoint != servers[1].endpoint
-        assert servers[1].endpoint != USUAL
-        assert all(server.startup_s > 0 for server in servers)
-        first.check()
-        second.check()
+    with Demo(scene, folders[0]) as first, Demo(scene, folders[1]) as second:
+        assert first.endpoint != second.endpoint
+        assert second.endpoint != USUAL
 
 
 def test_a_demo_that_a_user_ends_does_not_fail():

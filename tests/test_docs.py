@@ -1,21 +1,128 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The documentation site builds without a warning, and its first steps are the commands that test_readme.py runs."""
+"""The documentation site builds without a warning, and each command in it runs in a test."""
 
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+import tyro
 import yaml
 
+from calib.rig.rig import load_rig
+from camera_node.commands.camera import JoinArena
+from tests.calib.stick import LENGTH_M, write_stick
 from tests.conftest import ROOT
+from tests.waiting import wait_for
+from tests.web.roundel.programs import Program, roundel, roundel_command
 
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
+# The tests that run the commands of a page which are not in the README.
+TESTED = {
+    "bridges.md": "tests/fusion/bridges/test_bridges_page.py",
+    "security.md": "tests/security/test_security_page.py",
+    "relative.md": "tests/fusion/client/test_relative.py",
+    "lab.md": "tests/test_docs.py",
+    "import_export.md": "tests/test_docs.py",
+    "network_cameras.md": "tests/test_docs.py",
+    "detector_seen_refused.md": "tests/test_docs.py",
+}
+# They change the machine, or need a container engine; tests/test_lab.py checks the services.
+NOT_RUN = ("useradd ", "cp configs/systemd", "systemctl ", "pipx run cibuildwheel", "podman ")
+PIP = ("python3 -m venv ", "/opt/roundel/bin/pip ", "pip wheel ")  # tests/test_packaging.py
+
+
 def commands(text: str) -> list[str]:
     return [line for block in SHELL.findall(text) for line in block.splitlines()]
+
+
+def page(name: str) -> list[str]:
+    """The commands of a page."""
+    return commands((ROOT / "docs" / name).read_text())
+
+
+def test_every_command_of_every_page_is_tested():
+    """A page with commands of its own needs an entry in `TESTED`, and all commands are of `roundel` or of a shell."""
+    readme = commands((ROOT / "README.md").read_text())
+    own = {path.name: set(page(path.name)) - set(readme) for path in (ROOT / "docs").glob("*.md")}
+    assert {name for name, lines in own.items() if lines} == set(TESTED)
+    shell = (*NOT_RUN, *PIP, "sh configs/", "cp configs/", "sed -i ")
+    odd = [line for lines in own.values() for line in lines if not line.startswith(("roundel ", *shell))]
+    assert odd == []
+    assert all((ROOT / test).exists() for test in TESTED.values())
+
+
+def test_no_page_has_commands_of_developers():
+    """Users have the command `roundel`; only benchmarks are modules."""
+    for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        found = re.findall(r"python -m (?:camera_node|calib|fusion|web)\b(?! \|)", path.read_text())
+        assert not found, path.name
+
+
+def test_import_and_export(tmp_path: Path):
+    """The commands of the page, with a stick whose ends were clicked in Argus."""
+    write_stick(tmp_path, "argus", "wand-xypts.csv")
+    (tmp_path / "wand.yaml").write_text(f"markers: [[0, 0, 0], [{LENGTH_M}, 0, 0]]")
+    for command in page("import_export.md"):
+        roundel(*shlex.split(command)[1:], folder=tmp_path)
+    assert len(load_rig(tmp_path / "rig.yaml").placed()) == 3
+    assert {path.name for path in (tmp_path / "colmap").iterdir()} >= {"cameras.txt", "images.txt"}
+
+
+def test_what_the_detector_refuses(tmp_path: Path):
+    shutil.copy(ROOT / "docs" / "detector_seen_refused.png", tmp_path / "picture.png")
+    (command,) = page("detector_seen_refused.md")
+    assert "refused" in roundel(*shlex.split(command)[1:], folder=tmp_path)
+    assert (tmp_path / "seen.png").exists()
+
+
+def test_a_network_camera():
+    """Its options exist; tests/camera_node/sources/test_stream.py reads streams."""
+    (command,) = page("network_cameras.md")
+    camera = tyro.cli(JoinArena, args=shlex.split(command)[2:])
+    assert (camera.source[0].partition(":")[0], camera.name) == ("rtsp", "north")
+
+
+@pytest.fixture
+def shards(tmp_path: Path, endpoint: str) -> Iterator[tuple[Path, str]]:
+    """The two servers of the page on a reserved port."""
+    arena = (ROOT / "configs" / "arena.yaml").read_text().replace("tcp/127.0.0.1:7447", endpoint)
+    (tmp_path / "arena.yaml").write_text(arena)
+    shutil.copy(ROOT / "configs" / "robots.yaml", tmp_path)
+    servers = [
+        Program(roundel_command(*shlex.split(line)[1:]), tmp_path)
+        for line in page("lab.md")
+        if "--shard" in line
+    ]
+    try:
+        for server in servers:
+            server.until("INFO fusion")
+        yield tmp_path, endpoint
+    finally:
+        assert [server.stop() for server in servers] == [0, 0]
+
+
+def test_a_lab(shards: tuple[Path, str]):
+    """Health and doctor report that the cameras are missing; the bridge of another machine connects to both routers."""
+    folder, endpoint = shards
+    for line in page("lab.md"):
+        words = shlex.split(line, comments=True)[1:]
+        if line.startswith(("roundel health", "roundel doctor")):
+            connect = () if "doctor" in line else ("--connect", endpoint)
+            assert "camera" in roundel(*words, *connect, folder=folder, expected=1)
+        elif line.startswith("roundel ros2 --connect"):
+            words = [re.sub("tcp/(server|localhost):7447", endpoint, word) for word in words]
+            bridge = Program(roundel_command(*words), folder)
+            wait_for(lambda bridge=bridge: bridge.lines)
+            assert bridge.process.poll() is None, bridge.text
+            assert bridge.stop() == 0
 
 
 def test_the_site_builds_in_strict_mode(tmp_path: Path):

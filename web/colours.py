@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 BACKGROUND = (3, 3, 4)
 CAMERA, LABELED, UNLABELED = (122, 162, 247), (255, 255, 255), (150, 150, 150)
 TRUE_POINT, SELECTED, PREVIEW = (235, 238, 245), (255, 214, 64), (255, 214, 64)
+MASK, WAND_TRAIL = (239, 91, 91), (64, 200, 170)
 COASTING, LOST = (222, 99, 10), (40, 20, 20)
 LIGHTNESS, SATURATION = (0.55, 0.68), (0.75, 0.95)
 DISPLAY_EXPONENT = 2.2  # Viser's meshes and lines take linear light: (c / 255)^2.2 of the displayed colour

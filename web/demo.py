@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Runs a whole arena with simulated cameras: wand calibration, then tracking of robots, compared with the truth.
 
-Read `Demo.run` first: it lists the steps.
+The arena is one of `roundel up` in a temporary folder. Read `Demo.run` first: it lists the steps.
 """
 
+import contextlib
 import os
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,9 +17,15 @@ from calib.live.rig_requests import set_rig
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
+from camera_node.errors import NetworkError
 from camera_node.protocol.session import open_client
 from camera_node.simulation.scene import Scene
+from camera_node.sources.frame import SourceSettings
+from camera_node.supervisor import Supervisor, log_path
 from fusion.protocol.messages import RobotPose
+from fusion.server.config import load_arena
+from web.arena_folder import ArenaFolder
+from web.arena_programs import CALIBRATION, ArenaPrograms
 from web.demo_progress import (
     ProgressReporter,
     SceneClock,
@@ -25,15 +33,16 @@ from web.demo_progress import (
     describe_errors,
     describe_tracking_step,
 )
-from web.demo_server import RunningServer, start_server
+from web.errors import WebError
+from web.failures import ProgramFailed, interrupt_on_signals, raise_failure
 from web.feed import Feed
-from web.page_access import PageAccess, is_loopback
-from web.processes import Processes, ProgramFailed, interrupt_on_signals
 from web.score import PoseScore, summarize
 from web.subscription import Subscription
 from web.usage import ResourceUsage
 
 ARENA = "demo"
+USUAL, ANY_PORT = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:0"  # the README's client connects to the usual port
+FILES = ("arena.yaml", "robots.yaml", "wand.yaml")  # beside a scene
 MIN_START_S = 3.0  # for the programs to start before the wand session
 CALIBRATION_S = 90.0  # limit for the calibration after the wand session
 SETTLE_S = 0.5  # after a new calibration, until no pose of the previous one arrives
@@ -55,20 +64,36 @@ def run_demo(
     Raises:
         ConfigError, WebError: a file is invalid, or a port is taken.
     """
-    scene = Scene.load(scene_path)
-    folder = Path(tempfile.mkdtemp(prefix="roundel-demo-"))
+    path = Path(tempfile.mkdtemp(prefix="roundel-demo-"))
     try:
-        with interrupt_on_signals(), Processes(folder) as processes:
-            server = start_server(processes, scene_path.parent / "arena.yaml", listen)
-            code = Demo(scene, scene_path.parent, processes, server).run(page, seconds)
+        with interrupt_on_signals(), Demo(scene_path, path, listen) as demo:
+            code = demo.run(page, seconds)
     except ProgramFailed as error:
         print(f"the demo failed: {error}", flush=True)
         return 1
     if code:
-        print(f"the programs' logs are in {folder}", flush=True)
+        print(f"the programs' logs are in {path}", flush=True)
     else:
-        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(path, ignore_errors=True)
     return code
+
+
+def create_folder(path: Path, scene_path: Path, scene: Scene) -> ArenaFolder:
+    """The folder of the demo's arena: the files beside the scene, and a rig of the cameras' lenses.
+
+    Raises:
+        WebError: one of the files is missing.
+    """
+    for name in FILES:
+        try:
+            shutil.copy(scene_path.parent / name, path)
+        except OSError as error:
+            raise WebError(f"{scene_path.parent / name} can't be read: {error.strerror}") from None
+    folder = ArenaFolder(path)
+    folder.create(ARENA, None, is_local=True)
+    lenses = {name: Camera(**entry) for name, entry in scene.rig_entries().items()}
+    save_rig(Rig(cameras=lenses), folder.rig)
+    return folder
 
 
 def conclude(faults: list[str], is_test: bool) -> tuple[str, int]:
@@ -89,81 +114,105 @@ def start_delay_s(n_programs: int, startup_s: float) -> float:
 
 
 class Demo:
-    """Runs the steps of the demo beside a running server, and prints one line per second."""
+    """Runs the steps of the demo, and prints one line per second; a context manager, within which a server runs.
 
-    def __init__(self, scene: Scene, files: Path, processes: Processes, server: RunningServer) -> None:
-        """Connect to the server.
+    Args:
+        scene_path: a scene, with the arena's files beside it.
+        path: an empty folder for the arena's files and the logs.
+        listen: the server's Zenoh endpoint; None for port 7447, or a free one if that is taken.
 
-        Args:
-            scene: the simulated scene.
-            files: folder with scene.yaml and wand.yaml.
-            processes: runs the other programs.
-            server: the server, which `processes` runs.
-        """
-        self.scene, self.files, self.processes, self.endpoint = scene, files, processes, server.endpoint
-        self.session = open_client([self.endpoint])
-        self.delay_s = start_delay_s(len(scene.cameras) + 2, server.startup_s)  # cameras, page, calibration
-        self.clock = SceneClock(scene, time.time_ns() + round(self.delay_s * 1e9))
-        self.feed = Feed(ARENA, self._add_to_score)
-        self.subscription = Subscription(self.session, self.feed)
-        self._reporter = ProgressReporter(self.session, ARENA, self.clock)
+    Raises:
+        ConfigError, WebError: a file is invalid, or the endpoint is taken.
+        ProgramFailed: the server ended in another way, or did not listen in time.
+    """
+
+    def __init__(self, scene_path: Path, path: Path, listen: str | None = None) -> None:
+        self.scene, self.path, self._scene_path, self._listen = (
+            Scene.load(scene_path),
+            path,
+            scene_path,
+            listen,
+        )
+        self._folder = create_folder(path, scene_path, self.scene)
+        self._supervisor = Supervisor(self._ended, path, restarts=False)
+        self._programs = ArenaPrograms(self._supervisor, self._folder, load_arena(self._folder.config))
         self._score: PoseScore | None = None
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> "Demo":
+        with self._stack as stack:
+            stack.enter_context(self._supervisor)
+            start = time.monotonic()
+            self.endpoint = self._start_server()
+            startup_s = time.monotonic() - start
+            self.session = stack.enter_context(open_client([self.endpoint]))
+            # cameras, page and calibration start together
+            self.delay_s = start_delay_s(len(self.scene.cameras) + 2, startup_s)
+            self.clock = SceneClock(self.scene, time.time_ns() + round(self.delay_s * 1e9))
+            self.feed = Feed(ARENA, self._add_to_score)
+            stack.callback(Subscription(self.session, self.feed).close)
+            self._reporter = ProgressReporter(self.session, ARENA, self.clock)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
 
     def run(self, page: tuple[str, int] | None, seconds: float | None) -> int:
         """Run all steps; return the exit code."""
+        self._start_programs(page)
+        self._wait_for_calibration()
+        self._align_to_scene()
+        self._wait_for_robots()
+        return self._track_and_score(seconds)
+
+    def _start_server(self) -> str:
+        """Start the server; return its endpoint. It takes its port itself, so that no other program can before."""
         try:
-            self._start_programs(page)
-            self._wait_for_calibration()
-            self._align_to_scene()
-            self._wait_for_robots()
-            return self._track_and_score(seconds)
-        finally:
-            self.subscription.close()
-            self.session.close()
+            return self._start_server_on(self._listen or USUAL)
+        except WebError as error:
+            if self._listen is not None or USUAL not in str(error):  # or a fault in a file
+                raise
+        return self._start_server_on(ANY_PORT)
+
+    def _start_server_on(self, listen: str) -> str:
+        try:
+            return self._programs.start_server(listen, threading.Event())[0]
+        except NetworkError as error:
+            raise ProgramFailed(f"{error}; {log_path(self.path, 'server')}") from None
 
     def _start_programs(self, page: tuple[str, int] | None) -> None:
         """Start the cameras, the viewer and the calibration."""
-        folder, files, start = self.processes.folder, self.files, self.processes.start
-        connect = ["--connect", self.endpoint, "--arena", ARENA]
-        source = ["--source", "sim", "--scene", str(files / "scene.yaml")]
-        for name in self.scene.cameras:
-            epoch = ["--epoch-ns", str(self.clock.epoch_ns)]
-            start(name, "camera_node", [*source, "--name", name, *epoch, *connect])
+        sources = [f"sim:{name}" for name in self.scene.cameras]
+        settings = SourceSettings(scene=self._scene_path, epoch_ns=self.clock.epoch_ns)
+        self._programs.cameras(sources, settings).start()
         if page is not None:
-            self._start_page(*page, connect)
+            print(*self._programs.start_page(*page).instructions(), sep="\n", flush=True)
         print(f"Zenoh endpoint of arena '{ARENA}': {self.endpoint}", flush=True)
-        intrinsics = {name: Camera(**entry) for name, entry in self.scene.rig_entries().items()}
-        save_rig(Rig(cameras=intrinsics), folder / "intrinsics.yaml")
-        wand = ["wand", "--live", "--wand", str(files / "wand.yaml")]
-        duration = ["--seconds", str(self.delay_s + self.scene.wave_s)]
-        rigs = ["--rig", str(folder / "intrinsics.yaml"), "--out", str(folder / "rig.yaml")]
-        start("calib", "calib", [*wand, *duration, *rigs, *connect])
+        self._programs.start_wand_calibration(self.delay_s + self.scene.wave_s)
 
-    def _start_page(self, host: str, port: int, connect: list[str]) -> None:
-        """Start the viewer, with tokens that this process can print if other machines may open the page."""
-        tokens = None if is_loopback(host) else self.processes.folder / "page_tokens.yaml"
-        access = PageAccess.create(host, port, tokens)
-        options = ["--tokens", str(tokens)] if tokens else []
-        self.processes.start("web", "web", [*connect, "--host", host, "--port", str(port), *options])
-        print(*access.instructions(), sep="\n", flush=True)
+    def _ended(self, name: str, code: int) -> None:
+        """The calibration ends when its work is done; any other end is a failure."""
+        if code or name != CALIBRATION:
+            raise_failure(name, code, log_path(self.path, name))
 
     def _wait_for_calibration(self) -> None:
         """Report the wand session until `calib` has calibrated the cameras."""
         for whole_second in self._ticks(self.delay_s + self.scene.wave_s + CALIBRATION_S):
-            if self.processes.finished("calib"):
+            if CALIBRATION not in self._supervisor:
                 return
             text = describe_calibration_step(self.clock, self.feed.state())
             self._reporter.report(text, self.clock.wand_share(), whole_second)
-        raise ProgramFailed(f"the calibration did not end in time; the logs are in {self.processes.folder}")
+        raise ProgramFailed(f"the calibration did not end in time; the logs are in {self.path}")
 
     def _align_to_scene(self) -> None:
         """Align the calibration with the cameras' true positions: a wand does not define a world frame."""
-        rig = load_rig(self.processes.folder / "rig.yaml")
+        rig = load_rig(self._folder.rig)
         if missing := set(self.scene.cameras) - set(rig.placed()):
             raise ProgramFailed(f"the calibration has no pose for {', '.join(sorted(missing))}")
         positions = {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
         aligned, errors_m = align_cameras(rig, positions)
-        set_rig(self.session, ARENA, aligned, "web --demo")
+        set_rig(self.session, ARENA, aligned, "roundel demo")
         error = f"position errors up to {1e3 * max(errors_m.values()):.2f} mm"
         print(f"calibrated: {len(errors_m)} cameras, {error}", flush=True)
 
@@ -176,12 +225,12 @@ class Demo:
 
     def _track_and_score(self, seconds: float | None) -> int:
         """Compare the poses with the truth, print the summary, and return the exit code."""
-        usage = ResourceUsage(self.processes, self.feed)
+        usage = ResourceUsage(self._supervisor.pids, self.feed)
         score = self._score = self._new_score(usage.start_ns)
         try:
             for whole_second in self._ticks(seconds):
                 if whole_second:
-                    self.processes.measure()
+                    usage.measure()
                     self._reporter.report(describe_errors(score), 1.0, print_text=False)
                     print(describe_tracking_step(score, usage, self.scene.cameras), flush=True)
         except KeyboardInterrupt:  # the user ended the demo and expects the summary
@@ -212,6 +261,6 @@ class Demo:
         start, elapsed = time.monotonic(), 0
         while seconds is None or time.monotonic() - start < seconds:
             time.sleep(TICK_S)
-            self.processes.check("calib")
+            self._supervisor.tend()
             before, elapsed = elapsed, int(time.monotonic() - start)
             yield elapsed > before

@@ -23,6 +23,8 @@ from web.messages import DemoProgress, progress_key
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
 REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
+REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
+MAX_RIGS = 20  # in the history
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
 
@@ -50,6 +52,7 @@ class ArenaState:
     progress: TimedMessage | None = None  # of the demo
     rig: Rig | None = None
     rig_t_ns: int | None = None  # since when it is in force, server's time
+    rigs: tuple[RigMessage, ...] = ()  # that were in force since the feed was created, newest last
     server_alive: bool = False
     message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
@@ -160,6 +163,10 @@ class Feed:
         ):  # renamed or removed, unless it is new
             if self._clock() - state.poses[robot].received_s > REMOVED_S:
                 del state.poses[robot]
+        for camera in state.cameras.keys() - status.cameras.keys():  # renamed or forgotten, unless it is new
+            if self._clock() - state.cameras[camera].received_s > REMOVED_CAMERA_S:
+                for messages in (state.cameras, state.previews, state.detections, state.coverage):
+                    messages.pop(camera, None)
 
     def _store_camera_status(self, status: CameraStatus, key: str) -> None:
         self._store_named(self._state.cameras, status.camera, status, key)
@@ -178,7 +185,10 @@ class Feed:
         self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
-        self._state.rig, self._state.rig_t_ns = message.rig, message.t_ns
+        state = self._state
+        if message.t_ns != state.rig_t_ns or not state.rigs:  # a query repeats the one in force
+            state.rigs = (*state.rigs, message)[-MAX_RIGS:]
+        state.rig, state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(
         self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str

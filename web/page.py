@@ -13,9 +13,11 @@ from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
 from web.tabs.record import Recorder, RecordingList, ReplayControls
+from web.tabs.rig_change import CalibrationFiles
 from web.tabs.robots import RobotEditor, RobotTable
 from web.tabs.status import StatusTab
-from web.tabs.wand_session import CalibrationFiles, WandSessionPanel
+from web.tabs.wand_session import WandSessionPanel
+from web.tabs.world import WorldPanel
 from web.view import View
 
 
@@ -45,12 +47,15 @@ def add_live_page(
         pictures = LivePictures(view.server, subscription, view.cameras)
         closing.callback(pictures.close)
         view.add(pictures, is_live=True)
-        view.add(CameraSettings(gui, subscription), is_live=True)
+        settings = CameraSettings(view.server, subscription, files)
+        closing.callback(settings.close)
+        view.add(settings, is_live=True)
     with header.tabs["Calibrate"]:
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
             closing.callback(panel.close)
+            view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistory(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))

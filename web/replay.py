@@ -55,6 +55,7 @@ class RecordingPlayer:
         self._lock = threading.Lock()
         self._position_s, self._position_set_at = 0.0, time.monotonic()
         self._speed, self._playing, self._jumped = 1.0, True, True
+        self._part_s = 0.0, self.duration_s
 
     def seconds(self) -> float:
         """Return the current position, seconds from the start of the recording; the clock for a feed."""
@@ -65,13 +66,28 @@ class RecordingPlayer:
     def playing(self) -> bool:
         """Whether the position advances: not while paused, and not at the end."""
         with self._lock:
-            return self._playing and self._seconds() < self.duration_s
+            return self._playing and self._seconds() < self._part_s[1]
+
+    @property
+    def part_s(self) -> tuple[float, float]:
+        """Start and end of the part that is played, seconds."""
+        return self._part_s
+
+    def select_part(self, from_s: float, to_s: float) -> None:
+        """Play only a part; a position outside of it moves to its start."""
+        with self._lock:
+            here = self._seconds()
+            begin = min(max(from_s, 0.0), self.duration_s)
+            self._part_s = begin, max(begin, min(to_s, self.duration_s))
+            if not self._part_s[0] <= here <= self._part_s[1]:
+                self._set_position(self._part_s[0])
+                self._jumped = True
 
     def play(self, playing: bool = True) -> None:
-        """Play or pause. Playing at the end starts from the beginning."""
+        """Play or pause. Playing at the end of the part starts from its beginning."""
         with self._lock:
-            restart = playing and self._seconds() >= self.duration_s
-            self._set_position(0.0 if restart else self._seconds())
+            restart = playing and self._seconds() >= self._part_s[1]
+            self._set_position(self._part_s[0] if restart else self._seconds())
             self._playing, self._jumped = playing, self._jumped or restart
 
     def set_speed(self, speed: float) -> None:
@@ -81,15 +97,15 @@ class RecordingPlayer:
             self._speed = speed
 
     def seek(self, seconds: float) -> None:
-        """Jump to a position."""
+        """Jump to a position in the part that is played."""
         with self._lock:
-            self._set_position(min(max(seconds, 0.0), self.duration_s))
+            self._set_position(min(max(seconds, self._part_s[0]), self._part_s[1]))
             self._jumped = True
 
     def step(self, seconds: float) -> None:
         """Pause, and advance by some seconds."""
         with self._lock:
-            self._set_position(min(self._seconds() + seconds, self.duration_s))
+            self._set_position(min(self._seconds() + seconds, self._part_s[1]))
             self._playing = False
 
     def run(self, feed: Feed, stop: threading.Event, once: bool = False) -> None:
@@ -127,7 +143,7 @@ class RecordingPlayer:
 
     def _seconds(self) -> float:
         passed = (time.monotonic() - self._position_set_at) * self._speed if self._playing else 0.0
-        return min(self._position_s + passed, self.duration_s)
+        return min(self._position_s + passed, self._part_s[1])
 
     def _set_position(self, seconds: float) -> None:
         self._position_s, self._position_set_at = seconds, time.monotonic()

@@ -27,6 +27,7 @@ CAMERA_COLUMNS = (
     Column("rate", "1/s", "frames per second"),
     Column("detect", "ms", "time to find the roundels in a frame, at the camera"),
     Column("seen", "", "roundels in a frame, mean over one second"),
+    Column("blur", "px", "of the roundels' edges: turn the focus ring until it is least; 0.4 to 1 is sharp"),
     Column("error", "px", "RMS distance between detections and their prediction"),
     Column("arrival", "ms", "time from the middle of the exposure to the arrival at the server"),
     Column("clock", "ms", "the server's time minus the clock of the camera's machine"),
@@ -98,8 +99,8 @@ def position_sigma_mm(pose: RobotPose) -> float:
 def tabulate_cameras(state: ArenaState) -> HtmlTable:
     """One row per camera, from its own status and the server's.
 
-    Columns: frames/s, detection time, roundels per frame, RMS reprojection error, time from mid-exposure to arrival,
-    clock offset, lost frames (dropped by the camera / too late for the server).
+    Columns: frames/s, detection time, roundels per frame, blur of their edges, RMS reprojection error, time from
+    mid-exposure to arrival, clock offset, lost frames (dropped by the camera / too late for the server).
     """
     server = state.status.message.cameras if state.status else {}
     rows = [_camera_row(state, name, server.get(name)) for name in sorted({*state.cameras, *server})]
@@ -119,6 +120,7 @@ def _camera_row(state: ArenaState, name: str, health: CameraHealth | None) -> Ta
         _number(own and own.fps, 1),
         _number(own and own.detect_ms, 1),
         _number(own and own.roundels, 1),
+        _number(own and own.edge_blur_px, 1),
         _number(health and health.residual_px, 2),
         _number(health and health.lateness_ms, 1),
         _number(own and own.clock_offset_ms, 2),

@@ -37,6 +37,9 @@ class ActionButton:
         act: returns the outcome as text; a RoundelError is shown, any other exception is logged and shown.
         answer: the line for the outcome.
         hint: explanation that is shown when the pointer is on the button.
+
+    Attributes:
+        client: the browser of the latest click; None before.
     """
 
     def __init__(
@@ -45,14 +48,15 @@ class ActionButton:
         self._act, self._answer = act, answer
         self._running = threading.Lock()
         self._enabled = True
+        self.client: viser.ClientHandle | None = None
         self.handle = gui.add_button(label, color=GREY, hint=hint)
-        self.handle.on_click(lambda _: self.run())
+        self.handle.on_click(lambda event: self.run(event.client))
 
-    def run(self) -> None:
-        """Run the action, unless it runs already or can not act."""
+    def run(self, client: viser.ClientHandle | None = None) -> None:
+        """Run the action for a browser, unless it runs already or can not act."""
         if not self._enabled or not self._running.acquire(blocking=False):
             return
-        self.handle.disabled = True
+        self.client, self.handle.disabled = client, True
         try:
             self._answer.show(self._act(), "ok")
         except RoundelError as error:
@@ -72,6 +76,77 @@ class ActionButton:
             set_property(self.handle, name, value)
         if label:
             set_property(self.handle, "label", label)
+
+
+class LongAction:
+    """A button that starts an action in a thread of its own, and ends it at the second click.
+
+    Args:
+        gui: where the button is added.
+        labels: of the button, to start and to end the action.
+        act: called with an event that is set to end it; returns the outcome as text; errors as in `ActionButton`.
+        answer: the line for the outcome.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        labels: tuple[str, str],
+        act: Callable[[threading.Event], str],
+        answer: Answer,
+    ) -> None:
+        self._labels, self._act, self._answer = labels, act, answer
+        self._lock, self._end = threading.Lock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self.handle = gui.add_button(labels[0], color=GREY)
+        self.handle.on_click(lambda _: self.toggle())
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the action runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the page closes: the action should save what it has, and end."""
+        return self._closed
+
+    def toggle(self) -> None:
+        """Start the action, or end it."""
+        with self._lock:
+            if self.is_running:
+                self._end.set()
+                return
+            self._end.clear()
+            self.handle.label = self._labels[1]
+            self._thread = threading.Thread(target=self._run, name=self._labels[0], daemon=True)
+            self._thread.start()
+
+    def show(self, enabled: bool, primary: bool = False) -> None:
+        """Enable the button where the action can start; it is coloured while that is the next step or it runs."""
+        set_property(self.handle, "color", PRIMARY if self.is_running or primary else GREY)
+        if not self.is_running:
+            set_property(self.handle, "disabled", not enabled)
+
+    def close(self, timeout_s: float) -> None:
+        """End the action and wait for it."""
+        with self._lock:
+            self._closed = True
+            self._end.set()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            self._answer.show(self._act(self._end))
+        except RoundelError as error:
+            self._answer.show(str(error), "bad")
+        except Exception as error:  # the page must show any failure to its user
+            log.exception("the action %s failed", self._labels[0])
+            self._answer.show(f"this failed: {type(error).__name__}: {error}", "bad")
+        finally:
+            self.handle.label, self.handle.disabled = self._labels[0], False
 
 
 def set_content(handle: Any, text: str) -> None:

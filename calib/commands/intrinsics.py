@@ -14,7 +14,7 @@ from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
 from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
 from calib.intrinsics.calibrated_lens import CalibratedLens
-from calib.intrinsics.guided_capture import capture_views
+from calib.intrinsics.guided_capture import capture_views, make_panel
 from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.rig import load_rig
@@ -92,7 +92,11 @@ class Intrinsics:
         with self.server.open() as session:
             images = take_snapshots(session, self.server.arena, views.camera, self.seconds)
             with Live(console=progress_console(), transient=True) as live:
-                say(capture_views(views, images, self.model, live.update))
+                say(
+                    capture_views(
+                        views, images, self.model, lambda progress: live.update(make_panel(progress))
+                    )
+                )
         return views
 
 

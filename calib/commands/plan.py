@@ -1,57 +1,165 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib plan`: range, coverage and expected precision of an arena, before anything is mounted."""
+"""`calib plan`: coverage and expected precision of an arena, planned or calibrated, and where to mount cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import numpy as np
 import tyro
 
-from calib.commands.output import check_folder, save_image
-from calib.plan.planner import Plan, PlanReport, evaluate_plan
-from calib.rig.precision_plot import draw_precision
-from camera_node.config import load_yaml
-from camera_node.terminal import say
+from calib.commands.output import check_folder
+from calib.plan.camera_kind import CameraKind, PlannedCamera
+from calib.plan.catalogue import CATALOGUE
+from calib.plan.description import MAX_CAMERAS, Plan, PlannedRobots, Suggestion
+from calib.plan.placement import PlacementProblem, SuggestedPlaces, suggest_placement
+from calib.plan.planner import PlannedArena, evaluate
+from calib.plan.report import check_report, write_report
+from calib.plan.summary import describe, summarize
+from calib.rig.camera import Camera
+from calib.rig.rig import load_rig
+from camera_node.config import dump_yaml, load_yaml, write_atomically
+from camera_node.errors import ConfigError
+from camera_node.terminal import progress_bar, say
+
+DIAMETER_M = 0.09  # of the roundels that `roundel print` prints by default
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanArena:
-    """Predict what planned cameras see of an arena, and how precisely."""
+    """Predict what the cameras of an arena see and how precisely, and suggest where to mount them."""
 
-    plan: Annotated[Path, tyro.conf.Positional]
-    """The plan, such as configs/plan.yaml: area_m, height_m, diameter_m and cameras."""
-    map: Path | None = None
-    """Write a PNG of the expected errors."""
+    plan: Annotated[Path | None, tyro.conf.Positional] = None
+    """The description, such as configs/plan.yaml; may be left out with --rig or --catalogue."""
+    rig: Path | None = None
+    """Evaluate the calibrated cameras of this rig instead of those of the plan."""
+    suggest: int | None = None
+    """Place so many cameras where the plan's `suggest` allows it."""
+    out: Path | None = None
+    """Write the plan with the suggested cameras to this file."""
+    report: Path | None = None
+    """Write a report with figures, .html or .pdf."""
+    json: bool = False
+    """Print the result as JSON."""
+    catalogue: bool = False
+    """List the cameras that a plan can name as `model`, and end."""
 
     def execute(self) -> None:
-        """Print the report; write the map only."""
-        if self.map is not None:
-            check_folder(self.map)
-        plan = load_yaml(self.plan, Plan)
-        report = evaluate_plan(plan)
-        for line in describe(plan, report):
-            say(line)
-        if self.map is not None:
-            cameras = {name: camera.camera() for name, camera in plan.cameras.items()}
-            save_image(self.map, draw_precision(report.precision, cameras))
-            say(f"wrote {self.map}")
+        """Print the result; write the report and the suggested plan."""
+        if self.catalogue:
+            list_catalogue()
+            return
+        self._check_files()
+        arena = self._arena()
+        result = evaluate(arena)
+        if self.json:
+            print(msgspec.json.encode(summarize(result)).decode())
+        else:
+            for line in describe(result):
+                say(line)
+        if self.report is not None:
+            write_report(result, self.report, f"Arena {self.plan.stem if self.plan else self.rig}")
+            self._note(f"wrote {self.report}")
+
+    def _arena(self) -> PlannedArena:
+        """The cameras to evaluate: suggested, calibrated, or those of the plan."""
+        rig = {} if self.rig is None else load_rig(self.rig).require_placed(self.rig)
+        plan = plan_around(rig) if self.plan is None else load_yaml(self.plan, Plan)
+        if self.suggest is not None:
+            return self._suggest(plan, self.suggest)
+        if rig:
+            first = next(iter(rig.values()))
+            kind = CameraKind(width=first.width, height=first.height, focal_px=first.fx)
+            return PlannedArena.of_cameras(plan, rig, kind)
+        if not plan.cameras:
+            raise ConfigError(f"{self.plan} names no cameras; add them, or let --suggest N place them")
+        return PlannedArena.of(plan)
+
+    def _suggest(self, plan: Plan, count: int) -> PlannedArena:
+        kind = (plan.suggest or _suggestion_like(plan, self.plan)).camera
+        with progress_bar(f"placing {count} cameras") as progress:
+            placement = suggest_placement(PlacementProblem(plan, kind), count, progress)
+        plan = msgspec.structs.replace(plan, cameras=planned_cameras(placement, kind))
+        if not self.json:
+            for name, camera in plan.cameras.items():
+                say(f"{name}: at {_place(camera.position_m)}, directed at {_place(camera.look_at_m)}")
+        if self.out is not None:
+            write_atomically(self.out, dump_yaml(plan))
+            self._note(f"wrote {self.out}")
+        return PlannedArena.of(plan)
+
+    def _check_files(self) -> None:
+        """Raise ConfigError for options that contradict each other, and for files that can't be written."""
+        if self.plan is None and self.rig is None:
+            raise ConfigError("give a plan such as configs/plan.yaml, or --rig with a calibrated rig")
+        if self.rig is not None and self.suggest is not None:
+            raise ConfigError("--suggest places new cameras, --rig evaluates mounted ones; give one of them")
+        if self.suggest is not None and not 1 <= self.suggest <= MAX_CAMERAS:
+            raise ConfigError(f"--suggest {self.suggest} is not possible; give 1 to {MAX_CAMERAS} cameras")
+        if self.out is not None:
+            if self.suggest is None:
+                raise ConfigError("--out writes suggested cameras; give --suggest N too")
+            check_folder(self.out)
+        if self.report is not None:
+            check_report(self.report)
+
+    def _note(self, text: str) -> None:
+        if not self.json:
+            say(text)
 
 
-def describe(plan: Plan, report: PlanReport) -> list[str]:
-    """The report, line by line."""
-    lines = [
-        f"{name}: level roundels of {plan.diameter_m:g} m from {reach.v_min:.2f} to {reach.v_max:.2f} m along its axis "
-        f"({plan.min_diameter_px:g} px), {reach.v_y:.2f} x {reach.v_z:.2f} m there; sees {reach.share:.0%} of the area"
-        for name, reach in report.ranges.items()
-    ]
-    precision = report.precision
-    lines += precision.lines()
-    lines.append(
-        f"two cameras or more see {precision.covered:.0%} of the area, one {np.mean(precision.views == 1):.0%}, none "
-        f"{np.mean(precision.views == 0):.0%}; expected error {precision.typical_mm:.2f} mm in the median, "
-        f"{precision.worst_mm:.2f} mm at the 95 % quantile"
+def plan_around(rig: dict[str, Camera]) -> Plan:
+    """A plan for the floor under the cameras of a rig, with robots that carry one printed roundel each."""
+    centres = np.array([camera.matrix()[:3, 3] for camera in rig.values()])
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    middle = (low + high) / 2
+    half = np.maximum(high - low, 1.0) / 2
+    (x0, y0), (x1, y1) = (middle - half)[:2].tolist(), (middle + half)[:2].tolist()
+    return Plan(
+        area_m=(x0, y0, x1, y1),
+        ceiling_m=max(float(high[2]), 0.2),
+        robots=PlannedRobots(diameter_m=DIAMETER_M),
     )
-    if precision.covered < 1:
-        lines.append("to cover more: mount cameras higher, add a camera, or print larger roundels")
-    return lines
+
+
+def planned_cameras(placement: SuggestedPlaces, kind: CameraKind) -> dict[str, PlannedCamera]:
+    """Suggested cameras as entries of a plan."""
+    fields = {name: getattr(kind, name) for name in CameraKind.__struct_fields__}
+    pairs = zip(placement.positions_m.tolist(), placement.aims_m.tolist(), strict=True)
+    return {
+        f"camera-{k}": PlannedCamera(**fields, position_m=_rounded(position), look_at_m=_rounded(aim))
+        for k, (position, aim) in enumerate(pairs, 1)
+    }
+
+
+def list_catalogue() -> None:
+    """Print the catalogue."""
+    for name, camera in CATALOGUE.items():
+        kind = CameraKind(model=name)
+        half = camera.width / 2 / kind.focal
+        fov = 2 * np.degrees(np.arctan(half) if camera.model == "pinhole" else half)
+        say(
+            f"{name:11} {camera.width} x {camera.height} px, {camera.fps:g} Hz, {camera.shutter} shutter, "
+            f"{camera.focal_mm:g} mm, {fov:.0f} degrees: {camera.what} ({camera.source})"
+        )
+
+
+def _suggestion_like(plan: Plan, path: Path | None) -> Suggestion:
+    """The kind of the plan's first camera; raises ConfigError if there is none."""
+    first = next(iter(plan.cameras.values()), None)
+    if first is None:
+        raise ConfigError(
+            f"{path} has neither `suggest` nor cameras; add suggest: {{camera: {{model: ov9281}}}}"
+        )
+    fields = {name: getattr(first, name) for name in CameraKind.__struct_fields__}
+    return Suggestion(camera=CameraKind(**fields))
+
+
+def _rounded(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = (round(value, 3) for value in values)
+    return x, y, z
+
+
+def _place(values: tuple[float, float, float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in values) + " m"

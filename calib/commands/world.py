@@ -15,16 +15,11 @@ from calib.commands.output import check_folder, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
-from calib.world.landmarks import find_still_roundels, locate_landmarks
+from calib.world.alignment import align_to_roundels, name_markers
+from calib.world.landmarks import find_still_roundels
 from calib.world.resection import place_by_points
 from calib.world.survey import read_positions
-from calib.world.world_frame import (
-    align_cameras,
-    align_positions,
-    align_standing_wand,
-    check_above,
-    is_collinear,
-)
+from calib.world.world_frame import align_cameras, check_above, is_collinear
 from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
@@ -95,18 +90,15 @@ class World:
         file = self.points or self.frame or self.standing
         assert file is not None
         body = None if self.points else load_yaml(file, Body)
-        landmarks = read_positions(file, "name") if body is None else _name_markers(body)
+        landmarks = read_positions(file, "name") if body is None else name_markers(body)
         _check_landmarks(landmarks, file, on_line=self.standing is not None)
-        located = locate_landmarks(
-            rig.placed(), find_still_roundels(self._read_roundels(rig, body)), landmarks
-        )
-        if missing := [name for name in landmarks if name not in located]:
-            say(f"warning: fewer than two cameras see the roundel at {', '.join(missing)}; it is not used")
-        if self.standing is not None:
-            return align_standing_wand(rig, np.array(list(located.values())), self.foot), {}
-        moved, distances = align_positions(rig, located, landmarks, "roundel")
-        check_above(moved, landmarks)
-        return moved, distances
+        foot = self.foot if self.standing is not None else None
+        change = align_to_roundels(rig, landmarks, self._read_roundels(rig, body), foot)
+        if change.missing:
+            say(
+                f"warning: fewer than two cameras see the roundel at {', '.join(change.missing)}; it is not used"
+            )
+        return change.rig, change.distances
 
     def _place_cameras(self, rig: Rig) -> tuple[Rig, dict[str, float]]:
         """The rig with the named cameras placed, and the distances of the points from their rays, metres."""
@@ -149,10 +141,6 @@ def _move_by_cameras(rig: Rig, file: Path) -> tuple[Rig, dict[str, float]]:
     if np.mean([camera.matrix()[2, 1] for camera in moved.placed().values()]) > UPSIDE_DOWN:
         say("warning: most cameras are upside down in this world; check whether x and y are swapped")
     return moved, distances
-
-
-def _name_markers(body: Body) -> dict[str, Array]:
-    return {str(k): point for k, point in enumerate(body.points)}
 
 
 def _check_landmarks(landmarks: Landmarks, file: Path, on_line: bool) -> None:

@@ -2,6 +2,7 @@
 """Captures views of a board from a running camera: selects distinct views, gives advice, and ends when they suffice."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -24,11 +25,43 @@ ENOUGH_SIGMA_PX = 0.3  # median over the image: below, another view changes less
 SHADES, CORNERS_PER_SHADE = " ░▒▓█", 8  # of a cell, by the logarithm of its number of corners
 
 
+@dataclass(frozen=True, slots=True)
+class CaptureProgress:
+    """The state of a capture.
+
+    Attributes:
+        camera: its name.
+        n_views, n_images: distinct views, and images in which the board was searched.
+        coverage: of the image by corners of the board.
+        figures: of the latest trial lens, or what is needed for one.
+        added: whether the latest image was a distinct view.
+    """
+
+    camera: str
+    n_views: int
+    n_images: int
+    coverage: Coverage
+    figures: str
+    added: bool
+
+    @property
+    def summary(self) -> str:
+        """The number of views, and the covered share of the image."""
+        return f"{self.camera}: {self.n_views} views of {self.n_images} images, {self.coverage.share():.0%} covered"
+
+    @property
+    def advice(self) -> str:
+        """What to show next."""
+        if missing := self.coverage.missing():
+            return f"show the board in the {enumerate_words(missing[:3])}"
+        return "tilt the board in all directions"
+
+
 def capture_views(
     views: BoardViews,
     images: Iterable[NamedImage],
     model: Model,
-    show: Callable[[Group], None] = lambda panel: None,
+    show: Callable[[CaptureProgress], None] = lambda progress: None,
 ) -> str:
     """Add distinct views from a running camera's images to `views`, until they suffice or the images end.
 
@@ -44,10 +77,10 @@ def capture_views(
         if added and len(views.views) >= MIN_VIEWS and len(views.views) % TRIAL_EVERY == 0:
             lens, figures = _try_solve(views, model)
             sufficient = lens is not None and is_sufficient(lens)
-        show(make_panel(views, figures, added))
+        show(CaptureProgress(views.camera, len(views.views), views.frames, views.coverage(), figures, added))
         if sufficient:
             return f"there are enough views: {figures}"
-    return f"the time has passed: {figures}"
+    return f"the capture ended: {figures}"
 
 
 def is_distinct(view: BoardView, others: list[BoardView], width: int) -> bool:
@@ -79,23 +112,13 @@ def is_sufficient(lens: CalibratedLens) -> bool:
     return precise and len(lens.views) >= ENOUGH_VIEWS and lens.coverage.share() >= ENOUGH_COVERED
 
 
-def make_panel(views: BoardViews, figures: str, added: bool) -> Group:
+def make_panel(progress: CaptureProgress) -> Group:
     """The state of a capture for the terminal: the covered cells of the image, and what to do next."""
-    coverage = views.coverage()
-    head = (
-        f"{views.camera}: {len(views.views)} views of {views.frames} images, {coverage.share():.0%} covered"
-    )
-    missing = coverage.missing()
-    advice = (
-        f"show the board in the {enumerate_words(missing[:3])}"
-        if missing
-        else "tilt the board in all directions"
-    )
     return Group(
-        Text(head, "bold green" if added else "bold"),
-        _draw_cells(coverage),
-        Text(figures),
-        Text(advice, "yellow"),
+        Text(progress.summary, "bold green" if progress.added else "bold"),
+        _draw_cells(progress.coverage),
+        Text(progress.figures),
+        Text(progress.advice, "yellow"),
     )
 
 

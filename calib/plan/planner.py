@@ -1,160 +1,151 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Predicts range, coverage and precision of planned cameras, before they are mounted.
+"""Evaluates an arena, planned or calibrated: cameras per place, expected errors, blind spots, rate and network load.
 
-The sensor model is that of Faigl, Krajnik, Chudoba and Saska (ICRA 2013): a roundel of diameter d_o is detected from
-v_min = d_o max(f_x / w, f_y / h), where it fills the image, to v_max = d_o / D min(f_x cos phi, f_y cos psi), where its
-minor axis is D pixels. At v_max the operational space is v_max w / f_x - 2 d_o wide and v_max h / f_y - 2 d_o high.
-The paper prints the last two fractions inverted; as given here they are lengths.
+The sensor model is that of Faigl, Krajnik, Chudoba and Saska (ICRA 2013), extended by `camera_node.sensor_model`.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
+from calib.plan.camera_kind import CameraKind
+from calib.plan.description import Plan
+from calib.plan.network import NetworkLoad, network_load
+from calib.plan.precision import ExpectedErrors, Uncertainty, combine_views, expected_errors
+from calib.plan.views import RoundelSensor
+from calib.plan.volume import Region, Volume, find_regions
 from calib.rig.camera import Camera
-from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
 from camera_node.arrays import Array, Mask
-from camera_node.geometry.pose import Pose, look_at
+from camera_node.sensor_model.operational_space import OperationalSpace, operational_space
+from camera_node.sensor_model.threshold import threshold_D
 
-Vector = tuple[float, float, float]
-
-
-class PlannedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A camera that is not mounted yet, with a lens given by its field of view or by its focal length.
-
-    Attributes:
-        width, height: of its image, pixels.
-        fov_deg: horizontal field of view without distortion, as in data sheets.
-        focal_px: focal length, pixels; instead of `fov_deg`.
-        position_m, look_at_m: its position, and the point in the middle of its image, world.
-    """
-
-    width: int
-    height: int
-    fov_deg: float | None = None
-    focal_px: float | None = None
-    position_m: Vector
-    look_at_m: Vector
-
-    def __post_init__(self) -> None:
-        if (self.fov_deg is None) == (self.focal_px is None):
-            raise ValueError("give one of fov_deg and focal_px")
-        if self.fov_deg is not None and not 1 < self.fov_deg < 170:
-            raise ValueError(f"fov_deg is {self.fov_deg}; give 1 to 170 degrees")
-        if np.allclose(self.position_m, self.look_at_m):
-            raise ValueError("look_at_m equals position_m; give another point")
-        self.camera()
-
-    def camera(self) -> Camera:
-        """The camera at its planned pose, which counts as exact."""
-        focal = self.focal_px or 0.0
-        if self.fov_deg is not None:
-            focal = self.width / 2 / np.tan(np.radians(self.fov_deg) / 2)
-        return Camera(
-            width=self.width,
-            height=self.height,
-            fx=float(focal),
-            fy=float(focal),
-            cx=(self.width - 1) / 2,
-            cy=(self.height - 1) / 2,
-            T_world_cam=Pose.from_matrix(look_at(self.position_m, self.look_at_m)),
-        )
-
-
-class Plan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A planned arena, as in `configs/plan.yaml`.
-
-    Attributes:
-        area_m: x0, y0, x1, y1 of the floor.
-        height_m: of the level roundels that robots carry.
-        diameter_m: of these roundels.
-        min_diameter_px: the smallest minor axis at which the detector finds a roundel.
-        sigma_px: standard deviation of one coordinate of its centre.
-        cameras: by name.
-    """
-
-    area_m: tuple[float, float, float, float]
-    height_m: float = 0.1
-    diameter_m: float
-    min_diameter_px: float = 11.0
-    sigma_px: float = SIGMA_PX
-    cameras: dict[str, PlannedCamera]
-
-    def __post_init__(self) -> None:
-        x0, y0, x1, y1 = self.area_m
-        if not (x0 < x1 and y0 < y1):
-            raise ValueError("area_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1, metres")
-        if not (self.diameter_m > 0 and self.min_diameter_px > 0 and self.sigma_px > 0):
-            raise ValueError("diameter_m, min_diameter_px and sigma_px must be above 0")
-        if not self.cameras:
-            raise ValueError("cameras must name one or more")
-
-    def grid(self) -> FloorGrid:
-        """The points for which errors are predicted."""
-        return FloorGrid.covering(self.area_m[:2], self.area_m[2:], self.height_m)
+POINTS = 6000  # of the volume, about
+SMALL_REGION = 2e-3  # of the volume; smaller blind spots are not listed
 
 
 @dataclass(frozen=True, slots=True)
-class SensorRange:
-    """The range in which one camera detects roundels.
+class PlannedArena:
+    """Cameras with their kinds, both by name, and the plan that they serve."""
+
+    plan: Plan
+    cameras: Mapping[str, Camera]
+    kinds: Mapping[str, CameraKind]
+
+    @classmethod
+    def of(cls, plan: Plan) -> "PlannedArena":
+        """The plan's own cameras."""
+        return cls(plan, {name: entry.camera() for name, entry in plan.cameras.items()}, plan.cameras)
+
+    @classmethod
+    def of_cameras(cls, plan: Plan, cameras: Mapping[str, Camera], kind: CameraKind) -> "PlannedArena":
+        """Cameras of one kind: those of a calibrated rig, or a suggested placement."""
+        return cls(plan, cameras, dict.fromkeys(cameras, kind))
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """What adds to the detector's noise."""
+        return Uncertainty(self.plan.image.sigma_px, self.plan.robots.speed_m_s)
+
+    def sensors(self) -> dict[str, RoundelSensor]:
+        """How each camera sees roundels; cameras with the same exposure and shutter share one."""
+        unique: dict[tuple[float, float], RoundelSensor] = {}
+        sensors = {}
+        for name, kind in self.kinds.items():
+            key = (kind.exposure_s, kind.stamp_sigma_s)
+            sensors[name] = unique.setdefault(key, RoundelSensor.of(self.plan, kind))
+        return sensors
+
+    def errors_at(self, points: Array) -> ExpectedErrors:
+        """Expected errors of robots at points (N, 3), world, metres."""
+        sums = combine_views(self.cameras, self.sensors(), points, self.uncertainty)
+        return expected_errors(sums, self.plan.robots.points)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraReach:
+    """What one camera sees.
 
     Attributes:
-        v_min, v_max: nearest and farthest distance, metres.
-        v_y, v_z: width and height of the operational space at v_max, metres.
-        share: fraction of the area that the camera sees.
+        space: the operational space of level roundels, as slanted as on the optical axis; all 0 if that is too much.
+        share: fraction of the volume in which it detects roundels.
     """
 
-    v_min: float
-    v_max: float
-    v_y: float
-    v_z: float
+    space: OperationalSpace
     share: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PlanReport:
-    """The evaluation of a plan: the range of each camera by name, and the map of expected errors."""
+    """The evaluation of an arena.
 
-    ranges: dict[str, SensorRange]
-    precision: PrecisionMap
-
-
-def sensor_range(camera: Camera, diameter_m: float, min_diameter_px: float, tilt_rad: float) -> SensorRange:
-    """The paper's model of one camera, for roundels tilted by `tilt_rad` about either axis; `share` is 0."""
-    w, h, f_x, f_y = camera.width, camera.height, camera.fx, camera.fy
-    v_min = diameter_m * max(f_x / w, f_y / h)
-    v_max = diameter_m / min_diameter_px * min(f_x, f_y) * float(np.cos(tilt_rad))
-    return SensorRange(v_min, v_max, v_max * w / f_x - 2 * diameter_m, v_max * h / f_y - 2 * diameter_m, 0.0)
-
-
-def sees_level(camera: Camera, points: Array, diameter_m: float, min_diameter_px: float) -> Mask:
-    """(N,) whether a camera detects level roundels at points (N, 3), world: from above, complete, and large enough.
-
-    A level disc seen under the angle phi from the vertical, at distance r, has a minor axis of about f d_o cos phi / r.
+    Attributes:
+        arena: what was evaluated.
+        volume: the N points.
+        errors: expected at these points.
+        reach: of each camera, by name.
+        blind: the regions that fewer than two cameras see, largest first.
+        network: rate and load.
     """
-    T = camera.matrix()
-    away = T[:3, 3] - points
-    distance = np.linalg.norm(away, axis=1)
-    minor = min(camera.fx, camera.fy) * diameter_m * away[:, 2] / distance**2
-    edges = [
-        points + diameter_m / 2 * np.array(step) for step in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
-    ]
-    inside = np.logical_and.reduce([camera.sees(camera.project_world(edge)) for edge in edges])
-    return inside & (minor >= min_diameter_px)
+
+    arena: PlannedArena
+    volume: Volume
+    errors: ExpectedErrors
+    reach: Mapping[str, CameraReach]
+    blind: tuple[Region, ...]
+    network: NetworkLoad
+
+    @property
+    def covered(self) -> Mask:
+        """(N,) whether two cameras or more see the point."""
+        return self.errors.cameras >= 2
+
+    @property
+    def median_mm(self) -> float:
+        """Median error where two cameras or more see; infinite if there is no such point."""
+        return self.quantile_mm(0.5)
+
+    def quantile_mm(self, q: float) -> float:
+        """Quantile of the error where two cameras or more see; infinite if there is no such point."""
+        known = self.errors.position_mm[self.covered]
+        return float(np.quantile(known, q)) if known.size else float("inf")
+
+    @property
+    def median_deg(self) -> float:
+        """Median error of the orientation where two cameras or more see; NaN for robots with one or two roundels."""
+        known = self.errors.orientation_deg[self.covered]
+        return float(np.median(known)) if known.size else float("nan")
+
+    def share_within(self, error_mm: float) -> float:
+        """Fraction of the volume with at most this error."""
+        return float(np.mean(self.errors.position_mm <= error_mm))
+
+    @property
+    def is_sufficient(self) -> bool | None:
+        """Whether the plan's requirement is met; None without one."""
+        required = self.arena.plan.required
+        return None if required is None else self.share_within(required.error_mm) >= required.share
 
 
-def evaluate_plan(plan: Plan) -> PlanReport:
-    """Predict range, coverage and errors. Poses count as exact; a good calibration adds less than 5 % to the errors."""
-    cameras = {name: entry.camera() for name, entry in plan.cameras.items()}
+def evaluate(arena: PlannedArena, points: int = POINTS) -> PlanReport:
+    """Predict coverage and errors at about so many points of the arena's volume."""
+    plan, volume = arena.plan, arena.plan.volume(points)
+    sensors, at = arena.sensors(), volume.points
+    errors = arena.errors_at(at)
+    reach = {
+        name: _reach(camera, sensors[name], len(sensors[name].view(camera, at).rows) / len(at))
+        for name, camera in arena.cameras.items()
+    }
+    blind = tuple(r for r in find_regions(volume, errors.cameras < 2) if r.share >= SMALL_REGION)
+    shares = {name: one.share for name, one in reach.items()}
+    load = network_load(plan.robots, {name: kind.rate for name, kind in arena.kinds.items()}, shares)
+    return PlanReport(arena, volume, errors, reach, blind, load)
 
-    def sees(camera: Camera, points: Array) -> Mask:
-        return sees_level(camera, points, plan.diameter_m, plan.min_diameter_px)
 
-    precision = map_precision(list(cameras.values()), plan.grid(), plan.sigma_px, sees=sees)
-    ranges = {}
-    for name, camera in cameras.items():
-        tilt = float(np.arccos(np.clip(-camera.matrix()[2, 2], -1, 1)))
-        reach = sensor_range(camera, plan.diameter_m, plan.min_diameter_px, tilt)
-        ranges[name] = replace(reach, share=float(sees(camera, plan.grid().points).mean()))
-    return PlanReport(ranges, precision)
+def _reach(camera: Camera, sensor: RoundelSensor, share: float) -> CameraReach:
+    """A level roundel on the optical axis is slanted by the axis's angle from the vertical."""
+    slant = float(np.arccos(np.clip(-camera.matrix()[2, 2], 0, 1)))
+    D = sensor.min_diameter_px or float(threshold_D(slant, sensor.imaging.blur_px))
+    if not np.isfinite(D):
+        return CameraReach(OperationalSpace(0.0, 0.0, 0.0, 0.0), share)
+    return CameraReach(operational_space(camera, sensor.pattern.d_o, D, slant, slant), share)

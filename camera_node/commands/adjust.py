@@ -11,7 +11,14 @@ from zenoh import Session
 
 from camera_node.config import require_name
 from camera_node.errors import ConfigError
-from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings, request_snapshot
+from camera_node.protocol.camera_requests import (
+    Polygon,
+    mask_of,
+    mask_polygon,
+    next_detections,
+    request_settings,
+    request_snapshot,
+)
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
 from camera_node.protocol.session import open_requester
@@ -68,27 +75,47 @@ class ChangeSettings:
     """Least contrast of a roundel, grey levels."""
     mask_detected: bool = False
     """Ignore the places where roundels are detected now: reflections, while no real roundel is in view."""
+    mask: tuple[str, ...] = ()
+    """Also ignore a rectangle, by two opposite corners U,V in pixels, or a polygon, by three or more corners."""
     clear_mask: bool = False
-    """Ignore no place."""
+    """Ignore no place, except those of --mask and --mask-detected."""
     server: Annotated[CameraConnection, tyro.conf.OmitArgPrefixes] = field(default_factory=CameraConnection)
 
     def run(self) -> None:
         """Change the settings and print those in use. Raises NetworkError, RequestError or ConfigError."""
         require_name(self.name, "a camera")
-        if self.mask_detected and self.clear_mask:
-            raise ConfigError("--mask-detected and --clear-mask exclude each other")
+        drawn = (mask_polygon([_read_corner(text) for text in self.mask]),) if self.mask else ()
         with self.server.open() as session:
-            arena = self.server.arena
-            used = request_settings(session, arena, self.name)
-            mask = () if self.clear_mask else None
-            if self.mask_detected:
-                mask = (*(used.mask or ()), *mask_of(next_detections(session, arena, self.name)))
+            used = request_settings(session, self.server.arena, self.name)
             wanted = Settings(
-                exposure_us=self.exposure_us, gain=self.gain, min_contrast=self.min_contrast, mask=mask
+                exposure_us=self.exposure_us,
+                gain=self.gain,
+                min_contrast=self.min_contrast,
+                mask=self._changed_mask(session, used, drawn),
             )
             if wanted != Settings():
-                used = request_settings(session, arena, self.name, wanted)
+                used = request_settings(session, self.server.arena, self.name, wanted)
         for name, value in msgspec.structs.asdict(used).items():
             if name not in ("version", "mask"):
                 say(f"{name}: {'-' if value is None else value}")
         say(f"mask: {len(used.mask or ())} polygons")
+
+    def _changed_mask(
+        self, session: Session, used: Settings, drawn: tuple[Polygon, ...]
+    ) -> tuple[Polygon, ...] | None:
+        """The whole mask; None if it stays as it is."""
+        detected = ()
+        if self.mask_detected:
+            detected = mask_of(next_detections(session, self.server.arena, self.name))
+        if not (drawn or detected or self.clear_mask):
+            return None
+        return (*(() if self.clear_mask else used.mask or ()), *drawn, *detected)
+
+
+def _read_corner(text: str) -> tuple[float, float]:
+    """A corner from `U,V`; raises ConfigError for any other text."""
+    try:
+        u, v = (float(number) for number in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--mask {text}: give corners as U,V in pixels, such as 100,80 300,200") from None
+    return u, v

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from camera_node.commands.relative import RelativeSettings
 from camera_node.config import require_name
 from camera_node.errors import CameraAbsentError, ConfigError
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
@@ -42,6 +43,10 @@ class JoinArena:
     """The arena's name; the only one of the server unless given."""
     zenoh: Path | None = None
     """A Zenoh configuration file (JSON5) for TLS, access control or scouting; requires --connect."""
+    listen: tuple[str, ...] = ()
+    """Run one camera without a server, as on a robot: be the Zenoh router that listens on these endpoints, such as
+    tcp/127.0.0.1:7447, to which the robot's programs connect. Requires --name."""
+    relative: Annotated[RelativeSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=RelativeSettings)
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> int:
@@ -61,14 +66,22 @@ class JoinArena:
             require_name(self.name, "a camera")
             if len(self.source) != 1:
                 raise ConfigError("--name names one camera: give one --source with it")
-        if self.zenoh is not None and not self.connect:
+        self._check_listen()
+        self.relative.check()
+        if self.zenoh is not None and not (self.connect or self.listen):
             raise ConfigError("--zenoh needs --connect: a protected server is not found by scouting")
         if not self.source and not camera_names():
             raise CameraAbsentError("this machine has no camera; plug one in, or give --source")
 
+    def _check_listen(self) -> None:
+        if self.listen and self.connect:
+            raise ConfigError("--listen runs without a server; give it or --connect, not both")
+        if self.listen and self.name is None:
+            raise ConfigError("--listen runs without a server, which would name the camera; give --name")
+
     def _find(self, stop: threading.Event) -> FoundArena | None:
         """The arena to join; None if this program is stopped first."""
-        if self.connect:
+        if self.connect or self.listen:
             return FoundArena(self.arena or "arena", self.connect)
         waited = False
         while not stop.is_set():
@@ -83,15 +96,17 @@ class JoinArena:
         return None
 
     def _options(self, found: FoundArena) -> list[str]:
-        options = ["--connect", *found.endpoints, "--arena", found.arena, *given_options(self.settings)]
+        options = ["--listen", *self.listen] if self.listen else ["--connect", *found.endpoints]
+        options += ["--arena", found.arena, *given_options(self.settings)]
+        options += given_options(self.relative)
         if self.name is not None:
             options += ["--name", self.name]
         return options + (["--zenoh", str(self.zenoh)] if self.zenoh else [])
 
 
-def given_options(settings: SourceSettings) -> list[str]:
+def given_options(settings: SourceSettings | RelativeSettings) -> list[str]:
     """The options that differ from their defaults."""
-    values, defaults = asdict(settings), asdict(SourceSettings())
+    values, defaults = asdict(settings), asdict(type(settings)())
     return [
         word
         for name, value in values.items()

@@ -8,15 +8,9 @@ import msgspec
 import tyro
 
 from camera_node.errors import ConfigError
-from camera_node.protocol.messages import MessageError, decode, encode
-from camera_node.protocol.registration import (
-    CameraChange,
-    RegisteredCamera,
-    RegisteredCameras,
-    change_key,
-    registered_key,
-)
-from camera_node.protocol.requests import RequestError, RequestSource, send_request
+from camera_node.protocol.camera_requests import change_camera, request_cameras
+from camera_node.protocol.registration import CameraChange, RegisteredCamera
+from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_requester
 from camera_node.terminal import say
 
@@ -45,35 +39,20 @@ def cameras(
     if len(arguments) != N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
     with open_requester(connect, zenoh_config) as session:
-        if action == "list":
-            reply = send_request(session, registered_key(arena))
-        else:
-            reply = send_request(session, change_key(arena), encode(_change(action, arguments)))
-    for name, camera in _read(reply).cameras.items():
+        registered = (
+            request_cameras(session, arena)
+            if action == "list"
+            else change_camera(session, arena, _change(action, arguments))
+        )
+    for name, camera in registered.items():
         say(_line(name, camera))
     return 0
 
 
 def _change(action: str, arguments: tuple[str, ...]) -> CameraChange:
     name = arguments[1] if action == "rename" else ""
-    change = CameraChange(
-        camera=arguments[0],
-        name=name,
-        forget=action == "forget",
-        source=RequestSource.of("roundel cameras"),
-    )
-    try:
-        change.check()
-    except MessageError as error:
-        raise ConfigError(f"{' '.join(arguments)}: {error}") from None
-    return change
-
-
-def _read(data: bytes) -> RegisteredCameras:
-    try:
-        return decode(data, RegisteredCameras)
-    except MessageError as error:
-        raise RequestError(f"the server's reply is no list of cameras: {error}") from None
+    source = RequestSource.of("roundel cameras")
+    return CameraChange(camera=arguments[0], name=name, forget=action == "forget", source=source)
 
 
 def _line(name: str, camera: RegisteredCamera) -> str:

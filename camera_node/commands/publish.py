@@ -11,7 +11,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from camera_node.commands.relative import RelativeSettings
 from camera_node.config import example_file, require_name
+from camera_node.errors import ConfigError
 from camera_node.protocol.registration import CameraAssignment, CameraRegistration
 from camera_node.service import ServiceManager
 from camera_node.simulation.camera import SimulatedCamera
@@ -51,15 +53,17 @@ class Publish:
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
     inner_ratios: tuple[float, ...] = ()
     """Inner over outer diameters of the prints in use, such as 0.6; without any, they are found."""
+    listen: tuple[str, ...] = ()
+    """Run without a server, as on a robot: be the Zenoh router that listens on these endpoints, such as
+    tcp/127.0.0.1:7447, to which the robot's programs connect. Requires --name; --connect is not used."""
+    relative: Annotated[RelativeSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=RelativeSettings)
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> None:
         """Open the source and the session, publish until the source ends or a signal arrives, and close both."""
         import cv2
 
-        require_name(self.arena, "an arena")
-        if self.name is not None:
-            require_name(self.name, "a camera")
+        self._check()
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         cv2.setNumThreads(1)  # a machine runs one process for each of its cameras
         with contextlib.suppress(KeyboardInterrupt):
@@ -68,6 +72,7 @@ class Publish:
                     source = open_source(self.source, self.settings, self.name)
                     stack.callback(source.close)
                     self._detector()  # its settings may be invalid
+                    self.relative.localizer(self.name)
                     session = stack.enter_context(self._open_session())
                     keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
                     self._node(self.name, source, session, keeps_stamps).run()
@@ -77,10 +82,20 @@ class Publish:
             with self._open_session() as session:
                 self._publish_registered(session, identity, first_t_ns)
 
-    def _open_session(self) -> "zenoh.Session":
-        """Wait for the server; the service is ready while it waits."""
-        from camera_node.protocol.session import open_when_reachable
+    def _check(self) -> None:
+        require_name(self.arena, "an arena")
+        if self.name is not None:
+            require_name(self.name, "a camera")
+        elif self.listen:
+            raise ConfigError("--listen runs without a server, which would name the camera; give --name")
+        self.relative.check()
 
+    def _open_session(self) -> "zenoh.Session":
+        """Wait for the server, if there is to be one; the service is ready while it waits."""
+        from camera_node.protocol.session import open_router, open_when_reachable
+
+        if self.listen:
+            return open_router(self.listen, self.zenoh)
         with contextlib.ExitStack() as stack:
             service = stack.enter_context(ServiceManager())
 
@@ -120,9 +135,10 @@ class Publish:
                     assignment = registered.run(node, assignment)
 
     def _node(self, name: str, source: Source, session: "zenoh.Session", keep_stamps: bool) -> "Node":
-        from camera_node.node.node import Node
+        from camera_node.node.node import Node, NodeOptions
 
-        return Node(name, source, self._detector(), session, self.arena, keep_stamps)
+        options = NodeOptions(self.arena, keep_stamps, self.relative.localizer(name), bool(self.listen))
+        return Node(name, source, self._detector(), session, options)
 
     def _detector(self) -> "Detector":
         from camera_node.detection.detector import Detector
@@ -140,7 +156,8 @@ def open_source(
         text: the value of `--source`.
         settings: each kind of source uses those that apply to it.
         name: the camera's name in a simulated arena, unless `text` has it, as in `sim:north`.
-        arena_time: recordings and simulations play as live cameras in this time, whatever `settings` say.
+        arena_time: recordings play as live cameras in this time, whatever `settings` say, and so do simulations
+            without an epoch.
 
     Raises:
         CameraError: the source does not exist or does not open.
@@ -173,6 +190,6 @@ def first_time(text: str, settings: SourceSettings) -> int | None:
 def _open_simulation(settings: SourceSettings, name: str, arena_time: ArenaTime | None) -> Source:
     scene = settings.scene or example_file("demo/scene.yaml")
     epoch_ns = time.time_ns() if settings.epoch_ns is None else settings.epoch_ns
-    if arena_time is not None:
+    if arena_time is not None and settings.epoch_ns is None:
         epoch_ns = arena_time.shift_ns - arena_time.ahead_ns
     return SimulatedCamera(scene, name, epoch_ns)

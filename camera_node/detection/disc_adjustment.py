@@ -5,13 +5,34 @@ The pose has five parameters. They determine the seven measurements: the outer e
 own centre (2). The covariance of the measurements weights their residuals.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from camera_node.arrays import Array
 from camera_node.geometry.lens import Lens
 
 STEPS = 4  # Gauss-Newton iterations; the poses from the conic are close to the solution
+MAX_SIGMA = np.pi / 2  # of a normal, radians: nothing is known
 STEP = 0.2  # largest step: of the normal in radians, of the position relative to the distance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedDiscs:
+    """Adjusted poses of N discs, camera frame.
+
+    Attributes:
+        position, normal: (N, 3).
+        chi2: (N,) weighted sum of squared residuals, with two degrees of freedom.
+        cov: (N, 3, 3) covariance of `position`, squared unit of `position`, to first order.
+        normal_sigma: (N,) standard deviation of `normal` in its least certain direction, radians, to first order.
+    """
+
+    position: Array
+    normal: Array
+    chi2: Array
+    cov: Array
+    normal_sigma: Array
 
 
 def shape_of(dual: Array) -> Array:
@@ -56,7 +77,7 @@ def _root(ellipses: Array) -> Array:
 
 def adjust(
     position: Array, normal: Array, radius: float, measured: Array, covariance: Array
-) -> tuple[Array, Array, Array]:
+) -> AdjustedDiscs:
     """Adjust poses of discs of one radius to measurements by Gauss-Newton.
 
     Args:
@@ -65,10 +86,6 @@ def adjust(
         radius: outer radius of the discs, in the unit of `position`.
         measured: (N, 7) the ellipse's centre, S and the disc's centre, in the normalised image plane.
         covariance: (N, 7, 7) of `measured`.
-
-    Returns:
-        position, normal: (N, 3).
-        chi2: (N,) weighted sum of squared residuals, with two degrees of freedom.
     """
     to_white = np.linalg.inv(np.linalg.cholesky(covariance))
     c, n = position, normal
@@ -83,8 +100,19 @@ def adjust(
         n /= np.linalg.norm(n, axis=1, keepdims=True)
     valid = (c[:, 2:] > 0) & ((n * c).sum(axis=1, keepdims=True) < 0)
     c, n = np.where(valid, c, position), np.where(valid, n, normal)
-    residual = to_white @ (measured - _predict(c, n, radius)[0])[..., None]
-    return c, n, (residual**2).sum(axis=(1, 2))
+    predicted, J, _ = _predict(c, n, radius)
+    residual = to_white @ (measured - predicted)[..., None]
+    return AdjustedDiscs(c, n, (residual**2).sum(axis=(1, 2)), *_precision(c, to_white @ J))
+
+
+def _precision(c: Array, J: Array) -> tuple[Array, Array]:
+    """Covariances (N, 3, 3) of positions c (N, 3), and standard deviations (N,) of normals.
+
+    `J` are the whitened derivatives (N, 7, 5) of `_predict`.
+    """
+    cov = np.linalg.inv(J.mT @ J)
+    sigma = np.sqrt(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, 1])
+    return (c * c).sum(axis=1)[:, None, None] * cov[:, :3, :3], np.minimum(sigma, MAX_SIGMA)
 
 
 def _predict(c: Array, n: Array, radius: float) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from camera_node import _core
 from camera_node.arrays import Array
-from camera_node.detection.disc_adjustment import adjust, covariance_through, shape_of
+from camera_node.detection.disc_adjustment import AdjustedDiscs, adjust, covariance_through, shape_of
 from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
 from camera_node.geometry.lens import Lens
 
@@ -42,13 +42,17 @@ class DiscPose:
 class DiscPoses:
     """Both poses of N discs, the likelier first; rows are NaN where the lens has no inverse at the ellipse.
 
-    Shapes: position_m and normal (N, 2, 3), centre_uv (N, 2, 2), probability (N, 2); as in `DiscPose`.
+    Shapes: position_m and normal (N, 2, 3), centre_uv (N, 2, 2), probability (N, 2); as in `DiscPose`. `cov`
+    (N, 2, 3, 3) is the covariance of `position_m`, square metres, and `normal_sigma` (N, 2) the standard deviation of
+    `normal`, radians; NaN unless the roundels are `DetectedRoundels`.
     """
 
     position_m: Array
     normal: Array
     centre_uv: Array
     probability: Array
+    cov: Array
+    normal_sigma: Array
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -101,7 +105,13 @@ def locate_all(roundels: Roundels, lens: Lens, diameter_m: float) -> DiscPoses:
 
 
 def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) -> float:
-    """Distance of a disc's centre from the camera, metres, by the ellipse's major axis; NaN without an inverse.
+    """Distance of one disc's centre, metres, as in `distances_by_principal_axis`; NaN without an inverse."""
+    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
+    return float(_distances_by_principal_axis(ellipse, lens, diameter_m)[0])
+
+
+def distances_by_principal_axis(roundels: Roundels, lens: Lens, diameter_m: float) -> Array:
+    """Distances (N,) of discs' centres from the camera, metres, by the ellipses' major axes; NaN without an inverse.
 
     Section III-C of Faigl et al. (ICRA 2013): one diameter of a slanted disc is perpendicular to the line of sight and
     appears as the ellipse's major axis, so that L = d_o / major. Here the axis is measured in the image plane of a
@@ -113,15 +123,24 @@ def distance_by_principal_axis(roundel: Roundel, lens: Lens, diameter_m: float) 
     derived from the geometry, as the paper's own correction was not available. The remaining error is of the order of
     (d_o / L)^4.
     """
-    ellipse = np.array([[*roundel.uv, *roundel.axes_px, roundel.angle_rad]])
-    rays = lens.rays(np.vstack([ellipse[:, :2], _boundaries(ellipse)[0]]))
-    if not np.isfinite(rays).all():
-        return float("nan")
-    turned = rays[1:] @ _rotation_to_axis(rays[0]).T
-    minor, major = _axes(_fit_conics(turned[None, :, :2] / turned[None, :, 2:])[0])
-    sin2 = 1 - (minor / major) ** 2
-    uncorrected = _core.distance_by_principal_axis(diameter_m, major)
-    return float(np.hypot(uncorrected, diameter_m / 2 * np.sqrt(sin2)))
+    ellipses = np.column_stack([roundels.uv, roundels.axes_px, roundels.angle_rad])
+    return _distances_by_principal_axis(ellipses, lens, diameter_m)
+
+
+def _distances_by_principal_axis(ellipses: Array, lens: Lens, diameter_m: float) -> Array:
+    """As `distances_by_principal_axis`, of ellipses (N, 5)."""
+    n = len(ellipses)
+    points = np.concatenate([ellipses[:, None, :2], _boundaries(ellipses)], axis=1)
+    rays = lens.rays(points.reshape(-1, 2)).reshape(n, 1 + BOUNDARY, 3)
+    valid = np.isfinite(rays).all(axis=(1, 2))
+    distances = np.full(n, np.nan)
+    if not valid.any():
+        return distances
+    turned = rays[valid, 1:] @ _rotations_to_axis(rays[valid, 0]).mT
+    minor, major = _axes(_fit_conics(turned[..., :2] / turned[..., 2:]))
+    uncorrected = np.array([_core.distance_by_principal_axis(diameter_m, axis) for axis in major])
+    distances[valid] = np.hypot(uncorrected, diameter_m / 2 * np.sqrt(1 - (minor / major) ** 2))
+    return distances
 
 
 def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | None) -> DiscPoses:
@@ -130,18 +149,22 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | 
     xy = lens.normalise(_boundaries(ellipses).reshape(-1, 2)).reshape(n, BOUNDARY, 2)
     valid = np.isfinite(xy).all(axis=(1, 2))
     position, normal = np.full((n, 2, 3), np.nan), np.full((n, 2, 3), np.nan)
-    odds = np.full((n, 2), 0.5)
+    odds, cov = np.full((n, 2), 0.5), np.full((n, 2, 3, 3), np.nan)
+    sigma = np.full((n, 2), np.nan)
     if valid.any():
         Q, radius = _fit_conics(xy[valid]), diameter_m / 2
         position[valid], normal[valid] = decompose(Q, radius)
         if offsets is not None:
             offsets = _Offsets(offsets.offset_px[valid], offsets.pose_cov[valid])
-            measured, cov = _measure(Q, lens, ellipses[valid], offsets)
-            poses = _adjust(position[valid], normal[valid], radius, measured, cov)
-            position[valid], normal[valid], odds[valid] = poses
+            both = _adjust(
+                position[valid], normal[valid], radius, _measure(Q, lens, ellipses[valid], offsets)
+            )
+            position[valid], normal[valid] = both.position.reshape(-1, 2, 3), both.normal.reshape(-1, 2, 3)
+            odds[valid], cov[valid] = _odds(both.chi2.reshape(-1, 2)), both.cov.reshape(-1, 2, 3, 3)
+            sigma[valid] = both.normal_sigma.reshape(-1, 2)
     uv = lens.project(position.reshape(-1, 3)).reshape(n, 2, 2)
     pick = np.arange(n)[:, None], np.argsort(-odds, axis=1, kind="stable")
-    return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick])
+    return DiscPoses(position[pick], normal[pick], uv[pick], odds[pick], cov[pick], sigma[pick])
 
 
 def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[Array, Array]:
@@ -152,12 +175,11 @@ def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[
 
 
 def _adjust(
-    position: Array, normal: Array, radius: float, measured: Array, covariance: Array
-) -> tuple[Array, Array, Array]:
-    """Adjust both poses (N, 2, 3) of each disc to its measurements; also returns their probabilities (N, 2)."""
-    measured, covariance = np.repeat(measured, 2, axis=0), np.repeat(covariance, 2, axis=0)
-    c, n, chi2 = adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, measured, covariance)
-    return c.reshape(-1, 2, 3), n.reshape(-1, 2, 3), _odds(chi2.reshape(-1, 2))
+    position: Array, normal: Array, radius: float, measurements: tuple[Array, Array]
+) -> AdjustedDiscs:
+    """Adjust both poses (N, 2, 3) of each disc to its measurements (`_measure`); the result has 2 N rows."""
+    measured, covariance = (np.repeat(column, 2, axis=0) for column in measurements)
+    return adjust(position.reshape(-1, 3), normal.reshape(-1, 3), radius, measured, covariance)
 
 
 def _boundaries(ellipses: Array) -> Array:
@@ -219,15 +241,17 @@ def _odds(chi2: Array) -> Array:
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def _rotation_to_axis(ray: Array) -> Array:
-    """(3, 3) rotation that maps a unit ray (3,) to the optical axis."""
-    x = np.cross([0.0, 1.0, 0.0], ray)
-    x /= np.linalg.norm(x)
-    return np.array([x, np.cross(ray, x), ray])
+def _rotations_to_axis(rays: Array) -> Array:
+    """(N, 3, 3) rotations that map unit rays (N, 3) to the optical axis."""
+    x = np.cross([0.0, 1.0, 0.0], rays)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(rays, x), rays], axis=1).astype(float)
 
 
-def _axes(Q: Array) -> Array:
-    """(2,) full minor and major axis of an ellipse with the conic (3, 3)."""
-    centre = np.linalg.solve(Q[:2, :2], -Q[:2, 2])
-    level = -(Q[2, 2] + Q[2, :2] @ centre)
-    return 2 * np.sqrt(level / np.linalg.eigvalsh(Q[:2, :2])[::-1])
+def _axes(Q: Array) -> tuple[Array, Array]:
+    """Full minor and major axes, (N,) each, of ellipses with the conics (N, 3, 3)."""
+    linear = Q[:, :2, 2]
+    centre = np.linalg.solve(Q[:, :2, :2], -linear[..., None])[..., 0]
+    level = -(Q[:, 2, 2] + (linear * centre).sum(axis=1))
+    minor, major = 2 * np.sqrt(level[:, None] / np.linalg.eigvalsh(Q[:, :2, :2])[:, ::-1]).T
+    return minor, major

@@ -7,14 +7,18 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import zenoh
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_roundels
+from camera_node.detection.relative import DiscLocalizer
 from camera_node.node.clock_sync import ClockSync
 from camera_node.node.preview import Content, PreviewPublisher
+from camera_node.node.relative import RelativePublisher
 from camera_node.node.settings import apply_settings, read_settings
 from camera_node.node.status import DetectedFrame, NodeStatistics
 from camera_node.protocol.callbacks import guarded
@@ -44,6 +48,23 @@ LISTENER_S = 5.0  # longest time that a recording waits for a subscriber
 ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the route to it is ready
 
 
+@dataclass(frozen=True)
+class NodeOptions:
+    """What a node publishes, and for whom.
+
+    Attributes:
+        arena: the first part of all keys.
+        keep_stamps: publish the source's times unchanged instead of converting them to the server's time.
+        localizer: publish positions relative to the camera, too; None for detections only.
+        is_alone: no server is expected; its absence is not reported.
+    """
+
+    arena: str = "arena"
+    keep_stamps: bool = False
+    localizer: DiscLocalizer | None = None
+    is_alone: bool = False
+
+
 class Node:
     """Publishes the detections and the status of one camera, and answers requests for snapshots and settings.
 
@@ -56,8 +77,7 @@ class Node:
         source: Source,
         detector: Detector,
         session: zenoh.Session,
-        arena: str = "arena",
-        keep_stamps: bool = False,
+        options: NodeOptions = NodeOptions(),
     ) -> None:
         """Publish nothing before `run`.
 
@@ -66,27 +86,27 @@ class Node:
             source: the frames; the node closes it.
             detector: the detector with its initial settings.
             session: a Zenoh session; the node leaves it open.
-            arena: the first part of all keys.
-            keep_stamps: publish the source's times unchanged instead of converting them to the server's time.
+            options: what to publish.
         """
         self.name = name
         self._source, self._detector, self._session = source, detector, session
-        self._keys = Keys(arena)
+        self._options, self._keys = options, Keys(options.arena)
         self._clock = ClockSync(session, self._keys)
         self._statistics = NodeStatistics(name)
-        self._keep_stamps = keep_stamps
         self.on_settings: Callable[[Settings], object] = lambda wanted: None
         self._changing = threading.Lock()  # of the detector, by requests
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
         self._previews: PreviewPublisher | None = None
+        self._relative: RelativePublisher | None = None
 
     def run(self) -> None:
         """Publish every frame until the source ends or `close` is called; each frame is progress of the service.
 
         Raises:
             CameraError: a frame of the source can't be read.
+            ConfigError: the intrinsics of the localizer are for images of another size.
         """
         with contextlib.ExitStack() as stack:
             service = stack.enter_context(ServiceManager())
@@ -94,8 +114,11 @@ class Node:
             service.ready()
             for seq, frame in enumerate(self._source):
                 detected = self._detect(frame)
-                t_ns, clock_error_us = self._stamp(frame)
-                publisher.put(self._encode(seq, detected, t_ns, clock_error_us))
+                header = self._describe(seq, frame)
+                publisher.put(self._encode(detected, header))
+                if self._relative is not None:
+                    size = (frame.image.shape[1], frame.image.shape[0])
+                    self._relative.put(detected.roundels, size, **header)
                 self._statistics.count(detected)
                 service.progress()
 
@@ -120,27 +143,34 @@ class Node:
 
     def _stamp(self, frame: Frame) -> tuple[int, float]:
         """The frame's capture time in the server's time, ns, and the bound of its error by clocks, us."""
-        if self._keep_stamps:
+        if self._options.keep_stamps:
             return frame.t_ns, frame.error_us
         estimate = self._clock.estimate(frame.t_ns)
         if estimate is None:
             return frame.t_ns, math.nan
         return frame.t_ns + estimate[0], estimate[1] / 1000 + frame.error_us
 
-    def _encode(self, seq: int, detected: DetectedFrame, t_ns: int, clock_error_us: float) -> bytes:
+    def _describe(self, seq: int, frame: Frame) -> dict[str, Any]:
+        """The fields that all messages of a frame have."""
+        t_ns, clock_error_us = self._stamp(frame)
+        return {
+            "camera": self.name,
+            "seq": seq,
+            "t_ns": t_ns,
+            "exposure_us": frame.exposure_us,
+            "sent_ns": self._clock.to_server(time.time_ns()),
+            "clock_error_us": clock_error_us,
+        }
+
+    def _encode(self, detected: DetectedFrame, header: dict[str, Any]) -> bytes:
         height, width = detected.frame.image.shape
         message = Detections.pack(
             detected.roundels,
-            camera=self.name,
-            seq=seq,
-            t_ns=t_ns,
-            exposure_us=detected.frame.exposure_us,
             detect_us=detected.detect_us,
-            sent_ns=self._clock.to_server(time.time_ns()),
-            clock_error_us=clock_error_us,
             width=width,
             height=height,
             found_ratios=self._detector.found_ratios,
+            **header,
         )
         return encode(message)
 
@@ -166,6 +196,9 @@ class Node:
             session, keys.preview(name), name, self._latest, lambda: self._clock.to_server(time.time_ns())
         )
         stack.callback(previews.close)
+        if self._options.localizer is not None:
+            self._relative = RelativePublisher(session, keys.relative(name), self._options.localizer)
+            stack.callback(self._relative.close)
         watch = ServerWatch(session, keys.fusion_alive)
         stack.callback(watch.close)
         self._clock.start()
@@ -205,7 +238,8 @@ class Node:
         announced = False
         while not self._closed.wait(STATUS_S):
             try:
-                watch.report_absence()
+                if not self._options.is_alone:
+                    watch.report_absence()
                 status = self._summarize()
                 publisher.put(encode(status))
                 if status.fps > 0 and not announced:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Statistics of a camera node, and advice about the exposure, for its status once per second."""
+"""Statistics of a camera node, and advice about exposure and focus, for its status once per second."""
 
 import math
 import threading
@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.arrays import Array, Grey
-from camera_node.detection.roundels import Roundels
+from camera_node.detection.roundels import DetectedRoundels
+from camera_node.detection.sharpness import edge_blur_px
 from camera_node.protocol.messages import CameraStatus
 from camera_node.sources.frame import Frame, Source
 
@@ -22,6 +23,7 @@ DARK = 100  # least grey level of the roundels' white that is bright enough
 DARK_GUESSED = 64  # the same where no roundel is seen and the paper's grey level is a guess
 MAX_FACTOR = 16  # largest change of exposure that is advised; darker scenes need more light
 STRIDE = 8  # the brightness is that of every eighth pixel in both directions
+BLURRED_PX = 1.4  # of edges; a camera in focus has 0.4 to 1, and beyond 1.4 small roundels are lost first
 NO_IMAGE, NO_CENTRES = np.empty((0, 0), np.uint8), np.empty((0, 2))
 
 
@@ -30,7 +32,7 @@ class DetectedFrame:
     """A frame, its roundels, and the duration of their detection in microseconds."""
 
     frame: Frame
-    roundels: Roundels
+    roundels: DetectedRoundels
     detect_us: float
 
 
@@ -78,9 +80,11 @@ class NodeStatistics:
             source: the source of the frames.
             threshold: theta of `--detector paper`, grey levels; None with other detectors.
         """
-        with self._lock:
-            latest = self.latest
-            image, uv = (latest.frame.image, latest.roundels.uv) if latest else (NO_IMAGE, NO_CENTRES)
+        latest = self.latest
+        image, uv = (latest.frame.image, latest.roundels.uv) if latest else (NO_IMAGE, NO_CENTRES)
+        blur_px = edge_blur_px(image, latest.roundels) if latest else None
+        advice = advise(image, uv) or advise_focus(blur_px)
+        with self._lock:  # which frames wait for
             n = max(1, self._recent)
             status = CameraStatus(
                 camera=self.camera,
@@ -99,7 +103,8 @@ class NodeStatistics:
                 clock_offset_ms=clock[0] / 1e6 if clock else None,
                 clock_error_ms=clock[1] / 1e6 if clock else None,
                 temperature_c=temperature(),
-                advice=advise(image, uv),
+                edge_blur_px=blur_px,
+                advice=advice,
                 refused=self._refused,
             )
             self._clear()
@@ -124,6 +129,13 @@ def advise(image: Grey, uv: Array) -> str:
     if white >= dark:
         return ""
     return f"too dark: {min(MAX_FACTOR, WHITE / max(white, 1.0)):.1f} times the exposure or the gain"
+
+
+def advise_focus(blur_px: float | None) -> str:
+    """Advise to focus the lens if the roundels' edges are blurred, pixels; empty where they are sharp or unknown."""
+    if blur_px is None or blur_px < BLURRED_PX:
+        return ""
+    return f"out of focus: edges are blurred by {blur_px:.1f} px; turn the focus ring until that is least"
 
 
 def _white_of(image: Grey, uv: Array) -> float:

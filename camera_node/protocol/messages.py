@@ -46,6 +46,9 @@ class Keys:
     def detections(self, camera: str = "*") -> str:
         return f"{self.arena}/camera/{camera}/detections"
 
+    def relative(self, camera: str = "*") -> str:
+        return f"{self.arena}/camera/{camera}/relative"
+
     def camera_in(self, key: str) -> str | None:
         """The camera of a key on which detections are published; None for other keys."""
         camera = key.removeprefix(f"{self.arena}/camera/").removesuffix("/detections")
@@ -190,7 +193,10 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     clock_offset_ms: float | None = None
     clock_error_ms: float | None = None
     temperature_c: float | None = None
-    advice: str = ""  # "saturated" or "too dark" with the change to make, or empty
+    edge_blur_px: float | None = (
+        None  # standard deviation of the blur of the roundels' edges; None without roundels
+    )
+    advice: str = ""  # "saturated", "too dark" or "out of focus" with the change to make, or empty
     refused: int = 0  # refused requests for a snapshot or settings since the node started
 
     def check(self) -> None:

@@ -13,7 +13,6 @@ PIXEL_M = 0.005  # side of a pixel of the floor's image
 FLOOR = 128.0
 WALL = 120.0  # grey level outside the floor
 SUBSAMPLES = 3
-_TO_PIXELS = np.array([1, -1], np.float32) / np.float32(PIXEL_M)
 
 
 def plain_floor() -> Picture:
@@ -41,24 +40,30 @@ def paint_floor(seed: int) -> Picture:
     return np.asarray(floor * light * (1 + np.float32(0.04) * grain), np.float32)
 
 
-def view_floor(floor: Picture, rays: Picture, T_world_cam: Array) -> Picture:
+def view_floor(floor: Picture, rays: Picture, T_world_cam: Array, subsamples: int = SUBSAMPLES) -> Picture:
     """Render a camera's view (h, w) of the floor z = 0.
 
     Args:
         floor: grey levels from `paint_floor`.
         rays: (h, w, 2) x/z and y/z of each pixel's viewing ray.
         T_world_cam: (4, 4) pose of the camera.
+        subsamples: squared, of each pixel.
     """
     h, w = rays.shape[:2]
     T = T_world_cam.astype(np.float32)
-    fine = cv2.resize(rays, (w * SUBSAMPLES, h * SUBSAMPLES), interpolation=cv2.INTER_LINEAR)
-    directions = cv2.transform(fine, T[:3, :3])  # cv2.transform extends (x, y) to (x, y, 1)
-    down = np.minimum(directions[..., 2:], np.float32(-1e-6))  # rays above the horizon end far away
-    xy = T[:2, 3] - directions[..., :2] * (T[2, 3] / down)
-    where = (xy * _TO_PIXELS + np.float32(SIZE_M / 2 / PIXEL_M)).clip(-10, 32000)
-    columns, rows = cv2.split(where)
+    fine = cv2.resize(rays, (w * subsamples, h * subsamples), interpolation=cv2.INTER_LINEAR)
+    x, y, z = cv2.split(cv2.transform(fine, T[:3, :3]))  # cv2.transform extends (x, y) to (x, y, 1)
+    reach = -T[2, 3] / np.minimum(z, np.float32(-1e-6))  # rays above the horizon end far away
+    columns, rows = (_to_pixels(T[k, 3] + d * reach, sign) for k, d, sign in ((0, x, 1), (1, y, -1)))
     seen = cv2.remap(floor, columns, rows, cv2.INTER_LINEAR, borderValue=WALL)
     return np.asarray(cv2.resize(seen, (w, h), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _to_pixels(at: Picture, sign: int) -> Picture:
+    """Coordinates in the floor's image of places in the world, metres; `sign` is the axis' direction in it."""
+    at *= np.float32(sign / PIXEL_M)
+    at += np.float32(SIZE_M / 2 / PIXEL_M)
+    return np.clip(at, -10, 32000, out=at)
 
 
 def _paint_sheet(floor: NDArray[np.uint8], rng: np.random.Generator, u: int, v: int) -> None:

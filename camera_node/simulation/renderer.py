@@ -59,46 +59,37 @@ def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
     return discs
 
 
-class Renderer:
-    """Renders the images of one camera of a scene."""
+class ImageModel:
+    """What a camera makes of printed discs in front of a background: lens, blur, vignetting, sensor noise.
 
-    def __init__(self, scene: Scene, name: str) -> None:
-        """Raises ConfigError where the scene has no camera `name`."""
-        self.scene, self.camera = scene, scene.camera(name)
-        self._T_cam_world = invert(self.camera.T_world_cam)
-        self._reach = math.ceil(4 * self.camera.blur_px)  # pixels to which the blur extends
+    Args:
+        camera: its lens, blur and sensor; its pose is not used.
+        seed: of the noise.
+    """
+
+    def __init__(self, camera: SceneCamera, seed: int) -> None:
+        self.camera = camera
+        self._reach = math.ceil(4 * camera.blur_px)  # pixels to which the blur extends
         self._margin = self._reach + 2
-        self._rays = map_rays(self.camera, self._margin)
+        self._rays = map_rays(camera, self._margin)
         # No disc beyond this radius in x/z, y/z is visible: that of the corners, plus a margin for clipped discs.
         self._limit = 1.15 * float(np.linalg.norm(self._rays, axis=2).max())
-        self._gain = vignette(self.camera)
-        self._seed = zlib.crc32(f"{scene.seed} {name}".encode())
+        self._gain = vignette(camera)
+        self._seed = seed
         self._noise = self._draw_noise()
-        self._backdrop = self._view_backdrop()
 
-    def render(self, t_s: float, frame: int = 0) -> Grey:
-        """Render the image (h, w), uint8, of an exposure with its middle at `t_s`; `frame` seeds its noise."""
-        image = self._backdrop.copy()
-        for samples in self._visible_discs(t_s):
-            self._paint(image, samples)
-        return self._add_noise(image, frame)
+    def view(self, floor: Picture, T_world_cam: Array, subsamples: int = SUBSAMPLES) -> Picture:
+        """The light (h, w) from a floor (`background.paint_floor`) that arrives at a camera at T_world_cam (4, 4)."""
+        m = self._margin
+        seen = view_floor(floor, self._rays, T_world_cam, subsamples)
+        sharp = np.ascontiguousarray(seen[m:-m, m:-m])
+        return cv2.GaussianBlur(sharp, (0, 0), self.camera.blur_px) * self._gain
 
-    def _visible_discs(self, t_s: float) -> list[list[Disc]]:
-        """The roundels that face the camera, farthest first, each as its discs at all sample times of the exposure."""
-        n, exposure_s = self.camera.motion_samples, self.camera.exposure_us * 1e-6
-        samples = [self._discs_at(t_s + ((k + 0.5) / n - 0.5) * exposure_s) for k in range(n)]
-        middle = {key: disc for key, disc in samples[n // 2].items() if disc.faces_camera}
-        farthest_first = sorted(middle, key=lambda key: -float(np.linalg.norm(middle[key].T[:3, 3])))
-        return [[discs.get(key, middle[key]) for discs in samples] for key in farthest_first]
+    def paint(self, image: Picture, samples: list[Disc]) -> None:
+        """Draw one roundel, at all sample times of the exposure.
 
-    def _discs_at(self, t_s: float) -> dict[tuple[str, int], Disc]:
-        """Every roundel in the arena, by the name of its body and its number."""
-        bodies = self.scene.bodies_at(t_s).items()
-        discs = ((name, place_discs(body, self._T_cam_world @ T)) for name, (body, T) in bodies)
-        return {(name, k): disc for name, own in discs for k, disc in enumerate(own)}
-
-    def _paint(self, image: Picture, samples: list[Disc]) -> None:
-        """Draw one roundel; it replaces the light of each pixel in proportion to the card's share of the pixel."""
+        It replaces the light of each pixel in proportion to the card's share of the pixel.
+        """
         box = self._bound(samples)
         if box is None:
             return
@@ -109,6 +100,15 @@ class Renderer:
         h, w = image[seen].shape
         inside = (slice(max(-v0, 0), max(-v0, 0) + h), slice(max(-u0, 0), max(-u0, 0) + w))
         image[seen] += light[inside] * self._gain[seen] - card[inside] * image[seen]
+
+    def expose(self, image: Picture, frame: int) -> Grey:
+        """The picture (h, w), uint8, of light (h, w); `frame` seeds its noise."""
+        du, dv = np.random.default_rng((self._seed, frame)).integers(0, NOISE_SHIFTS, 2)
+        h, w = image.shape
+        noise = self._noise[dv : dv + h, du : du + w]
+        if self.camera.sensor == "clean":  # the same as `develop`, in a fifth of the time
+            return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)  # rounds and saturates
+        return self.camera.sensor_model.develop(image, noise)
 
     def _bound(self, samples: list[Disc]) -> tuple[int, int, int, int] | None:
         """Columns and rows u0, v0, u1, v1 that the discs may cover, within the range of `_rays`; None without any."""
@@ -141,25 +141,43 @@ class Renderer:
         )
         return np.asarray(cv2.resize(blurred, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA), np.float32)
 
-    def _view_backdrop(self) -> Picture:
-        m = self._margin
-        floor = paint_floor(self.scene.seed) if self.scene.clutter else plain_floor()
-        seen = view_floor(floor, self._rays, self.camera.T_world_cam)
-        sharp = np.ascontiguousarray(seen[m:-m, m:-m])
-        return cv2.GaussianBlur(sharp, (0, 0), self.camera.blur_px) * self._gain
-
     def _draw_noise(self) -> Picture:
         shape = (self.camera.height + NOISE_SHIFTS, self.camera.width + NOISE_SHIFTS)
         noise = np.random.default_rng(self._seed).standard_normal(shape, np.float32)
         return noise * np.float32(self.camera.noise if self.camera.sensor == "clean" else 1)
 
-    def _add_noise(self, image: Picture, frame: int) -> Grey:
-        du, dv = np.random.default_rng((self._seed, frame)).integers(0, NOISE_SHIFTS, 2)
-        h, w = image.shape
-        noise = self._noise[dv : dv + h, du : du + w]
-        if self.camera.sensor == "clean":  # the same as `develop`, in a fifth of the time
-            return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)  # rounds and saturates
-        return self.camera.sensor_model.develop(image, noise)
+
+class Renderer:
+    """Renders the images of one camera of a scene."""
+
+    def __init__(self, scene: Scene, name: str) -> None:
+        """Raises ConfigError where the scene has no camera `name`."""
+        self.scene, self.camera = scene, scene.camera(name)
+        self._T_cam_world = invert(self.camera.T_world_cam)
+        self._model = ImageModel(self.camera, zlib.crc32(f"{scene.seed} {name}".encode()))
+        floor = paint_floor(scene.seed) if scene.clutter else plain_floor()
+        self._backdrop = self._model.view(floor, self.camera.T_world_cam)
+
+    def render(self, t_s: float, frame: int = 0) -> Grey:
+        """Render the image (h, w), uint8, of an exposure with its middle at `t_s`; `frame` seeds its noise."""
+        image = self._backdrop.copy()
+        for samples in self._visible_discs(t_s):
+            self._model.paint(image, samples)
+        return self._model.expose(image, frame)
+
+    def _visible_discs(self, t_s: float) -> list[list[Disc]]:
+        """The roundels that face the camera, farthest first, each as its discs at all sample times of the exposure."""
+        n, exposure_s = self.camera.motion_samples, self.camera.exposure_us * 1e-6
+        samples = [self._discs_at(t_s + ((k + 0.5) / n - 0.5) * exposure_s) for k in range(n)]
+        middle = {key: disc for key, disc in samples[n // 2].items() if disc.faces_camera}
+        farthest_first = sorted(middle, key=lambda key: -float(np.linalg.norm(middle[key].T[:3, 3])))
+        return [[discs.get(key, middle[key]) for discs in samples] for key in farthest_first]
+
+    def _discs_at(self, t_s: float) -> dict[tuple[str, int], Disc]:
+        """Every roundel in the arena, by the name of its body and its number."""
+        bodies = self.scene.bodies_at(t_s).items()
+        discs = ((name, place_discs(body, self._T_cam_world @ T)) for name, (body, T) in bodies)
+        return {(name, k): disc for name, own in discs for k, disc in enumerate(own)}
 
 
 def trace_radius(disc: Disc, rays: Picture) -> Picture:

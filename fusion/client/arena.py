@@ -23,9 +23,11 @@ import zenoh
 from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
+from camera_node.config import require_name
 from camera_node.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
+from camera_node.protocol.relative import RelativePositions
 from camera_node.protocol.requests import RETRY_S
 from camera_node.protocol.session import open_client
 from fusion.model.robots import Robot as RobotBody
@@ -169,6 +171,13 @@ class RobotStream(Stream[RobotPose]):
         return self.on_message(callback)
 
 
+class RelativeStream(Stream[RelativePositions]):
+    """What one camera locates by itself."""
+
+    def _cause(self) -> str:
+        return "does roundel camera --rig RIG --diameter METRES run there under this name?"
+
+
 class Arena:
     """A connection to an arena's server. `faults` counts undecodable messages, by kind.
 
@@ -306,6 +315,27 @@ class Arena:
     def camera_statuses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[CameraStatus]:
         """The status of each camera, once a second."""
         return self._stream(self.keys.camera_status(), CameraStatus, "camera status", timeout_s)
+
+    def relative(self, camera: str, timeout_s: float | None = TIMEOUT_S) -> Stream[RelativePositions]:
+        """The roundels that a camera locates relative to itself, every frame; `unpack` gives arrays. Needs no server.
+
+        Raises:
+            ConfigError: no camera has such a name.
+        """
+        key = self.keys.relative(require_name(camera, "a camera"))
+        if key not in self._streams:
+            stream = self._streams[key] = RelativeStream(f"positions of '{camera}' {self._origin}", timeout_s)
+
+            def put(message: RelativePositions) -> None:
+                if message.camera == camera:
+                    stream._put(message)
+                else:
+                    self.faults["RelativePositions"] += 1
+
+            take = guarded(key, self._taker(RelativePositions, put))
+            self._subscribers.append(self._session.declare_subscriber(key, take))
+        self._streams[key].timeout_s = timeout_s
+        return self._streams[key]
 
     def rig(self, timeout_s: float = TIMEOUT_S) -> Rig | None:
         """The active calibration, or None if the server has none.

@@ -2,6 +2,7 @@
 """The queries by which cameras get their names, and by which users change names and settings."""
 
 import logging
+from collections.abc import Callable
 
 import msgspec
 import zenoh
@@ -41,6 +42,7 @@ class CameraRequests:
         pipeline: its rig is changed with a camera's name.
         publisher: publishes assignments and the changed rig.
         clock: the server's time.
+        on_retired: called with the name of a camera that no camera has any more.
     """
 
     def __init__(
@@ -50,8 +52,10 @@ class CameraRequests:
         pipeline: TrackingPipeline,
         publisher: ArenaPublisher,
         clock: ServerClock | ClockSync,
+        on_retired: Callable[[str], object],
     ) -> None:
         self._arena, self._registry, self._pipeline = arena, registry, pipeline
+        self._on_retired = on_retired
         self._publisher, self._clock = publisher, clock
         self._shift_ns: int | None = None
 
@@ -83,6 +87,8 @@ class CameraRequests:
             self._registry.require_free(request.name)
             self._rename_in_rig(before, request)
         after = self._registry.change(before, request)
+        if request.forget or after != before:
+            self._on_retired(before)
         if not request.forget:
             self._publisher.publish_assignment(self._assignment(after))
         return encode_reply(payload_of(query), RegisteredCameras(cameras=self._registry.cameras()))

@@ -119,7 +119,8 @@ class Server:
         if self.shard.leads:
             requests.declare_rig(transport, audit)
             registry = CameraRegistry(Path(self.config.cameras) if self.config.cameras else None)
-            cameras = CameraRequests(keys.arena, registry, self.pipeline, self._publisher, self.clock)
+            retire = self.statistics.retire
+            cameras = CameraRequests(keys.arena, registry, self.pipeline, self._publisher, self.clock, retire)
             cameras.declare(transport, audit)
             transport.declare_alive(keys.fusion_alive)
         else:

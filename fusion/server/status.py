@@ -54,6 +54,9 @@ class _CameraCounts:
 
     last_ns: int = 0
     is_gone: bool = False
+    is_retired: bool = (
+        False  # renamed or forgotten: not listed once its last frame under this name has passed
+    )
     is_late: bool = False
     has_two_publishers: bool = False
     lateness_ms: list[float] = field(default_factory=list)
@@ -105,6 +108,11 @@ class ServerStatistics:
             log.info("camera %s is back", name, extra=self._about(name))
         camera.is_gone, camera.last_ns = False, received_ns
         camera.lateness_ms.append((received_ns - t_ns) * 1e-6)
+
+    def retire(self, name: str) -> None:
+        """List a camera no more, once it is silent: it has another name, or was forgotten."""
+        if name in self._cameras:
+            self._cameras[name].is_retired = True
 
     def note_publishers(self, name: str, has_two_publishers: bool) -> None:
         """Log once that two nodes publish under a camera's name."""
@@ -184,8 +192,12 @@ class ServerStatistics:
             camera.squared_px = 0.0
 
     def _find_silent_cameras(self, now_ns: int) -> None:
-        for name, camera in self._cameras.items():
-            if not camera.is_gone and now_ns - camera.last_ns > SILENT_S * 1e9:
+        silent = {n: c for n, c in self._cameras.items() if now_ns - c.last_ns > SILENT_S * 1e9}
+        for name, camera in silent.items():
+            if camera.is_retired:
+                with self._lock:
+                    del self._cameras[name]
+            elif not camera.is_gone:
                 log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S, extra=self._about(name))
                 camera.is_gone = True
 

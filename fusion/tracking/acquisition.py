@@ -16,6 +16,7 @@ from fusion.model.observations import Assignments, DetectionTable, MatchedObserv
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
+    ANY_DIAMETERS,
     MAX_CHI2,
     POSITION_GATE,
     START_S,
@@ -227,8 +228,8 @@ class Acquisition:
         """
         free = np.ones(len(detections), bool)
         free[assignments.detection] = False
-        diameters = np.unique(2 * table.markers.radius)
-        if not free.any() or not len(diameters):
+        diameters = np.unique(2 * table.markers.radius) if len(table.names) else np.array(ANY_DIAMETERS)
+        if not free.any():
             return [], free.nonzero()[0][:0]
         self._frame_sets += 1
         limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)

@@ -15,6 +15,8 @@ POSITION_GATE = 16.3  # chi-square with 3 degrees of freedom; rejects one true p
 DECISIVE_CHI2 = 9.0  # by which an alternative must be worse
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold change it by more than noise
 DIAMETER_TOLERANCE = 0.2  # relative, between the diameter that a view implies and that of a marker
+# Of prints of any size, m, where no robot tells the sizes in use: 4 to 60 cm, in steps that the tolerance covers.
+ANY_DIAMETERS = tuple(0.05 * 1.5**k for k in range(7))
 MAX_SPEED_M_S = 2.0  # of the fastest marker that is searched for
 FORGET_NS = 300_000_000  # unlabeled markers are forgotten after this time without a detection
 

@@ -104,7 +104,9 @@ class Tracker:
         self.cameras = CameraArray(cameras)
         self.limits, self.shard = limits or Limits(), shard
         self.table = TrackTable(robots, self.limits, shard)
-        densities = np.array([robot.densities for robot in robots.values()])
+        densities = np.array([robot.densities for robot in robots.values()]).reshape(
+            -1, 2
+        )  # without robots too
         self.estimator = Estimator(self.cameras, densities, self.table.single)
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)

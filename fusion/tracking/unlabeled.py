@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.observations import DetectionTable, MatchedObservations
-from fusion.model.robots import MOTIONS, distances
+from fusion.model.robots import MOTIONS
 from fusion.model.states import POSITION, States, reset_unobservable
+from fusion.tracking.company import Company
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import (
+    ANY_DIAMETERS,
     FORGET_NS,
     MAX_CHI2,
     POSITION_GATE,
@@ -32,9 +34,6 @@ MAX_TRACKS = 64  # markers with a velocity and a normal; false detections make h
 MAX_STARTS = 8  # tracks that begin in one frame set; a start costs a millisecond
 NORMAL_RAD = 0.2  # largest standard deviation of a published normal
 ANCHOR_NS = 1_000_000_000  # motions are compared over this time
-MOVED_M = 0.05  # since the anchor: far above the noise
-RIGID_M = 0.01  # largest change of the distance of two markers of one body
-BODY_M = 1.0  # largest distance of two markers of one body
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +76,8 @@ class UnlabeledMarkers:
 class MarkerHistories:
     """What N markers did before: for how long they were tracked, seconds (N,), and how they moved (N,).
 
-    A marker in company kept its distance from another one while one of them moved: they belong to one body. A lone one
-    moved since the last anchor, and none kept its distance. The motions of anchored markers are compared (N,).
+    A marker in company moved together with another one: they belong to one body. A lone one moved since the last
+    anchor, and none moved with it. The motions of anchored markers are compared (N,).
     """
 
     age_s: Array
@@ -96,8 +95,7 @@ class _Tracks:
         radius: (K,) the assumed one.
         has_normal: (K,) whether the normal was determined.
         seen_ns, since_ns: (K,) times of the last and the first detection.
-        anchor: (K, 3) positions at one time not long ago; NaN for younger tracks.
-        in_company, alone: (K,) see `MarkerHistories`.
+        company: which of them belong to one body.
     """
 
     states: States
@@ -105,9 +103,7 @@ class _Tracks:
     has_normal: Mask
     seen_ns: NDArray[np.int64]
     since_ns: NDArray[np.int64]
-    anchor: Array
-    in_company: Mask
-    alone: Mask
+    company: Company
 
     def __len__(self) -> int:
         return len(self.states)
@@ -119,35 +115,37 @@ class _Tracks:
             self.has_normal[rows],
             self.seen_ns[rows],
             self.since_ns[rows],
-            self.anchor[rows],
-            self.in_company[rows],
-            self.alone[rows],
+            self.company.select(rows),
         )
 
-    def joined(self, other: "_Tracks") -> "_Tracks":
-        names = "radius", "has_normal", "seen_ns", "since_ns", "anchor", "in_company", "alone"
-        columns = (np.concatenate([getattr(self, k), getattr(other, k)]) for k in names)
-        return _Tracks(self.states.joined(other.states), *columns)
+    def with_new(self, states: States, radius: Array, has_normal: Mask, t_ns: int) -> "_Tracks":
+        """These tracks, then new ones."""
+        times = np.full(len(states), t_ns, np.int64)
+        return _Tracks(
+            self.states.joined(states),
+            np.concatenate([self.radius, radius]),
+            np.concatenate([self.has_normal, has_normal]),
+            np.concatenate([self.seen_ns, times]),
+            np.concatenate([self.since_ns, times]),
+            self.company.with_new(len(states)),
+        )
 
     @classmethod
-    def started(cls, states: States, radius: Array, has_normal: Mask, t_ns: int) -> "_Tracks":
-        """New tracks."""
-        n = len(states)
-        times, never = np.full(n, t_ns, np.int64), np.zeros(n, bool)
-        return cls(states, radius, has_normal, times, times, np.full((n, 3), np.nan), never, never)
+    def none(cls) -> "_Tracks":
+        states = States.at_rest(np.empty((0, 3, 3)), np.empty((0, 3)), START_SIGMAS_SINGLE)
+        times = np.empty(0, np.int64)
+        return cls(states, np.empty(0), np.empty(0, bool), times, times, Company.unknown(0))
 
-    def with_motion(self, is_due: bool) -> "_Tracks":
-        """With what the motion since the anchors shows; with new anchors if these are due."""
-        p, anchor = self.states.p, self.anchor
-        moved = np.linalg.norm(p - anchor, axis=1) > MOVED_M  # False without an anchor
-        in_company = self.in_company
-        if moved.any():
-            before, now = distances(anchor), distances(p)
-            rigid = (np.abs(now - before) < RIGID_M) & (now < BODY_M) & (moved[:, None] | moved)
-            np.fill_diagonal(rigid, False)
-            in_company = in_company | rigid.any(1)
-        alone = moved & ~in_company & (not is_due)
-        return replace(self, in_company=in_company, alone=alone, anchor=p if is_due else anchor)
+    def updated(self, rows: Index, states: States, t_ns: int) -> "_Tracks":
+        """With new states of the tracks that were seen."""
+        seen_ns = self.seen_ns.copy()
+        seen_ns[rows] = t_ns
+        return replace(self, states=self.states.with_rows(rows, states), seen_ns=seen_ns)
+
+    def compared(self, t_ns: int, is_due: bool) -> "_Tracks":
+        """With what the motion until now shows; with new anchors if these are due."""
+        company = self.company.observed(self.states.p, self.radius, self.seen_ns == t_ns)
+        return replace(self, company=company.anchored_at(self.states.p) if is_due else company)
 
 
 class UnlabeledTracker:
@@ -155,13 +153,12 @@ class UnlabeledTracker:
 
     Args:
         cameras: cameras of the rig.
-        radii: (R,) of the markers in use, one or more.
+        radii: (R,) of the markers in use; where there is none, a marker has its apparent size.
     """
 
     def __init__(self, cameras: CameraArray, radii: Array) -> None:
         self._cameras, self._radii, self._t_ns = cameras, np.unique(radii), 0
-        none = States.at_rest(np.empty((0, 3, 3)), np.empty((0, 3)), START_SIGMAS_SINGLE)
-        self._tracks = _Tracks.started(none, np.empty(0), np.empty(0, bool), 0)
+        self._tracks = _Tracks.none()
         self._anchored_ns = 0
 
     def track(self, t_ns: int, detections: DetectionTable, markers: Sequence[Marker]) -> UnlabeledMarkers:
@@ -178,16 +175,16 @@ class UnlabeledTracker:
         pair = _pair(tracks.states, position, covariance)
         old = np.flatnonzero(pair >= 0)
         new = np.flatnonzero(pair < 0)[: min(MAX_STARTS, MAX_TRACKS - len(tracks))]
-        started = self._start(t_ns, detections, [markers[k] for k in new.tolist()])
+        seen = np.concatenate([pair[old], len(tracks) + np.arange(len(new))])
         rows = np.concatenate([old, new])
-        current = tracks.select(pair[old]).joined(started)
-        states, good = self._update(current, detections, [markers[k] for k in rows.tolist()])
-        times = np.full(len(states), t_ns, np.int64)
-        current = replace(current, states=states, seen_ns=times).select(good)
-        unseen = np.setdiff1d(np.arange(len(tracks)), pair)
+        tracks = tracks.with_new(*self._start(detections, [markers[k] for k in new.tolist()]), t_ns)
+        states, good = self._update(tracks, seen, detections, [markers[k] for k in rows.tolist()])
+        tracks = tracks.updated(seen, states, t_ns)
+        current = tracks.select(seen[good])
         is_due = not 0 <= t_ns - self._anchored_ns < ANCHOR_NS
         self._anchored_ns = t_ns if is_due else self._anchored_ns
-        self._tracks = tracks.select(unseen).joined(current).with_motion(is_due)
+        remaining = np.setdiff1d(np.arange(len(tracks)), seen[~good])
+        self._tracks = tracks.select(remaining).compared(t_ns, is_due)
         self._t_ns = t_ns
         grouped = UnlabeledMarkers(markers, position, covariance, *_unknown(len(markers)))
         return _with_tracks(grouped, rows[good], current)
@@ -201,8 +198,9 @@ class UnlabeledTracker:
         paired, known = np.flatnonzero(pair >= 0), pair[pair >= 0]
         age_s, (anchored, in_company, alone) = np.zeros(len(pair)), np.zeros((3, len(pair)), bool)
         age_s[paired] = (t_ns - tracks.since_ns[known]) * 1e-9
-        anchored[paired] = np.isfinite(tracks.anchor[known, 0])
-        in_company[paired], alone[paired] = tracks.in_company[known], tracks.alone[known]
+        company = tracks.company
+        anchored[paired], in_company[paired] = company.anchored[known], company.in_company[known]
+        alone[paired] = company.alone[known]
         return MarkerHistories(age_s, anchored, in_company, alone)
 
     def _predict(self, t_ns: int) -> _Tracks:
@@ -211,7 +209,8 @@ class UnlabeledTracker:
         states = self._estimator(len(dt)).predict(tracks.states, dt).states
         return replace(tracks, states=states)
 
-    def _start(self, t_ns: int, detections: DetectionTable, markers: list[Marker]) -> _Tracks:
+    def _start(self, detections: DetectionTable, markers: list[Marker]) -> tuple[States, Array, Mask]:
+        """States and radii of new tracks, and which of their normals are determined."""
         radius = np.array([self._radius(marker) for marker in markers])
         starts = [
             start_rotation(self._cameras, detections, marker, r)
@@ -222,21 +221,21 @@ class UnlabeledTracker:
         states = States.at_rest(R, p, START_SIGMAS_SINGLE)
         states.P[:] = reset_unobservable(states.P)
         has_normal = np.array([determined for _, determined in starts], bool)
-        return _Tracks.started(states, radius, has_normal, t_ns)
+        return states, radius, has_normal
 
     def _update(
-        self, tracks: _Tracks, detections: DetectionTable, markers: Sequence[Marker]
+        self, tracks: _Tracks, seen: Index, detections: DetectionTable, markers: Sequence[Marker]
     ) -> tuple[States, Mask]:
-        """Update the tracks with the detections of their markers; and which tracks fit these."""
-        n = len(markers)
+        """Update the tracks `seen` with the detections of their markers; and which of them fit these."""
+        n, before = len(markers), tracks.states.select(seen)
         if not n:
-            return tracks.states, np.zeros(0, bool)
+            return before, np.zeros(0, bool)
         rows = np.concatenate([marker.detections for marker in markers])
         body = np.repeat(np.arange(n), [len(marker.detections) for marker in markers])
         centres = np.zeros((3, len(rows)))
-        discs = Discs(detections.frame[rows], body, body, centres, tracks.radius[body])
+        discs = Discs(detections.frame[rows], body, body, centres, tracks.radius[seen][body])
         observations = MatchedObservations.of_discs(detections.select(rows), discs)
-        states, residuals = self._estimator(n).update(Prediction.without_motion(tracks.states), observations)
+        states, residuals = self._estimator(n).update(Prediction.without_motion(before), observations)
         return states, mean_by_body(misfit(observations, residuals), body, n) < MAX_CHI2
 
     def _estimator(self, n: int) -> Estimator:
@@ -244,9 +243,12 @@ class UnlabeledTracker:
 
     def _radius(self, marker: Marker) -> float:
         """The radius in use that is closest to the apparent size of the marker."""
-        if not np.isfinite(marker.diameter_m):
+        apparent = marker.diameter_m / 2
+        if not len(self._radii):
+            return apparent if np.isfinite(apparent) else ANY_DIAMETERS[0] / 2
+        if not np.isfinite(apparent):
             return float(self._radii[0])
-        return float(self._radii[np.argmin(np.abs(self._radii - marker.diameter_m / 2))])
+        return float(self._radii[np.argmin(np.abs(self._radii - apparent))])
 
 
 def _pair(states: States, position: Array, covariance: Array) -> Index:

@@ -23,13 +23,11 @@ import zenoh
 
 from camera_node.config import example_file
 from camera_node.protocol.messages import CameraStatus, Detections, decode
-from camera_node.simulation.scene import Scene
 from tests.conftest import free_port
 from tests.waiting import wait_for_port
 from tests.web.browser import CHROMIUM, FLAGS
-from web.demo import Demo
-from web.demo_server import ANY_PORT, start_server
-from web.processes import Processes, interrupt_on_signals
+from web.demo import ANY_PORT, Demo
+from web.failures import interrupt_on_signals
 
 BUSY = "while True: pass"
 STAY_OPEN = "--remote-debugging-port=0"
@@ -124,10 +122,8 @@ def play(browser: bool, seconds: float) -> tuple[str, str]:
     with (
         interrupt_on_signals(),
         tempfile.TemporaryDirectory() as folder,
-        Processes(Path(folder)) as processes,
+        Demo(path, Path(folder), ANY_PORT) as demo,
     ):
-        server = start_server(processes, path.parent / "arena.yaml", ANY_PORT)
-        demo = Demo(Scene.load(path), path.parent, processes, server)
         errors = TimestampErrors(demo)
         with contextlib.redirect_stdout(output), browsing(port) if browser else contextlib.nullcontext():
             demo.run(("127.0.0.1", port) if browser else None, seconds)

@@ -7,17 +7,17 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import tyro
 
-import camera_node.__main__ as camera_program
+from camera_node.commands.camera import JoinArena
 from camera_node.config import load_yaml
 from tests.conftest import ROOT, free_port
 from tests.security.lab import KEYS, Lab
 from tests.waiting import wait_for, wait_for_port
+from tests.web.roundel.programs import roundel_command
 from web.page_access import Tokens
 
 TEXT = (ROOT / "docs" / "security.md").read_text()
@@ -41,7 +41,7 @@ def checkout(tmp_path: Path) -> Path:
     """A folder with configs, after the commands that create the files. The server is reached as localhost."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     for command in commands("Set-up"):
-        if not command.startswith("python"):
+        if not command.startswith("roundel"):
             run(
                 command.replace(" server camera", " localhost camera").replace("0.0.0.0:7447", "127.0.0.1:0"),
                 tmp_path,
@@ -51,22 +51,22 @@ def checkout(tmp_path: Path) -> Path:
 
 def test_every_command_has_a_test():
     """A command that is added to the page needs a test here."""
-    tested = ("sh configs/", "cp configs/", "sed -i ", "python -m fusion", "python -m camera_node --source")
-    tested += ("python -m web --host",)
+    tested = ("sh configs/", "cp configs/", "sed -i ", "roundel server", "roundel camera", "roundel record")
+    tested += ("roundel view --host",)
     assert [c for section in SECTIONS for c in commands(section) if not c.startswith(tested)] == []
 
 
 def test_the_folders_work_as_the_page_says(checkout: Path):
     """The server starts in its folder; a recorder and a camera of the page connect in theirs."""
-    server, camera, record = (shlex.split(c) for c in commands("Set-up") if c.startswith("python"))
+    server, camera, record = (shlex.split(c) for c in commands("Set-up") if c.startswith("roundel"))
     keys = checkout / "keys"
     with contextlib.ExitStack() as closing:
         lab = Lab(keys, closing)
-        assert server[3:] == ["--config", "arena.yaml"], "as Lab starts it"
-        tyro.cli(camera_program.Publish, args=camera[3:])
+        assert server[1:] == ["server", "--config", "arena.yaml"], "as Lab starts it"
+        tyro.cli(JoinArena, args=camera[2:])  # test_roundel_up.py runs it
         north = lab.session("camera.north")
         recorder = subprocess.Popen(
-            [sys.executable, *(word.replace("tls/server:7447", lab.endpoint) for word in record[1:])],
+            roundel_command(*(word.replace("tls/server:7447", lab.endpoint) for word in record[1:])),
             cwd=keys / "viewer",
         )
         closing.callback(recorder.wait, 30)
@@ -87,7 +87,7 @@ def test_the_page_requires_a_token_of_the_file(tmp_path: Path):
     (command,) = commands("The page")
     port = free_port()
     page = subprocess.Popen(
-        [sys.executable, *shlex.split(command)[1:], "--port", str(port)],
+        roundel_command(*shlex.split(command)[1:], "--port", port),
         cwd=tmp_path,
         stdout=subprocess.DEVNULL,
     )

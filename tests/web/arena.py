@@ -74,6 +74,7 @@ class ArenaMessages:
             roundels=8.0,
             saturated=0.0,
             clock_offset_ms=0.02,
+            edge_blur_px=0.62,
             advice=advice,
         )
         self.put(self.keys.camera_status(name), encode(message))

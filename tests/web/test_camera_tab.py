@@ -2,13 +2,17 @@
 """The tab Cameras in a real browser: live pictures on demand, and settings and mask of a camera."""
 
 import time
+from collections.abc import Iterator
 
 import cv2
 import msgspec
 import numpy as np
+import pytest
 import zenoh
 
 from camera_node.protocol.messages import Preview, Settings, decode, encode
+from camera_node.protocol.registration import CameraChange, RegisteredCameras, change_key
+from camera_node.protocol.requests import encode_jpeg
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing
@@ -17,27 +21,51 @@ from web.view import View
 ROUNDEL = (320.0, 240.0)
 
 
+class SettingsOfEast:
+    """Answers as the node of camera "east" does, and records the requests."""
+
+    def __init__(self, arena: LiveArena, image: np.ndarray) -> None:
+        self.used = Settings(exposure_us=4000.0, gain=2.0, min_contrast=25.0, mask=())
+        self.changes: list[Settings] = []
+        self._jpeg, keys = encode_jpeg(image, 90), arena.keys
+        self.queryables = [
+            arena.session.declare_queryable(keys.settings("east"), self._answer),
+            arena.session.declare_queryable(keys.snapshot("east"), self._answer_snapshot),
+        ]
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            if query.payload:
+                self.changes.append(decode(query.payload.to_bytes(), Settings))
+                given = {k: v for k, v in msgspec.structs.asdict(self.changes[-1]).items() if v is not None}
+                self.used = msgspec.structs.replace(self.used, **given)
+            query.reply(query.key_expr, encode(self.used))
+
+    def _answer_snapshot(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, self._jpeg)
+
+    def close(self) -> None:
+        for queryable in self.queryables:
+            queryable.undeclare()
+
+
+@pytest.fixture
+def east(arena: LiveArena) -> Iterator[SettingsOfEast]:
+    node = SettingsOfEast(arena, np.full((480, 640), 90, np.uint8))
+    yield node
+    node.close()
+
+
 def is_matched(publisher: zenoh.Publisher) -> bool:
     """Whether someone subscribes."""
     return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View):
+def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View, east: SettingsOfEast):
     """Pictures are subscribed to while a browser is open; a click on the mask sends polygons around the detections."""
     jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
     publisher = arena.session.declare_publisher(arena.keys.preview("east"))
-    used, changes = Settings(exposure_us=4000.0, gain=2.0, min_contrast=25.0, mask=()), []
-
-    def answer(query) -> None:
-        nonlocal used
-        with query:
-            if query.payload:
-                changes.append(decode(query.payload.to_bytes(), Settings))
-                given = {k: v for k, v in msgspec.structs.asdict(changes[-1]).items() if v is not None}
-                used = msgspec.structs.replace(used, **given)
-            query.reply(query.key_expr, encode(used))
-
-    queryable = arena.session.declare_queryable(arena.keys.settings("east"), answer)
 
     def speak() -> None:
         arena.camera("east")
@@ -55,12 +83,66 @@ def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View):
         page.get_by_role("button", name="Read the settings").click()
         page.get_by_text("exposure 4000 us, 0 masked places").wait_for(timeout=20_000)
         page.get_by_role("button", name="Mask everything detected now").click()
-        page.get_by_text("exposure 4000 us, 1 masked places").wait_for(timeout=20_000)
+        page.get_by_text("east: 1 masked places").wait_for(timeout=20_000)
         page.get_by_role("button", name="Remove the mask").click()
-        page.get_by_text("exposure 4000 us, 0 masked places").wait_for(timeout=20_000)
-    polygon = np.array(changes[0].mask)[0]
+        page.get_by_text("east: 0 masked places").wait_for(timeout=20_000)
+    polygon = np.array(east.changes[0].mask)[0]
     assert cv2.pointPolygonTest(polygon.astype(np.float32), ROUNDEL, False) > 0
-    assert changes[1].mask == ()
+    assert east.changes[1].mask == ()
     wait_for(lambda: not is_matched(publisher))
-    for entity in (queryable, publisher):
-        entity.undeclare()
+    publisher.undeclare()
+
+
+def test_a_mask_is_drawn_by_clicks(arena: LiveArena, view: View, east: SettingsOfEast):
+    """Two clicks make a rectangle: the centre of the view is that of the picture, and v grows downwards."""
+    with browsing(view) as page:
+        draw = page.get_by_role("button", name="Draw on the picture")
+        wait_for(draw.is_enabled, lambda: arena.camera("east"))
+        (client,) = view.server.get_clients().values()
+        draw.click()
+        page.get_by_text("east, 0 masked places").wait_for(timeout=20_000)
+        wait_for(lambda: client.camera.position[2] < -100)
+        box = page.locator("canvas").first.bounding_box()
+        assert box is not None
+        middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.wait_for_function(
+            "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
+        page.mouse.click(*middle)
+        page.get_by_text("corner 1 at 320, 240").or_(page.get_by_text("corner 1 at 319, 239")).wait_for()
+        page.mouse.click(middle[0] + 60, middle[1] + 30)
+        page.get_by_text("corner 2 at").wait_for()
+        page.get_by_role("button", name="Add what is drawn to the mask").click()
+        page.get_by_text("east: 1 masked places").wait_for(timeout=20_000)
+        page.get_by_role("button", name="Back to the arena's view").click()
+        wait_for(lambda: np.linalg.norm(client.camera.look_at) < 5.0)  # the arena's view
+    (polygon,) = np.array(east.changes[0].mask)
+    size = np.ptp(polygon, axis=0)
+    assert np.allclose(polygon.min(axis=0), (319.5, 239.5), atol=1.0), (
+        "the first click: a pixel of the screen"
+    )
+    assert size[0] / size[1] == pytest.approx(2.0, abs=0.1)
+    assert size[0] > 30
+
+
+def test_a_camera_is_renamed(arena: LiveArena, view: View):
+    """The server gets the request; an empty name is refused."""
+    changes: list[CameraChange] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            changes.append(decode(query.payload.to_bytes(), CameraChange))
+            query.reply(query.key_expr, encode(RegisteredCameras(cameras={})))
+
+    queryable = arena.session.declare_queryable(change_key("test"), answer)
+    with browsing(view) as page:
+        rename = page.get_by_role("button", name="Rename")
+        wait_for(rename.is_enabled, lambda: arena.camera("camera-1"))
+        rename.click()
+        page.get_by_text("'' can't name a camera").wait_for(timeout=20_000)
+        page.locator("xpath=//*[text()='New name']/following::input[1]").fill("north-2")
+        wait_for(lambda: changes, rename.click)
+        page.get_by_text("camera-1 is called north-2 from now on").wait_for(timeout=20_000)
+    assert (changes[0].camera, changes[0].name) == ("camera-1", "north-2")
+    queryable.undeclare()

@@ -7,8 +7,9 @@ from camera_node.protocol.messages import encode
 from tests.calib.rig.hostile import as_publication, hostile_messages
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
-from web.feed import MAX_REASONS, Feed
+from web.feed import MAX_REASONS, REMOVED_CAMERA_S, Feed
 from web.messages import DemoProgress, progress_key
+from web.subscription import Subscription
 
 
 def test_messages_are_stored(arena: LiveArena, feed: Feed):
@@ -86,3 +87,22 @@ def test_the_state_is_a_copy(arena: LiveArena, feed: Feed):
     arena.pose("rover", (0, 0, 0))
     wait_for(lambda: feed.state().poses)
     assert not before.poses
+
+
+def test_a_renamed_camera_disappears(arena: LiveArena, subscription: Subscription):
+    """A camera that is silent and that the server does not list has another name; one that it lists is silent only."""
+    feed, now = subscription.feed, [0.0]
+    feed._clock = lambda: now[0]
+    wait_for(lambda: {"old", "pulled"} <= feed.state().cameras.keys(), lambda: _announce(arena))
+    now[0] = REMOVED_CAMERA_S - 1.0
+    arena.status(cameras=("pulled",))
+    wait_for(lambda: feed.state().status)
+    assert "old" in feed.state().cameras, "the server may not know it yet"
+    now[0] = REMOVED_CAMERA_S + 1.0
+    wait_for(lambda: "old" not in feed.state().cameras, lambda: arena.status(cameras=("pulled",)))
+    assert "pulled" in feed.state().cameras
+
+
+def _announce(arena: LiveArena) -> None:
+    arena.camera("old")
+    arena.camera("pulled")

@@ -88,7 +88,10 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
         name = page.evaluate_handle(inputs).as_element()
         assert name is not None
         name.fill("wide")
-        wait_for(lambda: picker._name.value == "wide")
+        page.get_by_text("Black disc, mm").locator("xpath=ancestor::*[.//input][1]").locator("input").fill(
+            "120"
+        )
+        wait_for(lambda: (picker._name.value, picker._diameter.value) == ("wide", 120.0))
         define = page.get_by_role("button", name="Define robot")
         click(define.click, page, re.compile("wide.* 3 markers"))
     wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")

@@ -10,10 +10,12 @@ import pytest
 
 from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
+from fusion.commands.trim import trim
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
 from web.__main__ import Options, show_recording
+from web.errors import WebError
 from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.tables import tabulate_robots
@@ -162,3 +164,52 @@ def test_the_controls_follow_the_recording(recording: Path):
         assert controls._button.label == "Play"
         assert player.seconds() == 7.5, "an update of the page is not a jump"
         view.close()
+
+
+def test_only_the_selected_part_is_played(recording: Path):
+    """The position stays in it; playing at its end starts at its beginning."""
+    player = RecordingPlayer(recording)
+    player.play(False)
+    player.select_part(12.0, 15.0)
+    assert player.seconds() == 12.0
+    player.seek(3.0)
+    assert player.seconds() == 12.0
+    player.seek(19.0)
+    assert player.seconds() == 15.0
+    assert not player.playing
+    player.play()
+    assert 12.0 <= player.seconds() < 15.0
+    assert player.playing
+    player.select_part(-5.0, 99.0)
+    assert player.part_s == (0.0, player.duration_s)
+
+
+def test_a_part_is_saved_as_a_recording(recording: Path):
+    """By the page, which runs `fusion trim`: with the rig that held at its start, and the poses of the part only."""
+    view = View(Feed("test"), loopback())
+    player = RecordingPlayer(recording)
+    controls = ReplayControls(view.server.gui, player)
+    player.select_part(12.0, 15.0)
+    text = controls.save_part()
+    part = recording.with_name("arena_12.0-15.0s.mcap")
+    assert str(part) in text
+    assert RecordingPlayer(part).duration_s == pytest.approx(3.0)
+    with playing(part) as (_, feed):
+        wait_for(lambda: position(feed) >= 12.0)
+        rig = feed.state().rig
+        assert rig is not None
+        assert "west" not in rig.cameras
+    with pytest.raises(WebError, match="exists"):
+        controls.save_part()
+    view.close()
+
+
+@pytest.mark.parametrize(
+    ("from_s", "to_s", "says"), [(3.0, 3.0, "empty"), (-1.0, 3.0, "empty"), (30.0, 40.0, "no message")]
+)
+def test_an_empty_part_is_refused(recording: Path, from_s: float, to_s: float, says: str):
+    """And nothing is written."""
+    out = recording.with_name("part.mcap")
+    with pytest.raises(ConfigError, match=says):
+        trim(recording, out, from_s=from_s, to_s=to_s)
+    assert not out.exists()

@@ -35,7 +35,7 @@ def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
     state = feed.state()
     robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")
     assert tabulate_robots(state).rows == [TableRow(robot, "ok", dot=css(robot_colour("rover")))]
-    camera = ("north", "30.0", "0.7", "8.0", "0.08", "5.1", "0.02", "2 / 1")
+    camera = ("north", "30.0", "0.7", "8.0", "0.6", "0.08", "5.1", "0.02", "2 / 1")
     assert tabulate_cameras(state).rows == [TableRow(camera, "warn", "too dark")]
 
 

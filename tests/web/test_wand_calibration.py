@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A wand session that is started and ended in a real browser calibrates the cameras."""
 
+import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 import zenoh
 
 from calib.rig.recording import read_detections, save_wand_recording
-from calib.rig.rig import load_rig, save_rig
+from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.errors import ConfigError
+from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from tests.calib.synthetic import assert_near, record, ring
@@ -20,10 +24,19 @@ from tests.web.arena import LiveArena
 from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
 from web.subscription import Subscription
-from web.tabs.wand_session import CalibrationFiles, WandSessionPanel, calibrate_cameras, describe_calibration
+from web.tabs.rig_change import CalibrationFiles
+from web.tabs.wand_session import (
+    WandSessionPanel,
+    calibrate_cameras,
+    describe_calibration,
+    describe_move,
+    recalibrate_one,
+)
 from web.view import View
 
 ARENA = ring(3)
+SHIFT = np.zeros((4, 4))
+SHIFT[:3, 3] = 0.06, 0.08, 0.0  # metres
 CALIBRATION_MS = 120_000  # on a busy machine: two processes start, and one calibrates
 
 
@@ -96,6 +109,39 @@ def test_a_failed_calibration_names_the_recording(tmp_path: Path, files: Calibra
     with pytest.raises(WebError, match=r"symmetric.*rig\.wave\.mcap"):
         calibrate_cameras(recording, files)
     assert files.rig.read_bytes() == before
+
+
+def test_one_camera_is_recalibrated(tmp_path: Path, files: CalibrationFiles):
+    """A camera that was moved by 10 cm is placed where it is; the others stay, and the rig's file too."""
+    recording = tmp_path / "rig.wave.mcap"
+    save_wand_recording(recording, "test", record(ARENA, 6.0))
+    moved = msgspec.structs.replace(
+        ARENA.truth.cameras["cam0"],
+        T_world_cam=Pose.from_matrix(ARENA.truth.cameras["cam0"].matrix() + SHIFT),
+    )
+    before = Rig(cameras={**ARENA.truth.cameras, "cam0": moved})
+    recalibrate_one(recording, files, before, "cam0")
+    after = load_rig(files.candidate)
+    assert after.cameras["cam1"] == before.cameras["cam1"]
+    assert np.abs(after.cameras["cam0"].matrix() - ARENA.truth.cameras["cam0"].matrix()).max() < 1e-3
+    assert re.fullmatch(r"cam0 moved by (99|100|101)\.\d mm", describe_move(before, after, "cam0"))
+    assert not load_rig(files.rig).placed()
+
+
+def test_the_wand_is_drawn_during_a_session(subscription: Subscription, files: CalibrationFiles):
+    """With its trail, which begins again with the next trial, whose world differs."""
+    view = View(subscription.feed, loopback())
+    frames = sorted(record(ARENA, 3.0, free_running=False), key=lambda message: message.t_ns)
+    with closing(WandSessionPanel(view.server, subscription, files)) as panel:
+        for message in frames:
+            subscription.feed.receive(
+                view.feed.keys.detections(), view.feed.keys.detections(message.camera), encode(message)
+            )
+            panel._draw(ARENA.truth, ARENA.wand, is_trial=True)
+        assert panel._wand.n_places > 10
+        panel._draw(Rig(cameras=dict(ARENA.truth.cameras)), ARENA.wand, is_trial=True)
+        assert panel._wand.n_places <= 1
+    view.close()
 
 
 def test_a_discarded_calibration_changes_nothing(subscription: Subscription, files: CalibrationFiles):

@@ -81,7 +81,7 @@ COMMANDS = {
     "demo": Command(
         "calibrate and track a simulated arena, and show it",
         _class_or_function("web.roundel.demo:RunDemo"),
-        ("roundel demo", "roundel demo --headless --seconds 20"),
+        ("roundel demo", "roundel demo --headless --seconds 20", "roundel demo --relative"),
         logging.WARNING,
     ),
     "camera": Command(

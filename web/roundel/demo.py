@@ -4,6 +4,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from camera_node.errors import ConfigError
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunDemo:
@@ -11,6 +13,8 @@ class RunDemo:
     http://localhost:8080. The exit code is 0 if the poses are correct.
     """
 
+    relative: bool = False
+    """Three robots hold a formation by what their own cameras locate, without a server, instead."""
     headless: bool = False
     """Serve no page."""
     seconds: float | None = None
@@ -26,6 +30,8 @@ class RunDemo:
 
     def run(self) -> int:
         """Run the demo and return its exit code."""
+        if self.relative:
+            return self._run_formation()
         from web.__main__ import Options, play_demo
 
         return play_demo(
@@ -39,3 +45,14 @@ class RunDemo:
                 listen=self.listen,
             )
         )
+
+    def _run_formation(self) -> int:
+        from web.formation.demo import run_formation
+        from web.view import check_port
+
+        if self.scene is not None:
+            raise ConfigError("--scene is not for --relative, whose robots move by themselves")
+        if not self.headless:
+            check_port(self.host, self.port)
+        page = None if self.headless else (self.host, self.port)
+        return run_formation(self.listen, page, self.seconds)

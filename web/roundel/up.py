@@ -5,9 +5,7 @@ Read `ArenaUp.run` first: it lists the steps.
 """
 
 import contextlib
-import tempfile
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,19 +13,17 @@ from typing import Annotated
 
 import tyro
 
-from camera_node.commands.camera import LocalCameras, given_options
 from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
 from camera_node.service import ServiceManager, stopped_by_signals
 from camera_node.sources.frame import SourceSettings
 from camera_node.supervisor import Supervisor
 from camera_node.terminal import say
 from fusion.server.config import ArenaConfig, load_arena
-from web.page_access import PageAccess, is_loopback
-from web.roundel.folder import ArenaFolder
+from web.arena_folder import ArenaFolder
+from web.arena_programs import ArenaPrograms
 from web.view import check_port
 
 TICK_S = 0.25
-START_S = 120.0  # for the server to listen, on a loaded machine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,44 +81,23 @@ class ArenaUp:
         with contextlib.ExitStack() as stack:
             supervisor = stack.enter_context(Supervisor(self._note_end))
             service = stack.enter_context(ServiceManager())
-            endpoint = self._start_server(supervisor, options.listen)
-            if endpoint is None:
+            programs = ArenaPrograms(supervisor, self._folder, self._config)
+            endpoints = programs.start_server(options.listen, self._stop)
+            if not endpoints:
                 return self._failed.get("server", 0)
-            connect = ["--connect", endpoint, "--arena", self._config.arena]
+            self._report(endpoints)
             if not options.headless:
-                self._start_page(supervisor, options, connect)
-            words = [*connect, *given_options(options.settings)]
-            cameras = LocalCameras(options.source or (), words, supervisor)
+                programs.start_page(options.host, options.port)
+            cameras = programs.cameras(options.source or (), options.settings)
             if options.source is None or options.source:
                 cameras.start()
             service.ready()
             return self._watch(supervisor, service, cameras.look if options.source is None else None)
 
-    def _start_server(self, supervisor: Supervisor, listen: str | None) -> str | None:
-        """Start the server; return the endpoint for programs of this machine, None if it ended or was stopped."""
-        with tempfile.TemporaryDirectory(prefix="roundel-up-") as temporary:
-            path, end_s = Path(temporary) / "endpoints", time.monotonic() + START_S
-            words = ["--config", str(self._folder.config), "--endpoints-file", str(path)]
-            words += ["--listen", listen] if listen else []
-            supervisor.start("server", "fusion", words)
-            while not path.exists():
-                supervisor.tend()
-                if "server" not in supervisor or time.monotonic() > end_s or self._stop.wait(0.05):
-                    return None
-            endpoints = path.read_text().splitlines()
+    def _report(self, endpoints: list[str]) -> None:
         say(f"server of arena '{self._config.arena}' at {' '.join(endpoints)}")
         if any("127.0.0.1" not in endpoint for endpoint in endpoints):
             say("cameras of other machines in this network join with: roundel camera")
-        return endpoints[0].replace("0.0.0.0", "127.0.0.1")
-
-    def _start_page(self, supervisor: Supervisor, options: RunArena, connect: list[str]) -> None:
-        tokens = None if is_loopback(options.host) else self._folder.path / "page_tokens.yaml"
-        words = [*connect, "--host", options.host, "--port", str(options.port)]
-        words += ["--tokens", str(tokens)] if tokens else []
-        words += ["--rig", str(self._folder.rig), "--wand", str(self._folder.wand)]
-        words += ["--folder", str(self._folder.path / "recordings")]
-        PageAccess.create(options.host, options.port, tokens)  # writes the tokens before the page reads them
-        supervisor.start("page", "web", words)
 
     def _watch(
         self, supervisor: Supervisor, service: ServiceManager, look: Callable[[], object] | None

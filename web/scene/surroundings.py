@@ -7,8 +7,12 @@ import numpy as np
 import viser
 
 from calib.rig.rig import Rig
+from camera_node.arrays import Array
+from camera_node.geometry.pose import wxyz_from_rotation
+from web.colours import PREVIEW
 
 AXES_M = 0.5
+LABEL_SCALE = 0.7
 FIELD_OF_VIEW = math.radians(42)
 DISTANCE = 2.5  # of the initial viewpoint, in radii of the rig
 MIN_RADIUS_M = 1.5
@@ -38,6 +42,47 @@ def add_floor(scene: viser.SceneApi) -> None:
         section_size=1.0,
     )
     scene.add_frame("/origin", axes_length=AXES_M, axes_radius=0.006, origin_radius=0.015)
+    for name, place in (("x", (AXES_M, 0, 0)), ("y", (0, AXES_M, 0)), ("z", (0, 0, AXES_M))):
+        scene.add_label(f"/origin/{name}", name, position=place, font_screen_scale=LABEL_SCALE)
+    for metres in (1, 2):
+        for axis, place in (("x", (metres, 0, 0)), ("y", (0, metres, 0))):
+            scene.add_label(
+                f"/scale/{axis}{metres}", f"{metres} m", position=place, font_screen_scale=LABEL_SCALE
+            )
+
+
+class WorldPreview:
+    """The axes and the floor of a world that is not in use yet; nothing before `draw`."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._handles: list[viser.SceneNodeHandle] = []
+
+    def draw(self, T_world_new: Array | None) -> None:
+        """Draw the world whose pose (4, 4) in the present world this is; None removes it."""
+        for handle in self._handles:
+            handle.remove()
+        self._handles = []
+        if T_world_new is None:
+            return
+        frame = self._scene.add_frame(
+            "/new_world",
+            wxyz=wxyz_from_rotation(T_world_new[:3, :3]),
+            position=T_world_new[:3, 3],
+            axes_length=2 * AXES_M,
+            axes_radius=0.012,
+            origin_radius=0.03,
+        )
+        grid = self._scene.add_grid(
+            "/new_world/floor",
+            width=4.0,
+            height=4.0,
+            cell_color=PREVIEW,
+            section_color=PREVIEW,
+            cell_size=1.0,
+        )
+        label = self._scene.add_label("/new_world/name", "new origin", font_screen_scale=LABEL_SCALE)
+        self._handles = [label, grid, frame]
 
 
 def default_viewpoint(

@@ -10,15 +10,21 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from camera_node.errors import ConfigError, NetworkError
-from camera_node.protocol.camera_requests import mask_of
+from camera_node.config import require_name
+from camera_node.errors import NetworkError
+from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Preview, Settings
+from camera_node.protocol.registration import CameraChange
+from camera_node.protocol.requests import RequestSource
 from web.coverage_picture import montage
 from web.feed import ArenaState
 from web.html_tables import MARGIN_PX
 from web.scene.cameras import CameraDrawing
 from web.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
+from web.tabs.lens import LensPanel
+from web.tabs.mask_editor import MaskEditor
+from web.tabs.rig_change import CalibrationFiles
 from web.widgets import ActionButton, Answer, set_content, set_property
 
 NO_CAMERA = "no camera yet"
@@ -86,14 +92,20 @@ def picture_grid(previews: Mapping[str, Preview], state: ArenaState) -> str:
 
 
 class CameraSettings:
-    """The settings of one camera, its mask, and its image in full resolution."""
+    """The name and the settings of one camera, its mask, its lens, and its image in full resolution."""
 
-    def __init__(self, gui: viser.GuiApi, subscription: Subscription) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        subscription: Subscription,
+        files: CalibrationFiles | None = None,
+    ) -> None:
+        gui = server.gui
         self._gui, self._subscription = gui, subscription
-        self._state = ArenaState()
         self._folder = gui.add_folder("One camera")
         with self._folder:
             self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
+            self._new_name = gui.add_text("New name", "", hint="in the rig, in files and on the network")
             self._exposure = gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0)
             self._gain = gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units")
             self._contrast = gui.add_number(
@@ -105,26 +117,41 @@ class CameraSettings:
                 hint="least contrast of a roundel, grey levels",
             )
             answer = Answer(gui)
-            hint = (
-                "ignore the places of all roundels that are detected now: reflections, while none is in view"
-            )
             self._buttons = (
+                ActionButton(gui, "Rename", self.rename, answer),
                 ActionButton(gui, "Read the settings", self.read, answer),
                 ActionButton(gui, "Apply", self.apply, answer, "zero leaves exposure or gain as it is"),
-                ActionButton(gui, "Mask everything detected now", self.mask_detected, answer, hint),
-                ActionButton(gui, "Remove the mask", self.remove_mask, answer),
                 ActionButton(gui, "Take a snapshot", self._show_snapshot, answer),
             )
             self._image: viser.GuiImageHandle | None = None
+            self._mask = MaskEditor(server, subscription, lambda: self._name, self._request_picture)
+            self._lens = LensPanel(gui, subscription, files, lambda: self._name) if files else None
 
     def update(self, state: ArenaState) -> None:
         """Offer the cameras that publish."""
-        self._state = state
         names = tuple(sorted(state.cameras)) or (NO_CAMERA,)
         if names != tuple(self._camera.options):
             self._camera.options = names
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
+        self._mask.update(state)
+        if self._lens is not None:
+            self._lens.update(state)
+
+    def close(self) -> None:
+        """End a capture of a board."""
+        if self._lens is not None:
+            self._lens.close()
+
+    def rename(self) -> str:
+        """Have the server rename the camera, in the rig too. Raises ConfigError, RequestError or NetworkError."""
+        old, new = self._name, str(self._new_name.value).strip()
+        require_name(new, "a camera")
+        change = CameraChange(camera=old, name=new, source=RequestSource.of("web"))
+        arena = self._subscription.feed.keys.arena
+        change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
+        self._new_name.value = ""
+        return f"{old} is called {new} from now on"
 
     def read(self) -> str:
         """Show the settings in use."""
@@ -139,19 +166,6 @@ class CameraSettings:
         )
         return self._show(self._subscription.change_settings(self._name, wanted))
 
-    def mask_detected(self) -> str:
-        """Add the places of all roundels that the camera detects now to its mask."""
-        detections = self._state.detections.get(self._name)
-        if detections is None or not len(detections):
-            raise ConfigError(f"{self._name} detects nothing now; there is nothing to mask")
-        used = self._subscription.change_settings(self._name)
-        mask = (*(used.mask or ()), *mask_of(detections))
-        return self._show(self._subscription.change_settings(self._name, Settings(mask=mask)))
-
-    def remove_mask(self) -> str:
-        """Have the camera ignore no place."""
-        return self._show(self._subscription.change_settings(self._name, Settings(mask=())))
-
     @property
     def _name(self) -> str:
         return str(self._camera.value)
@@ -164,14 +178,19 @@ class CameraSettings:
 
     def _show_snapshot(self) -> str:
         name = self._name
-        image = decode_jpeg(self._subscription.snapshot(name))
-        if image is None:
-            raise NetworkError(f"{name} sent no image within {REQUEST_TIMEOUT_S:.0f} s")
+        image = self._request_picture(name)
         if self._image is not None:
             self._image.remove()
         with self._folder:
             self._image = self._gui.add_image(image, format="jpeg")
         return f"{name}, {image.shape[1]} x {image.shape[0]}"
+
+    def _request_picture(self, name: str) -> NDArray[np.uint8]:
+        """The current image of a camera, (h, w, 3) RGB; raises NetworkError if there is none."""
+        image = decode_jpeg(self._subscription.snapshot(name))
+        if image is None:
+            raise NetworkError(f"{name} sent no image within {REQUEST_TIMEOUT_S:.0f} s")
+        return image
 
 
 def decode_jpeg(data: bytes | None) -> NDArray[np.uint8] | None:

@@ -34,7 +34,7 @@ class MarkerPicker:
         with server.gui.add_folder("New robot"):
             self._button = server.gui.add_button(SELECT, color=GREY)
             self._name = server.gui.add_text("Name", "robot")
-            self._diameter = server.gui.add_number("Black disc, mm", 120.0, min=1.0, max=10_000.0, step=0.1)
+            self._diameter = server.gui.add_number("Black disc, mm", 90.0, min=1.0, max=10_000.0, step=0.1)
             self._motion = server.gui.add_dropdown("Motion", ("aerial", "ground"))
             self._answer = Answer(server.gui)
             self._define_selected = ActionButton(

@@ -55,11 +55,24 @@ class ReplayControls:
             self._position = gui.add_slider("Seconds", 0.0, 1.0, step=0.1, initial_value=0.0)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1")
             self._loop = gui.add_checkbox("Loop", False, hint="start again at the end")
+            self._part = gui.add_multi_slider(
+                "Part, s",
+                0.0,
+                1.0,
+                step=0.1,
+                initial_value=(0.0, 1.0),
+                hint="only this part is played and saved",
+            )
             step = gui.add_button("Step", hint="one frame of 30 Hz, paused")
+            answer = Answer(gui)
+            self._save = ActionButton(
+                gui, "Save the part as a recording", self.save_part, answer, "beside the recording"
+            )
         self._button.on_click(lambda _: self._with(lambda player: player.play(not player.playing)))
         step.on_click(lambda _: self._with(lambda player: player.step(STEP_S)))
         self._speed.on_update(lambda _: self._with(lambda player: player.set_speed(float(self._speed.value))))
         self._position.on_update(self._seek)
+        self._part.on_update(self._select_part)
 
     def update(self, state: ArenaState) -> None:
         """Show the position and the time of day, and label the button with its action."""
@@ -67,14 +80,37 @@ class ReplayControls:
         set_property(self._folder, "visible", player is not None)
         if player is None:
             return
-        if self._loop.value and not player.playing and player.seconds() >= player.duration_s:
+        if self._loop.value and not player.playing and player.seconds() >= player.part_s[1]:
             player.play()
         seconds = player.seconds()
         time_of_day = datetime.fromtimestamp(player.start_s + seconds).isoformat(" ", "milliseconds")
         set_content(self._time, time_of_day)
         set_property(self._button, "label", "Pause" if player.playing else "Play")
-        set_property(self._position, "max", max(0.1, round(player.duration_s, 1)))
+        duration_s = max(0.1, round(player.duration_s, 1))
+        set_property(self._position, "max", duration_s)
+        set_property(self._part, "max", duration_s)
+        set_property(self._part, "value", tuple(round(s, 1) for s in player.part_s))
+        self._save.show(enabled=player.part_s != (0.0, player.duration_s))
         set_property(self._position, "value", round(min(seconds, player.duration_s), 1))
+
+    def save_part(self) -> str:
+        """Write the part that is played as a recording of its own, beside the recording.
+
+        Raises:
+            WebError: it can't be written; the message is that of `fusion trim`.
+        """
+        player = self.player
+        if player is None:
+            raise WebError("no recording is played; select one and replay it")
+        from_s, to_s = player.part_s
+        out = player.path.with_name(f"{player.path.stem}_{from_s:.1f}-{to_s:.1f}s.mcap")
+        run_fusion("trim", player.path, out, "--from-s", from_s, "--to-s", to_s)
+        return f"wrote {out}"
+
+    def _select_part(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            from_s, to_s = (float(s) for s in self._part.value)
+            self._with(lambda player: player.select_part(from_s, to_s))
 
     def _seek(self, event: viser.GuiEvent) -> None:
         if event.client is not None:  # a user moved the slider; `update` moves it without a client
@@ -226,15 +262,20 @@ def tabulate_recordings(found: list[RecordingSummary]) -> HtmlTable:
 
 
 def export_poses(recording: Path, out: Path) -> None:
-    """Run `fusion replay`, in a process of its own because GTSAM holds the GIL.
+    """Write the poses of a recording as CSV; raises as `run_fusion`."""
+    run_fusion("replay", recording, "--out", out)
+
+
+def run_fusion(*words: object) -> None:
+    """Run a command of `fusion`, in a process of its own because it takes the processor for seconds.
 
     Raises:
         WebError: it failed, with its error message.
     """
-    command = [sys.executable, "-m", "fusion", "replay", str(recording), "--out", str(out)]
+    command = [sys.executable, "-m", "fusion", *map(str, words)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=EXPORT_S, check=False)
     except subprocess.TimeoutExpired:
-        raise WebError(f"the export of {recording} did not end within {EXPORT_S:.0f} s") from None
+        raise WebError(f"fusion {words[0]} did not end within {EXPORT_S:.0f} s") from None
     if done.returncode:
-        raise WebError(done.stderr.strip().removeprefix("error: ") or f"fusion replay failed on {recording}")
+        raise WebError(done.stderr.strip().removeprefix("error: ") or f"fusion {words[0]} failed")

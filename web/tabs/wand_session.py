@@ -3,21 +3,22 @@
 
 import subprocess
 import sys
+import tempfile
 import threading
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import viser
 
 from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
 from calib.live.camera_sizes import running_camera_sizes
-from calib.live.rig_requests import set_rig
+from calib.live.wand_position import locate_wand
 from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
-from camera_node.errors import RoundelError
 from camera_node.geometry.body import Body
 from web.colours import PREVIEW
 from web.condition import next_step
@@ -25,8 +26,10 @@ from web.errors import WebError
 from web.feed import ArenaState
 from web.html_tables import Column, HtmlTable, TableRow
 from web.scene.cameras import CameraDrawing
+from web.scene.wand import WandDrawing
 from web.subscription import Subscription
-from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
+from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.widgets import ActionButton, Answer, LongAction, set_content
 
 SOLVE_S = 600.0  # limit for `calib wand`
 CLOSE_S = 5.0  # for the recording to be saved when the page closes
@@ -36,25 +39,9 @@ WAND_COLUMNS = (
     Column("image", "", "part of the image in which roundels were seen"),
     Column("shared", "", "part of the image area shared with other cameras in which the wand was used"),
 )
-START, END = "Start wand session", "End wand session"
-
-
-@dataclass(frozen=True)
-class CalibrationFiles:
-    """The rig, whose intrinsics are read and whose extrinsics are written, and the wand."""
-
-    rig: Path
-    wand: Path
-
-    @property
-    def candidate(self) -> Path:
-        """The rig that is calibrated but not accepted yet, beside the rig."""
-        return self.rig.with_name(f"{self.rig.stem}.candidate.yaml")
-
-    def check(self) -> None:
-        """Raise ConfigError or CalibrationError if a file is missing or invalid."""
-        load_known_lenses(self.rig)
-        load_yaml(self.wand, Body)
+ALL = "all cameras"
+ONLY_ADVICE = "wave the wand in front of {0} and its neighbours for 10 to 20 s, then end the session"
+LABELS = ("Start wand session", "End wand session")
 
 
 class WandSessionPanel:
@@ -64,42 +51,34 @@ class WandSessionPanel:
         self, server: viser.ViserServer, subscription: Subscription, files: CalibrationFiles
     ) -> None:
         self._subscription, self._files = subscription, files
-        self._lock, self._end_requested = threading.Lock(), threading.Event()
-        self._thread: threading.Thread | None = None
-        self._closed = False
         with server.gui.add_folder("Wand"):
-            self._button = server.gui.add_button(START, color=GREY)
+            self._which = server.gui.add_dropdown(
+                "Calibrate",
+                [ALL],
+                hint="one camera: it was moved or is new, and the other cameras stay as they are",
+            )
             self._answer = Answer(server.gui)
+            self._session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
             self._accept = ActionButton(server.gui, "Accept the calibration", self.accept, self._answer)
             self._discard = ActionButton(server.gui, "Discard it", self.discard, self._answer)
             self._cameras = server.gui.add_html("")
         self._candidate: Rig | None = None
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
-        self._button.on_click(lambda _: self.toggle())
+        self._wand = WandDrawing(server.scene)
+        self._trial: Rig | None = None
 
     def update(self, state: ArenaState) -> None:
         """Enable the button while cameras send, and colour it while it is the next step."""
         step = next_step(state)
-        is_running = self._thread is not None and self._thread.is_alive()
+        known = state.rig.cameras if state.rig is not None and state.rig.placed() else {}
+        names = (ALL, *sorted(known.keys() & state.cameras.keys()))
+        if names != tuple(self._which.options) and not self._session.is_running:
+            self._which.options = names
         is_next = step == "calibrate" and self._candidate is None
-        set_property(self._button, "color", PRIMARY if is_running or is_next else GREY)
-        if not is_running:
-            set_property(self._button, "disabled", step == "cameras")
-        is_ready = self._candidate is not None and not is_running
+        self._session.show(enabled=step != "cameras", primary=is_next)
+        is_ready = self._candidate is not None and not self._session.is_running
         self._accept.show(enabled=is_ready, primary=is_ready)
         self._discard.show(enabled=is_ready)
-
-    def toggle(self) -> None:
-        """Start a wand session, or end the current one."""
-        with self._lock:
-            if self._thread is not None and self._thread.is_alive():
-                self._end_requested.set()
-                return
-            self._end_requested.clear()
-            self._forget()
-            self._button.label = END
-            self._thread = threading.Thread(target=self._run, name="wand session", daemon=True)
-            self._thread.start()
 
     def accept(self) -> str:
         """Write the calibrated rig and have the server use it; returns the outcome.
@@ -111,14 +90,9 @@ class WandSessionPanel:
         candidate = self._candidate
         if candidate is None:
             raise WebError("there is no calibration to accept; record a wand first")
-        save_rig(candidate, self._files.rig)
+        outcome = apply_rig(self._subscription, self._files, candidate)
         self._forget()
-        outcome = describe_calibration(candidate.calibration)
-        try:
-            set_rig(self._subscription.session, self._subscription.feed.keys.arena, candidate, "web")
-        except RoundelError as error:
-            return f"{outcome}; {self._files.rig} is written, but not in force: {error}"
-        return f"{outcome}; in force on the server"
+        return f"{describe_calibration(candidate.calibration)}; {outcome}"
 
     def discard(self) -> str:
         """Forget the calibrated rig; the recording stays."""
@@ -132,54 +106,68 @@ class WandSessionPanel:
 
     def close(self) -> None:
         """End the session and save its recording, without calibrating."""
-        with self._lock:
-            self._closed = True
-            self._end_requested.set()
-        if self._thread is not None:
-            self._thread.join(CLOSE_S)
+        self._session.close(CLOSE_S)
 
-    def _run(self) -> None:
+    def _calibrate(self, end: threading.Event) -> str:
+        self._forget()
         try:
-            self._answer_with(self._calibrate())
-        except RoundelError as error:
-            self._answer_with(str(error))
-        except Exception as error:  # the page must show any failure to the user
-            self._answer_with(f"the calibration failed: {error!r}")
+            return self._record_and_calibrate(end, str(self._which.value))
         finally:
-            self._button.label, self._button.disabled = START, False
+            self._wand.clear()
             if self._candidate is None:  # the session failed: the trials' poses in the scene are void
                 self._preview.draw(None)
 
-    def _calibrate(self) -> str:
+    def _record_and_calibrate(self, end: threading.Event, only: str) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
         wand = load_yaml(files.wand, Body)
-        rig, _ = with_nominal_lenses(load_known_lenses(files.rig), running_camera_sizes(session, arena))
-        settings = WandSession(rig=rig, wand=wand)
-        collected, reason = run_wand_session(session, arena, settings, self._show, self._end_requested)
-        self._button.disabled = True
+        before = current_rig(self._subscription, files)
+        if only == ALL:
+            lenses, sizes = load_known_lenses(files.rig), running_camera_sizes(session, arena)
+            settings = WandSession(rig=with_nominal_lenses(lenses, sizes)[0], wand=wand)
+        else:
+            settings = WandSession(rig=before, wand=wand, trials=False, stops_itself=False)
+        show = partial(self._show, settings, "" if only == ALL else ONLY_ADVICE.format(only))
+        collected, reason = run_wand_session(session, arena, settings, show, end)
+        self._session.handle.disabled = True
         recording = wand_recording_path(files.rig)
         save_wand_recording(recording, arena, collected.messages)
-        if self._closed:
+        if self._session.is_closed:
             return ""
-        self._answer_with(f"wand session ended: {reason}; calibrating")
-        calibrate_cameras(recording, files)
-        self._candidate = load_rig(files.candidate)
-        self._preview.draw(self._candidate)
-        return (
-            f"{describe_calibration(self._candidate.calibration)}; the new poses are yellow in the scene: accept or "
-            "discard them"
+        self._answer.show(f"wand session ended: {reason}; calibrating")
+        if only == ALL:
+            calibrate_cameras(recording, files)
+        else:
+            recalibrate_one(recording, files, before, only)
+        candidate = load_rig(files.candidate)
+        self._candidate = candidate
+        self._preview.draw(candidate)
+        text = (
+            describe_calibration(candidate.calibration)
+            if only == ALL
+            else describe_move(before, candidate, only)
         )
+        return f"{text}; the new poses are yellow in the scene: accept or discard them"
 
-    def _show(self, progress: SessionProgress) -> None:
-        rows = [TableRow((*rest, used), "ok" if used else "warn") for *rest, used, _ in progress.cells()]
-        table = HtmlTable(WAND_COLUMNS, rows, "no roundel yet")
-        set_content(self._cameras, table.html())
-        self._answer_with(f"{progress.summary}: {progress.advice}")
-        if progress.trial is not None and progress.trial.rig is not None:
-            self._preview.draw(progress.trial.rig)
+    def _show(self, settings: WandSession, advice: str, progress: SessionProgress) -> None:
+        where = progress.trial.advice if progress.trial is not None else {}
+        rows = [
+            TableRow((name, *rest, used), "ok" if used else "warn", where.get(name, ""))
+            for name, *rest, used, _ in progress.cells()
+        ]
+        set_content(self._cameras, HtmlTable(WAND_COLUMNS, rows, "no roundel yet").html())
+        self._answer.show(f"{progress.summary}: {advice or progress.advice}")
+        rig = settings.rig if advice else progress.trial.rig if progress.trial is not None else None
+        if rig is not None:
+            self._draw(rig, settings.wand, is_trial=not advice)
 
-    def _answer_with(self, text: str) -> None:
-        self._answer.show(text)
+    def _draw(self, rig: Rig, wand: Body, is_trial: bool) -> None:
+        """Draw the wand, and the cameras of a trial; the next trial's world differs, so the trail begins again."""
+        if is_trial and rig is not self._trial:
+            self._trial = rig
+            self._wand.clear()
+            self._preview.draw(rig)
+        latest = self._subscription.feed.state().detections
+        self._wand.draw(locate_wand(rig.placed(), wand, latest))
 
 
 def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
@@ -189,8 +177,20 @@ def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
     Raises:
         WebError: it failed, with its error message.
     """
+    _run_calib(recording, files, ["--rig", str(files.rig)])
+
+
+def recalibrate_one(recording: Path, files: CalibrationFiles, rig: Rig, name: str) -> None:
+    """Like `calibrate_cameras`, for one camera of a rig: `calib wand --only`."""
+    with tempfile.TemporaryDirectory(prefix="roundel-rig-") as folder:
+        path = Path(folder) / "rig.yaml"
+        save_rig(rig, path)
+        _run_calib(recording, files, ["--rig", str(path), "--only", name])
+
+
+def _run_calib(recording: Path, files: CalibrationFiles, rest: list[str]) -> None:
     files.candidate.unlink(missing_ok=True)  # of a session without a decision
-    options = ["--recording", recording, "--wand", files.wand, "--rig", files.rig, "--out", files.candidate]
+    options = ["--recording", recording, "--wand", files.wand, "--out", files.candidate, *rest]
     command = [sys.executable, "-m", "calib", "wand", *map(str, options)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SOLVE_S, check=False)
@@ -201,6 +201,15 @@ def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
     if done.returncode:
         error = done.stderr.strip().removeprefix("error: ") or f"calib wand ended with {done.returncode}"
         raise WebError(f"{error}; the recording is {recording}")
+
+
+def describe_move(before: Rig, after: Rig, name: str) -> str:
+    """How far a recalibrated camera moved."""
+    new, old = after.cameras[name], before.cameras.get(name)
+    if old is None or old.T_world_cam is None:
+        return f"{name} is placed"
+    moved_mm = 1e3 * float(np.linalg.norm(new.matrix()[:3, 3] - old.matrix()[:3, 3]))
+    return f"{name} moved by {moved_mm:.1f} mm"
 
 
 def describe_calibration(calibration: dict[str, Any]) -> str:

@@ -13,21 +13,24 @@ namespace roundel {
 namespace {
 
 /// One stage of the iteration: the approximate number of pixels, the spacing of the exposure's time steps in
-/// pixels of motion, the maximum number of steps, and the step length in pixels at which it stops.
+/// pixels of motion and their maximum number, the maximum number of steps, and the step length in pixels at
+/// which it stops.
 struct Stage {
     int pixels;
-    double spacing;
+    double spacing, time_steps;
     int max_steps;
     double converged;
 };
-constexpr Stage kCoarse{240, 1.5, 14, 0.1}, kFine{1200, 1, 5, 0.01};
+constexpr Stage kCoarse{240, 1.5, 8, 7, 0.1}, kFine{1200, 1, 1000, 5, 0.01};
 
 constexpr double kInitialBlur = 0.9;
 // Prior standard deviations. They are smaller than those of fit_photometric: a motion hides both.
 constexpr double kRatioPrior = 0.05, kBlurPrior = 0.5;
-constexpr double kMinMotion = 0.1;   // over the minor axis: below it the roundel counts as still
-constexpr double kMaxMotion = 4;     // mean radii
-constexpr double kMaxMisfit = 0.15;  // residuals over the contrast after the coarse stage
+constexpr double kMinMotion = 0.1;  // over the minor axis: below it the roundel counts as still
+constexpr double kMaxMotion = 4;    // mean radii
+// Residuals after the coarse stage: of the contrast, and grey levels of the noise.
+constexpr double kMaxMisfit = 0.08, kMaxNoise = 4;
+constexpr int kHopeful = 3;                           // steps after which they are at most twice as large
 constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
 constexpr double kPatch = 64;                         // pixels of the ground with correlated levels
 constexpr SanityLimits kLimits{
@@ -51,7 +54,7 @@ class MovingFitter : GaussNewton<kMovingCount> {
         prior_ = join(0, 0, prior_information(guess.still.outer.major, kRatioPrior, kBlurPrior));
     }
 
-    bool solve() { return iterate(kCoarse) && noise_ < kMaxMisfit * contrast() && iterate(kFine); }
+    bool solve() { return iterate(kCoarse) && noise_ < max_noise() && iterate(kFine); }
     RoundelFit fit() const;
 
   private:
@@ -59,8 +62,10 @@ class MovingFitter : GaussNewton<kMovingCount> {
         select_moving(image_, p_, stage.pixels, pixels_);
         if (pixels_.used < 2 * kMovingCount) return false;
         for (int k = 0; k < stage.max_steps; ++k) {
-            sums_ = accumulate(pixels_, p_, stage.spacing, kPatch * square(spread_ / noise_));
+            const double spacing = std::max(stage.spacing, motion() / stage.time_steps);
+            sums_ = accumulate(pixels_, p_, spacing, kPatch * square(spread_ / noise_));
             update_noise();
+            if (k == kHopeful && noise_ > 2 * max_noise()) return false;
             if (!factorize(sums_.system, noise_)) return false;
             const double moved = advance();
             if (!is_sane(kLimits) || motion() >= kMaxMotion * start_radius()) return false;
@@ -91,6 +96,7 @@ class MovingFitter : GaussNewton<kMovingCount> {
         return moved;
     }
 
+    double max_noise() const { return std::hypot(kMaxMisfit * contrast(), kMaxNoise); }
     double motion() const { return std::hypot(p_[kMotionX], p_[kMotionY]); }
 
     const ImageView& image_;

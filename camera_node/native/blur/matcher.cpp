@@ -20,9 +20,10 @@ constexpr double kMinDistance = 0.3;     // minor axes between two matches
 
 // New roundels.
 constexpr double kLengths[] = {0.25, 0.4, 0.55, 0.75, 1};  // of the motion, diameters
-constexpr double kMaxFirstMisfit = 0.4;              // RMS over the contrast in the direction of the streak,
-constexpr double kMaxStartMisfit = 0.25;             // in the best direction, before the descent,
-constexpr double kMaxMisfits[] = {0.2, 0.13, 0.09};  // and after each of its rounds
+constexpr double kMaxFirstMisfit = 0.4;   // RMS over the contrast in the direction of the streak,
+constexpr double kMaxStartMisfit = 0.25;  // in the best direction, before the descent,
+// and after each of its rounds. Templates are not blurred and have five lengths: true matches reach 0.11.
+constexpr double kMaxMisfits[] = {0.2, 0.15, 0.13, 0.11};
 constexpr double kFirstStep = 0.1, kNextStep = 0.6;  // widths; factor from round to round
 constexpr double kRadians = 1.5;                     // of a step of one width
 constexpr double kTurns[] = {0, -0.25, 0.25};        // radians from the streak's direction

@@ -21,7 +21,7 @@ from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.geometry.pose import Pose, rotation_from_vector
-from camera_node.node.node import Node
+from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import MAX_ROUNDELS
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import Frame, Source
@@ -157,7 +157,7 @@ def main(name: str, connect: str, arena: str, epoch_ns: int, load: str) -> None:
     camera = SceneCamera(world, name, detector)
     threading.Thread(target=obey, args=(camera, world), daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt), open_client([connect]) as session:
-        Node(name, camera, detector, session, arena).run()
+        Node(name, camera, detector, session, NodeOptions(arena)).run()
 
 
 if __name__ == "__main__":

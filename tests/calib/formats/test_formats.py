@@ -23,6 +23,7 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_wxyz
 from camera_node.sources.observations import read_observations
+from tests.calib.stick import LENGTH_M, write_stick
 from tests.calib.synthetic import camera_errors, ring
 
 EASYWAND_PROFILE = (
@@ -398,20 +399,9 @@ def test_a_lens_with_k3_is_written_with_four_coefficients_where_that_is_near_eno
 
 def test_imported_points_calibrate_a_rig(tmp_path: Path):
     """A stick before three cameras in the tables of DLTdv, with numbers of frames and no diameter: as recorded."""
-    truth, rng, wand = ring(3).truth, np.random.default_rng(1), WandBody(markers=((0, 0, 0), (0.5, 0, 0)))
-    rows = []
-    for _ in range(60):
-        at, along = rng.uniform([-0.6, -0.6, 0.4], [0.6, 0.6, 1.5]), rng.standard_normal(3)
-        ends = np.array([at, at + 0.5 * along / np.linalg.norm(along)])
-        uv = np.array(
-            [c.project_world(ends) + 0.2 * rng.standard_normal((2, 2)) for c in truth.cameras.values()]
-        )
-        seen = np.array([c.sees(uv[k]) for k, c in enumerate(truth.cameras.values())])
-        rows.append(np.where(seen[..., None], uv + 1, np.nan).swapaxes(0, 1).ravel())
-    header = [f"pt{m}_cam{c}_{x}" for m in (1, 2) for c in (1, 2, 3) for x in "XY"]
+    truth, wand = ring(3).truth, WandBody(markers=((0, 0, 0), (LENGTH_M, 0, 0)))
+    write_stick(tmp_path, "dltdv")
     table = tmp_path / "xypts.csv"
-    np.savetxt(table, np.array(rows), delimiter=",", header=",".join(header), comments="")
-    FORMATS["dltdv"].write(ring(3).intrinsics, tmp_path, FORMATS["dltdv"].origin)
     ImportData(format="dltdv", files=(table, tmp_path / "profile.txt"), out=tmp_path).execute()
     rig = load_rig(tmp_path / "rig.yaml")
     messages = read_observations(tmp_path / "observations.csv", fps=100.0)

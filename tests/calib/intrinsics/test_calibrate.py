@@ -215,6 +215,10 @@ def test_a_capture_ends_when_the_views_suffice():
     assert reason.startswith("there are enough views")
     assert len(views.views) <= len(everywhere)
     assert len(shown) < 2 * len(everywhere) + 2
+    counts = [progress.n_views for progress in shown]
+    assert counts == sorted(counts)
+    assert counts[-1] == len(views.views)
+    assert shown[0].advice.startswith("show the board in the ")
 
 
 def test_residuals_are_drawn():

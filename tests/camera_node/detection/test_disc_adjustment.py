@@ -36,10 +36,10 @@ def test_without_noise_the_pose_is_recovered(tilt: float):
     start = normal + np.array([0.02, 0.05, 0.0])
     start /= np.linalg.norm(start)
     seen, cov = measured(position, normal), measured_covariance(24)
-    c, n, chi2 = adjust(1.02 * position[None], start[None], RADIUS, seen, cov)
-    assert c[0] == pytest.approx(position, rel=1e-6)
-    assert n[0] == pytest.approx(normal, abs=1e-5)
-    assert chi2[0] < 1e-3
+    found = adjust(1.02 * position[None], start[None], RADIUS, seen, cov)
+    assert found.position[0] == pytest.approx(position, rel=1e-6)
+    assert found.normal[0] == pytest.approx(normal, abs=1e-5)
+    assert found.chi2[0] < 1e-3
 
 
 def test_the_residual_is_chi_square_distributed():
@@ -49,7 +49,7 @@ def test_the_residual_is_chi_square_distributed():
     noise = np.random.default_rng(3).standard_normal((n, 7)) @ np.linalg.cholesky(cov[0]).T
     seen = measured(position, normal) + noise
     positions, normals = np.tile(position, (n, 1)), np.tile(normal, (n, 1))
-    chi2 = adjust(positions, normals, RADIUS, seen, np.repeat(cov, n, axis=0))[2]
+    chi2 = adjust(positions, normals, RADIUS, seen, np.repeat(cov, n, axis=0)).chi2
     assert chi2.mean() == pytest.approx(2, abs=0.4)
 
 

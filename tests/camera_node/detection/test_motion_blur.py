@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
+from camera_node.simulation.sensor import CLEAN
+from tests.benchmarks.detector.cameras import moving
+from tests.benchmarks.detector.pictures import missed
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 SIZE = (72, 88)
@@ -75,6 +78,18 @@ def test_a_new_moving_roundel_is_found_in_both_diagonal_directions():
             detector, clean = Detector(search_share=share), exposed(24.0, turn, 0.0, 190.0)
             detector.detect(expose(plain, 3, rng))
             assert any(len(detector.detect(expose(clean, 3, rng))) for _ in range(round(1 / share)))
+
+
+def test_short_motions_are_found_on_clutter_on_the_first_frame():
+    """Nine of ten of 24 to 40 px that move by 10 px: their holes are not closed, and their bars are short."""
+    there = lost = 0
+    for seed in range(3):
+        light, shown = moving(np.random.default_rng(seed))
+        found = Detector().detect(CLEAN.expose(light, np.random.default_rng(seed)))
+        lost += missed(shown, found.uv)
+        there += len(shown)
+        assert len(found) <= len(shown)
+    assert lost <= 0.1 * there
 
 
 def test_size_and_contrast_are_those_of_a_sharp_image():

@@ -16,7 +16,7 @@ import zenoh
 
 from camera_node.commands.publish import open_source
 from camera_node.detection.detector import Detector
-from camera_node.node.node import Node
+from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
@@ -55,7 +55,7 @@ def running(network):
     def start(folder: Path, **settings) -> Node:
         source = open_source(str(folder), SourceSettings(**settings))
         keep_stamps = source.is_recording and settings.get("stamps", "recorded") == "recorded"
-        node = Node("cam0", source, Detector(), network.client(), keep_stamps=keep_stamps)
+        node = Node("cam0", source, Detector(), network.client(), NodeOptions(keep_stamps=keep_stamps))
         thread = threading.Thread(target=node.run)
         thread.start()
         nodes.append((node, thread))

@@ -142,6 +142,21 @@ def test_masking_what_is_detected_silences_it(network, node: Node, tmp_path: Pat
     assert request_settings(client, "arena", "cam0").mask == ()
 
 
+def test_a_drawn_mask_silences_what_is_in_it(network, node: Node, capsys):
+    """Two corners are a rectangle; a mask beside the roundel changes nothing; both are refused without an area."""
+    client, server = network.client(), CameraConnection(connect=(network.endpoint,))
+    wait_for(lambda: _detects(client), deadline_s=20)
+    u, v = next_detections(client, "arena", "cam0").unpack().uv[0]
+    ChangeSettings(name="cam0", mask=(f"{u + 60},{v + 60}", f"{u + 80},{v + 70}"), server=server).run()
+    wait_for(lambda: _detects(client), deadline_s=20)
+    ChangeSettings(name="cam0", mask=(f"{u - 9},{v - 9}", f"{u + 9},{v + 9}"), server=server).run()
+    assert "mask: 2 polygons" in capsys.readouterr().out
+    wait_for(lambda: not _detects(client), deadline_s=20)
+    for corners in (("1,1",), ("1,1", "1,9"), ("nan,1", "5,9"), ("1,1", "5")):
+        with pytest.raises(ConfigError):
+            ChangeSettings(name="cam0", mask=corners, server=server).run()
+
+
 def _detects(client) -> bool:
     return len(next_detections(client, "arena", "cam0")) > 0
 

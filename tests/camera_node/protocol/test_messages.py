@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 import calib.rig.messages
 import camera_node.protocol.messages
+import camera_node.protocol.relative
 import fusion.protocol.messages
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import (
@@ -130,9 +131,14 @@ def test_a_newer_sender_may_add_fields():
 
 
 def test_every_field_is_documented():
-    """docs/messages.md has a section for every message of the three packages, with a row for every field."""
+    """docs/messages.md has a section for every message of these modules, with a row for every field."""
     sections = (ROOT / "docs" / "messages.md").read_text().split("\n## ")
-    for module in (camera_node.protocol.messages, calib.rig.messages, fusion.protocol.messages):
+    for module in (
+        camera_node.protocol.messages,
+        camera_node.protocol.relative,
+        calib.rig.messages,
+        fusion.protocol.messages,
+    ):
         for name, kind in vars(module).items():
             if (
                 isinstance(kind, type)

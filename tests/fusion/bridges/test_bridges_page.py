@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The commands of docs/bridges.md run as they are written there, with the endpoint and the port of the test."""
 
-import os
 import re
 import shlex
 import subprocess
@@ -15,6 +14,7 @@ from camera_node.protocol.messages import encode
 from tests.conftest import ROOT, free_port
 from tests.fusion.bridges.pose_server import ARENA, PoseServer, first_line, moving_pose
 from tests.waiting import DEADLINE_S
+from tests.web.roundel.programs import roundel_command
 
 PAGE = (ROOT / "docs" / "bridges.md").read_text()
 COMMANDS = [
@@ -55,30 +55,26 @@ def test_the_page_exports(tmp_path: Path):
             writer.put("x/robot/rover/pose", encode(pose), pose.t_ns)
     for command in COMMANDS:
         if " export " in command:
-            python, *words = shlex.split(command)
-            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-            program = subprocess.run(
-                [sys.executable, *words], cwd=tmp_path, env=environment, timeout=DEADLINE_S, check=False
-            )
-            assert python == "python"
+            _, *words = shlex.split(command)
+            program = subprocess.run(roundel_command(*words), cwd=tmp_path, timeout=DEADLINE_S, check=False)
             assert program.returncode == 0
             assert (tmp_path / words[-1]).exists()
 
 
 def test_the_page_has_commands():
     assert len(COMMANDS) >= 2
+    assert all(command.startswith("roundel ") for command in COMMANDS)
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if " export " not in c])
 def test_a_bridge_of_the_page_runs_until_it_is_ended(command: str, endpoint: str, tmp_path: Path):
-    python, *words = shlex.split(command)
-    assert python == "python"
+    _, *words = shlex.split(command)
     words += ["--connect", endpoint, "--arena", ARENA]
     if " ros2" not in command and " mavlink" not in command:
         words += ["--port", str(free_port())]  # another test may use the usual one
     with (
         PoseServer(endpoint),
-        subprocess.Popen([sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process,
+        subprocess.Popen(roundel_command(*words), cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process,
     ):
         try:
             assert first_line(process)

@@ -56,6 +56,21 @@ def test_a_wand_is_no_single_marker_robot():
     }
 
 
+def test_a_marker_of_a_wand_whose_others_are_hidden_is_no_single_marker_robot():
+    """All three have moved by 0.2 m when two of them are hidden."""
+    arena = beside(DRIVING, lambda robot, marker, t: robot == "s" or (marker > 0 and t > 0.9))
+    tracker, n_wrong = run(arena, {"s": SINGLE}, 60)
+    assert (tracker.table.status, n_wrong) == ([None], 0)
+
+
+def test_a_robot_that_passes_another_marker_is_in_its_company_only_while_the_distance_stays_the_same():
+    """It starts abeam of a marker that stands still: 0.09 m later their distance has changed by 0.01 m."""
+    motions = {"s": line((0.0, 0.0, 0.2), (0.4, 0.0, 0.0)), "o": line((0.0, 0.4, 0.2))}
+    arena = Arena({"s": SINGLE, "o": SINGLE}, motions, sigma_px=0.05)
+    tracker, n_wrong = run(arena, {"s": SINGLE}, 30)
+    assert (tracker.table.status, n_wrong) == (["tracked"], 0)
+
+
 def test_no_robot_is_acquired_while_the_wand_is_recorded():
     tracker, _ = run(beside(DRIVING), {"s": SINGLE, "b": WIDE}, 10, is_wand_recorded=True)
     assert tracker.table.status == [None, None]

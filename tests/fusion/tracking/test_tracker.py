@@ -10,7 +10,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
+from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, line
 from tests.fusion.tracks import errors, poses_of, track
 
 TIGHT = Limits(sigma_floor_px=1e-3)
@@ -270,3 +270,15 @@ def test_the_noise_of_stamps_is_noise_along_the_motion():
         honesty.append(float(np.mean(np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0])) / 3))
     assert honesty[0] < 2.5
     assert honesty[1] > 10.0
+
+
+def test_an_arena_without_robots_has_markers():
+    """From which its first robot is defined."""
+    arena = Arena({"a": TRIANGLE}, {"a": line((0.1, 0.2, 0.3))}, sigma_px=0.05)
+    tracker, synchronizer = Tracker(arena.cameras, {}), FrameSynchronizer(PERIOD_NS)
+    for frame in arena.frames(10):
+        synchronizer.add(frame)
+    *_, result = [tracker.track(frame_set) for frame_set in synchronizer.finish()]
+    assert not result.poses
+    n_seen_by_several = np.isfinite(result.markers.positions()).all(1).sum()
+    assert n_seen_by_several == len(TRIANGLE.markers)

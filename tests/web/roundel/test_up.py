@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel up` and `roundel camera`: real processes on loopback, simulated images."""
 
-import os
 import re
 import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,50 +13,9 @@ import yaml
 from fusion.client import Arena
 from tests.conftest import free_port
 from tests.waiting import wait_for
+from tests.web.roundel.programs import Program, roundel, roundel_command
 
 WAND_S = 60.0
-MAIN = "from web.roundel.command import main; main()"
-
-
-class Program:
-    """A `roundel` command and the lines that it printed so far."""
-
-    def __init__(self, *words: object, folder: Path) -> None:
-        command = [sys.executable, "-P", "-c", MAIN, *map(str, words)]
-        env = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        self.process = subprocess.Popen(
-            command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.append(line)
-
-    def until(self, pattern: str) -> str:
-        """Wait for a line that matches, and return it."""
-
-        def find() -> str | None:
-            assert self.process.poll() is None or self._reader.is_alive(), self.text
-            return next((line for line in list(self.lines) if re.search(pattern, line)), None)
-
-        return wait_for(find) or ""
-
-    @property
-    def text(self) -> str:
-        return "".join(self.lines)
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-        code = self.process.wait(30)
-        self._reader.join(10)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-        return code
 
 
 @pytest.fixture
@@ -69,20 +24,12 @@ def start(tmp_path: Path) -> Iterator:
     programs: list[Program] = []
 
     def run(*words: object) -> Program:
-        programs.append(Program(*words, folder=tmp_path))
+        programs.append(Program(roundel_command(*words), tmp_path))
         return programs[-1]
 
     yield run
     for program in reversed(programs):
         program.stop()
-
-
-def roundel(*words: object, folder: Path, expected: int = 0) -> str:
-    """Run a command to its end; return what it printed."""
-    command = [sys.executable, "-P", "-c", MAIN, *map(str, words)]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == expected, done.stdout + done.stderr
-    return done.stdout + done.stderr
 
 
 @pytest.mark.slow  # the wand is waved for as long as all programs need to start on a loaded machine

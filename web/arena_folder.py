@@ -53,6 +53,14 @@ class ArenaFolder:
     def wand(self) -> Path:
         return self.path / "wand.yaml"
 
+    @property
+    def recordings(self) -> Path:
+        return self.path / "recordings"
+
+    def resolved(self) -> "ArenaFolder":
+        """The same folder by its absolute path."""
+        return ArenaFolder(self.path.resolve())
+
     def create(self, arena: str, listen: str | None, is_local: bool) -> bool:
         """Write the files that are missing; return whether the folder is new.
 
@@ -66,7 +74,7 @@ class ArenaFolder:
         """
         require_name(arena, "an arena")
         try:
-            for folder in (self.path, self.path / "cameras", self.path / "recordings"):
+            for folder in (self.path, self.path / "cameras", self.recordings):
                 folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(

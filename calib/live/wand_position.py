@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Locates the wand in the latest frames of placed cameras, to show it during a recording."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.errors import CalibrationError
+from calib.rig.camera import Camera
+from calib.rig.triangulation import triangulate_point
+from calib.wand.detections import gather
+from calib.wand.labeling import label
+from calib.wand.timing import MAX_SPREAD_S, Timing
+from camera_node.arrays import Array
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+
+MAX_MISFIT = (
+    0.2  # of a distance between two markers: the motion between frames changes it, a wrong match much more
+)
+ONE_FRAME = Timing(0.0, synchronous=True)  # labels need no other frames
+
+
+def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, Detections]) -> Array | None:
+    """Locate the markers of the wand.
+
+    The frames of different cameras are treated as simultaneous: at 1 m/s and 30 frames/s, the position is right to
+    about 2 cm, which suffices for a display.
+
+    Args:
+        cameras: placed cameras by name.
+        wand: its markers; the ends of a wand of two can't be told apart in one frame, so it is not located.
+        latest: the latest frame of each camera, by name.
+
+    Returns:
+        (M, 3) world, metres, NaN for markers that fewer than two cameras saw; None if the wand is not seen.
+    """
+    newest_ns = max((message.t_ns for message in latest.values()), default=0)
+    recent = [
+        message
+        for name, message in latest.items()
+        if name in cameras and len(message) and newest_ns - message.t_ns < MAX_SPREAD_S * 1e9
+    ]
+    if len(recent) < 2:
+        return None
+    names = sorted(message.camera for message in recent)
+    lenses = [cameras[name] for name in names]
+    frames, detections = gather(recent, names, lenses)
+    try:
+        labeled, _ = label(frames, ONE_FRAME, detections, wand, lenses)
+    except CalibrationError:  # a symmetric wand without numbers
+        return None
+    points = np.full((len(wand.markers), 3), np.nan)
+    for marker in range(len(points)):
+        rows = labeled.label == marker
+        if rows.sum() >= 2:
+            points[marker] = _triangulate([lenses[k] for k in labeled.camera[rows]], labeled.uv[rows])
+    return points if _fits(points, wand.points) else None
+
+
+def _triangulate(cameras: list[Camera], uv: Array) -> Array:
+    try:
+        return triangulate_point(cameras, uv)
+    except CalibrationError:
+        return np.full(3, np.nan)
+
+
+def _fits(points: Array, body: Array) -> bool:
+    """Whether some points (M, 3) were located, and their distances are about those of the body (M, 3)."""
+    found = np.isfinite(points[:, 0])
+    if not found.any():
+        return False
+    apart, true = (np.linalg.norm(p[found][:, None] - p[found], axis=2) for p in (points, body))
+    return bool((np.abs(apart - true) <= MAX_MISFIT * true).all())

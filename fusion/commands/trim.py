@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion trim`: a part of a recording as a recording."""
+
+from pathlib import Path
+
+from camera_node.terminal import say
+from fusion.recordings.trim import trim_recording
+
+
+def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9) -> int:
+    """Copy a part of a recording (MCAP), with the rig and the robots that held at its start.
+
+    Args:
+        recording: the MCAP file.
+        out: the file to write; it must not exist.
+        from_s: start of the part, seconds after the first message.
+        to_s: end of the part, seconds after the first message.
+    """
+    count = trim_recording(recording, out, from_s, to_s)
+    say(f"wrote {out}: {count} messages")
+    return 0

@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A first arena: four unknown cameras on two machines, an operator who clicks in a browser, and a program with poses.
+
+The cameras are recordings, which `roundel up` and `roundel camera` play as live ones: of the first machine folders of
+pictures, of the second videos. Someone waves a wand for `WAND_S`, then sets a robot down for `STANDING_S`, which then
+drives on a circle. Each of the three motions repeats, so that few frames are rendered. `Operator` has no other means
+than the page.
+"""
+
+import contextlib
+import csv
+import json
+import os
+import re
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from playwright.sync_api import Locator, Page, expect, sync_playwright
+
+from calib.rig.rig import load_rig
+from camera_node.arrays import Array, Grey
+from camera_node.config import example_file
+from camera_node.simulation.recording import render_recording
+from camera_node.simulation.scene import Scene
+from camera_node.sources.replay import read_grey
+from tests.benchmarks.faults.network import Loopback
+from tests.conftest import free_port
+from tests.waiting import wait_for
+from tests.web.browser import CHROMIUM, FLAGS
+from tests.web.roundel.programs import Program, roundel_command
+
+SERVER, CAMERAS = "server", "cameras"  # the machines
+FOLDERS, VIDEOS = ("north", "east"), ("south", "west")  # the cameras of the first and of the second machine
+FPS = {"north": 20.0, "east": 19.75, "south": 20.25, "west": 19.5}  # whole numbers of frames in 4 s
+WAND_S, STANDING_S, DRIVING_S = 72.0, 60.0, 72.0
+WAND_PERIOD_S, STANDING_PERIOD_S, ROUND_S = 12.0, 4.0, 12.0
+RADIUS_M = 0.6  # of the circle on which the robot drives
+DIAMETER_M = 0.09
+STEP_MS = 60_000  # for the page to show the outcome of a step, on a loaded machine
+CALIBRATION_MS = 150_000
+LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s, grade ., expected error"  # three rounds of the wand
+WAIT_S = 60.0  # for the robot to drive
+N_POSES = 1500  # at about 80 a second
+STOOD_M = 0.1
+
+WAND_MOTION = {
+    "x_m": {"amplitude": 1.0, "period_s": 6.0},
+    "y_m": {"amplitude": 0.9, "period_s": 4.0, "phase_deg": 40},
+    "z_m": {"mean": 0.65, "amplitude": 0.5, "period_s": 12.0, "phase_deg": 110},
+    "yaw_deg": {"mean": 20, "amplitude": 170, "period_s": 12.0},
+    "pitch_deg": {"amplitude": 18, "period_s": 4.0},
+    "roll_deg": {"amplitude": 18, "period_s": 3.0, "phase_deg": 70},
+}
+STANDING = {"x_m": {"mean": 0.0}, "y_m": {"mean": RADIUS_M}, "z_m": {"mean": 0.15}}
+DRIVING = {
+    "x_m": {"amplitude": RADIUS_M, "period_s": ROUND_S},
+    "y_m": {"amplitude": RADIUS_M, "period_s": ROUND_S, "phase_deg": 90},
+    "z_m": {"mean": 0.15},
+}
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of the recording: `period_s` of it are rendered, and repeated until `seconds` are full."""
+
+    seconds: float
+    period_s: float
+    is_wand: bool
+    robot_motion: dict
+
+
+PHASES = (
+    Phase(WAND_S, WAND_PERIOD_S, True, STANDING),
+    Phase(STANDING_S, STANDING_PERIOD_S, False, STANDING),
+    Phase(DRIVING_S, ROUND_S, False, DRIVING),
+)
+
+
+def render(folder: Path) -> None:
+    """Write the pictures `<camera>/<t_ns>.png` of `FOLDERS`, and the videos `<camera>/<camera>.avi` of `VIDEOS`."""
+    with ProcessPoolExecutor() as processes:
+        for done in [processes.submit(_render_phase, folder, k) for k in range(len(PHASES))]:
+            done.result()
+    for name in FPS:
+        frames = _repeated(folder, name)
+        (folder / name).mkdir()
+        if name in FOLDERS:
+            for t_ns, path in frames:
+                os.link(path, folder / name / f"{t_ns}.png")
+        else:
+            _write_video(folder / name / f"{name}.avi", frames)
+
+
+def _render_phase(folder: Path, k: int) -> None:
+    """Render one period of a phase, beginning at time 0, into `folder/phase<k>`."""
+    phase, place = PHASES[k], folder / f"phase{k}"
+    place.mkdir(parents=True)
+    text = example_file("demo/scene.yaml").read_text(encoding="utf-8")
+    scene = yaml.safe_load(text)
+    for name, fps in FPS.items():
+        scene["cameras"][name]["fps"] = fps
+    scene["wave_s"] = phase.period_s + 1.0 if phase.is_wand else 0.0
+    scene["wand_motion"], scene["robot_motions"] = WAND_MOTION, {"rover": phase.robot_motion}
+    (place / "scene.yaml").write_text(json.dumps(scene))
+    (place / "wand.yaml").write_text(example_file("wand.yaml").read_text())
+    markers = [[0.1, 0.0, 0.0], [-0.08, 0.05, 0.0], [-0.03, -0.11, 0.0]]
+    robots = {"robots": {"rover": {"diameter_m": DIAMETER_M, "markers": markers}}}
+    (place / "robots.yaml").write_text(json.dumps(robots))
+    render_recording(Scene.load(place / "scene.yaml"), place, 0.0, phase.period_s)
+
+
+def _repeated(folder: Path, camera: str) -> list[tuple[int, Path]]:
+    """Time (ns) and file of each frame of a camera, from the first phase to the last."""
+    frames, start_s = [], 0.0
+    for k, phase in enumerate(PHASES):
+        paths = sorted((folder / f"phase{k}" / camera).glob("*.png"))
+        for round_ in range(round(phase.seconds / phase.period_s)):
+            shift_ns = round((start_s + round_ * phase.period_s) * 1e9)
+            frames += [(int(path.stem) + shift_ns, path) for path in paths]
+        start_s += phase.seconds
+    return frames
+
+
+def _write_video(path: Path, frames: list[tuple[int, Path]]) -> None:
+    pictures: dict[Path, Grey] = {}
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS[path.stem], (640, 480), False)
+    for _, picture in frames:
+        if picture not in pictures:
+            pictures[picture] = read_grey(picture)
+        video.write(pictures[picture])
+    video.release()
+    with path.with_name("timestamps.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["frame_time"])
+        rows.writerows([f"{t_ns / 1e9:.9f}"] for t_ns, _ in frames)
+
+
+class Operator:
+    """Works with the page of an arena, step by step.
+
+    Args:
+        page: the open page.
+        picture: called with the name of each step that the documentation shows.
+    """
+
+    def __init__(self, page: Page, picture: Callable[[str], object] = lambda name: None) -> None:
+        self._page, self._picture = page, picture
+
+    def check_cameras(self) -> None:
+        """Wait until all cameras send, and their pictures are shown."""
+        self._tab("Cameras")
+        for name in FPS:
+            self._page.locator(f"img[alt={name}]").wait_for(timeout=STEP_MS)
+        self._picture("cameras")
+
+    def calibrate(self) -> str:
+        """Record the wand until the session ends by itself or saw three rounds, and accept; return the outcome."""
+        self._tab("Calibrate")
+        self._click("Start wand session")
+        self._button("End wand session").wait_for(timeout=STEP_MS)
+        long_enough = self._page.get_by_text(re.compile(LONG_ENOUGH))
+        self._button("Start wand session").or_(long_enough).wait_for(timeout=STEP_MS)
+        self._picture("wand")
+        if self._button("End wand session").is_enabled():
+            self._click("End wand session")
+        self._button("Start wand session").wait_for(timeout=CALIBRATION_MS)
+        accept = self._button("Accept the calibration")
+        expect(accept, self._page.locator("body").inner_text()).to_be_enabled(timeout=STEP_MS)
+        self._picture("calibrate")
+        accept.click()
+        outcome = self._page.get_by_text("in force on the server")
+        outcome.wait_for(timeout=STEP_MS)
+        return outcome.inner_text()
+
+    def define_robot(self, name: str) -> str:
+        """Define a robot from everything stationary; again, as an operator would, while something moves."""
+        self._tab("Robots")
+        label = self._page.get_by_text("Name", exact=True).and_(self._page.locator(":visible"))
+        label.locator("xpath=ancestor::*[.//input][1]").locator("input").fill(name)
+        outcome = self._page.get_by_text(f"the server now tracks {name}")
+        refusal = self._page.get_by_text(re.compile("no stationary|make no robot|no markers"))
+        for _ in range(60):
+            self._click("Define from everything stationary")
+            outcome.or_(refusal).first.wait_for(timeout=STEP_MS)
+            if outcome.count():
+                break
+        self._picture("robots")
+        return outcome.inner_text()
+
+    def program(self) -> str:
+        """The program that the page offers."""
+        self._tab("Status")
+        self._page.get_by_text("Poses for your program").click(timeout=STEP_MS)
+        text = self._page.locator("pre").filter(has_text="Arena.connect")
+        text.wait_for(timeout=STEP_MS)
+        return text.inner_text()
+
+    def _tab(self, name: str) -> None:
+        self._page.get_by_role("tab", name=name).click(timeout=STEP_MS)
+
+    def _button(self, name: str) -> Locator:
+        return self._page.get_by_role("button", name=name, exact=True)
+
+    def _click(self, name: str) -> None:
+        self._button(name).click(timeout=STEP_MS)
+
+
+class FirstArena:
+    """The two machines, and the browser of the first one; a context manager.
+
+    Args:
+        network: with places `SERVER` and `CAMERAS`.
+        recordings: as `render` wrote them.
+        folder: in which both commands run.
+    """
+
+    def __init__(self, network: Loopback, recordings: Path, folder: Path) -> None:
+        self._network, self._recordings, self._folder = network, recordings, folder
+        self._stack = contextlib.ExitStack()
+        self.port = free_port()
+
+    def __enter__(self) -> "FirstArena":
+        with self._stack as stack:
+            folders = [self._recordings / name for name in FOLDERS]
+            videos = [self._recordings / name / f"{name}.avi" for name in VIDEOS]
+            self.up = self._start(SERVER, stack, "up", "lab", "--port", self.port, "--source", *folders)
+            self.camera = self._start(CAMERAS, stack, "camera", "--source", *videos)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
+
+    def _start(self, place: str, stack: contextlib.ExitStack, *words: object) -> Program:
+        program = Program(self._network.command(place, roundel_command(*words)), self._folder)
+        stack.callback(program.stop)
+        return program
+
+    @contextlib.contextmanager
+    def browsing(self) -> Iterator[Page]:
+        """Open the page in a browser of the server's machine."""
+        assert CHROMIUM is not None
+        script = self._folder / "browser"
+        command = shlex.join(self._network.command(SERVER, [CHROMIUM]))
+        script.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+        script.chmod(0o755)
+        self.up.until("the page is at|http://")
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=script, args=FLAGS)
+            page = browser.new_page(viewport={"width": 1600, "height": 1000})
+            page.goto(f"http://127.0.0.1:{self.port}")
+            yield page
+            browser.close()
+
+    def run_program(self, code: str, n_poses: int) -> list[str]:
+        """Run a program on the server's machine until it printed so many lines; return them."""
+        path = self._folder / "poses.py"
+        path.write_text(code)
+        program = Program(self._network.command(SERVER, [sys.executable, "-P", str(path)]), self._folder)
+        try:
+            wait_for(lambda: len(program.lines) >= n_poses, deadline_s=2 * ROUND_S + WAIT_S)
+        finally:
+            program.stop(signal.SIGKILL)
+        return program.lines
+
+
+def read_poses(lines: Iterable[str]) -> tuple[Array, Array]:
+    """Times (N,) ns and positions (N, 3) of printed poses."""
+    rows = [
+        (int(match[1]), [float(number) for number in match[2].split(",")])
+        for line in lines
+        if (match := re.match(r"(\d+) \w+ \(([^)]*)\) \(", line))
+    ]
+    return np.array([t for t, _ in rows]), np.array([position for _, position in rows])
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle through positions.
+
+    Attributes:
+        radius_m: its radius.
+        rms_m: of the distances between the positions and the circle, in space.
+        round_s: the time of one round.
+    """
+
+    radius_m: float
+    rms_m: float
+    round_s: float
+
+
+def fit_circle(t_ns: Array, positions: Array) -> Circle:
+    """Fit a circle in space to positions (N, 3) at times (N,): a plane, then a linear fit in it (Kasa)."""
+    centre = positions.mean(0)
+    _, _, axes = np.linalg.svd(positions - centre)
+    u, v, height = ((positions - centre) @ axes.T).T
+    A = np.column_stack([2 * u, 2 * v, np.ones(len(u))])
+    a, b, c = np.linalg.lstsq(A, u**2 + v**2, rcond=None)[0]
+    radius = float(np.sqrt(c + a**2 + b**2))
+    off = np.hypot(np.hypot(u - a, v - b) - radius, height)
+    angle = np.unwrap(np.arctan2(v - b, u - a))
+    rate = np.polyfit((t_ns - t_ns[0]) * 1e-9, angle, 1)[0]
+    return Circle(radius, float(np.sqrt(np.mean(off**2))), float(2 * np.pi / abs(rate)))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a first arena achieved.
+
+    Attributes:
+        calibration: the page's sentence about it.
+        expected_mm: the largest error that the calibration states.
+        circle: through the positions that the program printed while the robot drove.
+        n_poses: their number.
+    """
+
+    calibration: str
+    expected_mm: float
+    circle: Circle
+    n_poses: int
+
+
+def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]) -> Outcome:
+    """Do all steps of the operator in the page of a running arena, then run the page's program.
+
+    Args:
+        arena: its two commands run.
+        folder: as of the arena.
+        picture: called with the page and the name of each step that the documentation shows.
+    """
+    with arena.browsing() as page:
+        operator = Operator(page, lambda name: picture(page, name))
+        operator.check_cameras()
+        calibration = operator.calibrate()
+        operator.define_robot("rover")
+        code = operator.program()
+        t_ns, positions = driven(*read_poses(arena.run_program(code, N_POSES)))
+        picture(page, "status")
+    rig = load_rig(folder / "lab" / "rig.yaml")
+    return Outcome(
+        calibration, rig.calibration["expected_mm"]["worst"], fit_circle(t_ns, positions), len(t_ns)
+    )
+
+
+def driven(t_ns: Array, positions: Array) -> tuple[Array, Array]:
+    """The poses since the robot left the place where it stood."""
+    moving = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > STOOD_M)
+    assert len(moving), "the robot did not move"
+    return t_ns[moving[0] :], positions[moving[0] :]

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Runs `roundel` commands as processes, and reads what they print."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.waiting import wait_for
+
+MAIN = "from web.roundel.command import main; main()"
+
+
+def roundel_command(*words: object) -> list[str]:
+    """The command line of a `roundel` command with this Python."""
+    return [sys.executable, "-P", "-c", MAIN, *map(str, words)]
+
+
+class Program:
+    """A running program and the lines that it printed so far."""
+
+    def __init__(self, command: Sequence[str], folder: Path) -> None:
+        env = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        self.process = subprocess.Popen(
+            command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line)
+
+    def until(self, pattern: str) -> str:
+        """Wait for a line that matches, and return it."""
+
+        def find() -> str | None:
+            assert self.process.poll() is None or self._reader.is_alive(), self.text
+            return next((line for line in list(self.lines) if re.search(pattern, line)), None)
+
+        return wait_for(find) or ""
+
+    @property
+    def text(self) -> str:
+        return "".join(self.lines)
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        code = self.process.wait(30)
+        self._reader.join(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+
+def roundel(*words: object, folder: Path, expected: int = 0) -> str:
+    """Run a command to its end; return what it printed."""
+    command = roundel_command(*words)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == expected, done.stdout + done.stderr
+    return done.stdout + done.stderr

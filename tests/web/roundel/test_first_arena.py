@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From four unknown cameras to poses in a program: two commands and clicks in a real browser, and no edited file."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.benchmarks.faults.network import Namespaces, why_not
+from tests.web.browser import CHROMIUM
+from tests.web.roundel.first_arena import CAMERAS, FPS, RADIUS_M, ROUND_S, FirstArena, play, render
+
+
+@pytest.mark.slow  # the recording lasts three minutes
+def test_from_unknown_cameras_to_poses_with_two_commands_and_the_page(tmp_path: Path):
+    """The server with two cameras, and two cameras on another machine, which finds the server by scouting.
+
+    The robot drives on a circle whose radius and duration the poses show. The largest error that the calibration states
+    bounds the radius; the distances of single poses from the circle have noise of their own, half a pixel.
+    """
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed; apt-get install chromium")
+    if reason := why_not():
+        pytest.skip(reason)
+    render(tmp_path / "recording")
+    with Namespaces([CAMERAS]) as network, FirstArena(network, tmp_path / "recording", tmp_path) as arena:
+        outcome = play(arena, tmp_path, lambda page, name: None)
+        assert arena.camera.stop() == 0
+        assert arena.up.stop() == 0
+    assert re.search("found arena 'arena' at tcp/", arena.camera.text)
+    assert abs(outcome.circle.radius_m - RADIUS_M) < 1e-3 * outcome.expected_mm
+    assert outcome.circle.rms_m < 1e-3 * (outcome.expected_mm + PIXEL_MM / 2)
+    assert abs(outcome.circle.round_s - ROUND_S) < 0.01 * ROUND_S
+    lab = tmp_path / "lab"
+    assert {path.stem for path in (lab / "cameras").glob("*.yaml")} == set(FPS)
+    assert list(yaml.safe_load((lab / "robots.yaml").read_text())["robots"]) == ["rover"]
+
+
+PIXEL_MM = 1e3 * 3.0 / 565.0  # at 3 m

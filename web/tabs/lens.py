@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The lens of one camera: its state, and its calibration with a board; `roundel calibrate intrinsics --live` does so
+in a terminal."""
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import takewhile
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+
+from calib.intrinsics.board import make_finder
+from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
+from calib.intrinsics.calibrated_lens import CalibratedLens
+from calib.intrinsics.guided_capture import CaptureProgress, capture_views
+from calib.intrinsics.images import take_snapshots
+from calib.intrinsics.residual_plot import draw_residuals
+from calib.rig.coverage import Coverage
+from calib.rig.rig import Rig
+from web.errors import WebError
+from web.feed import ArenaState
+from web.html_tables import COLOURS, MARGIN_PX, small
+from web.subscription import Subscription
+from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.widgets import ActionButton, Answer, LongAction, set_content, set_property
+
+BOARD = "charuco:5x7:0.035"  # of `roundel print board`
+MODELS = ("pinhole", "fisheye")
+CAPTURE_S = 180.0
+CLOSE_S = 5.0
+CORNERS_PER_SHADE, SHADES = 8, 4  # of a cell, by the logarithm of its number of corners
+LABELS = ("Calibrate the lens with a board", "End, and calibrate")
+BOARD_HINT = (
+    "charuco:COLUMNSxROWS:SQUARE_M as roundel print board writes it, or chessboard:COLUMNSxROWS:SQUARE_M"
+)
+
+
+class LensPanel:
+    """The folder "Lens" of the selected camera.
+
+    Args:
+        gui: where the controls are added.
+        subscription: connected to the arena.
+        files: the rig in which the lens is saved.
+        camera: returns the name of the selected camera.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        subscription: Subscription,
+        files: CalibrationFiles,
+        camera: Callable[[], str],
+    ) -> None:
+        self._gui, self._subscription, self._files, self._camera = gui, subscription, files, camera
+        self._candidate: tuple[str, CalibratedLens] | None = None
+        self._folder = gui.add_folder("Lens")
+        with self._folder:
+            self._state = gui.add_html("")
+            self._board = gui.add_text("Board", BOARD, hint=BOARD_HINT)
+            self._model = gui.add_dropdown("Model", MODELS, hint="fisheye for lenses beyond 120 degrees")
+            self._answer = answer = Answer(gui)
+            self._capture = LongAction(gui, LABELS, self._calibrate, answer)
+            self._cells = gui.add_html("")
+            self._accept = ActionButton(gui, "Accept the lens", self.accept, answer)
+            self._discard = ActionButton(gui, "Discard it", self.discard, answer)
+        self._residuals: viser.GuiImageHandle | None = None
+
+    def update(self, state: ArenaState) -> None:
+        """Show the lens of the selected camera, and enable the buttons that can act."""
+        name = self._camera()
+        set_content(self._state, small(describe_lens(state.rig, name)))
+        self._capture.show(enabled=name in state.cameras)
+        is_ready = self._candidate is not None and not self._capture.is_running
+        for handle in (self._accept.handle, self._discard.handle):
+            set_property(handle, "visible", is_ready)
+        self._accept.show(enabled=is_ready, primary=is_ready)
+        self._discard.show(enabled=is_ready)
+
+    def accept(self) -> str:
+        """Write the lens into the rig, and have the server use it; the camera's pose becomes void.
+
+        Raises:
+            WebError: there is none.
+            CalibrationError, ConfigError: the rig can't be read or written.
+        """
+        if self._candidate is None:
+            raise WebError("there is no lens to accept; calibrate it with a board first")
+        name, lens = self._candidate
+        provenance = {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": "the page",
+            "board": str(self._board.value),
+        }
+        rig = merge_lenses(current_rig(self._subscription, self._files), {name: lens}, provenance)
+        outcome = apply_rig(self._subscription, self._files, rig)
+        self._forget()
+        return f"the lens of {name}: {outcome}; its pose is void: record a wand session in Calibrate"
+
+    def discard(self) -> str:
+        """Forget the lens that was calibrated."""
+        self._forget()
+        return "discarded"
+
+    def close(self) -> None:
+        """End a capture."""
+        self._capture.close(CLOSE_S)
+
+    def _forget(self) -> None:
+        self._candidate = None
+        set_content(self._cells, "")
+        if self._residuals is not None:
+            self._residuals.remove()
+            self._residuals = None
+
+    def _calibrate(self, end: threading.Event) -> str:
+        """Capture views until they suffice or the user ends it; returns the figures of the lens."""
+        self._forget()
+        name = self._camera()
+        model: Model = "fisheye" if self._model.value == "fisheye" else "pinhole"
+        views = BoardViews(name, make_finder(str(self._board.value)))
+        session, arena = self._subscription.session, self._subscription.feed.keys.arena
+        images = takewhile(lambda _: not end.is_set(), take_snapshots(session, arena, name, CAPTURE_S))
+        reason = capture_views(views, images, model, self._show)
+        if self._capture.is_closed:
+            return ""
+        self._capture.handle.disabled = True
+        self._answer.show(f"{reason}; calibrating")
+        lens = replace(views.solve(model), better_model=views.compare_models(model))
+        self._candidate = name, lens
+        self._show_residuals(name, lens)
+        return summarize_lens(name, lens)
+
+    def _show(self, progress: CaptureProgress) -> None:
+        set_content(self._cells, draw_cells(progress.coverage))
+        self._answer.show(f"{progress.summary}; {progress.figures}; {progress.advice}")
+
+    def _show_residuals(self, name: str, lens: CalibratedLens) -> None:
+        drawn = draw_residuals(name, lens.camera, lens.observed(), lens.residuals())
+        with self._folder:
+            picture = np.ascontiguousarray(cv2.cvtColor(drawn, cv2.COLOR_BGR2RGB), np.uint8)
+            self._residuals = self._gui.add_image(picture, label="residuals", format="jpeg")
+
+
+def draw_cells(coverage: Coverage) -> str:
+    """The cells of the image as HTML, brighter with more corners of the board."""
+    columns = coverage.counts.shape[1]
+    shades = np.minimum(SHADES, np.ceil(np.log2(coverage.counts / CORNERS_PER_SHADE + 1))) / SHADES
+    style = f"display:grid;grid-template-columns:repeat({columns},1fr);gap:2px;margin:4px {MARGIN_PX}px"
+    cells = "".join(
+        f'<div style="height:12px;background:{COLOURS["ok"]}{round(20 + 235 * shade):02x}"></div>'
+        for shade in shades.ravel()
+    )
+    return f'<div title="where the board was seen" style="{style}">{cells}</div>'
+
+
+def summarize_lens(name: str, lens: CalibratedLens) -> str:
+    """The figures of a calibrated lens, its warnings, and what to do."""
+    sigma = float(np.nanmedian(lens.sigma_px))
+    figures = (
+        f"{name}: {len(lens.views)} views, residual {lens.rms_px:.2f} px, projection uncertainty {sigma:.2f} px, "
+        f"board in {lens.coverage.share():.0%} of the image"
+    )
+    rejected = [f"{len(lens.rejected)} views rejected as outliers"] if lens.rejected else []
+    return "; ".join([figures, *rejected, *lens.warnings(), "accept or discard it"])
+
+
+def describe_lens(rig: Rig | None, name: str) -> str:
+    """What is known about a camera's lens. The rig may come from the network: its `calibration` holds anything."""
+    camera = rig.cameras.get(name) if rig is not None else None
+    if rig is None or camera is None:
+        return "no lens yet: the wand calibration starts from a nominal one of 60 degrees; a board is more precise"
+    angle = math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))
+    sigma = f" \N{PLUS-MINUS SIGN} {camera.lens_sigma[0]:.1f}" if camera.lens_sigma else ""
+    text = f"{camera.model}, focal length {camera.fx:.1f}{sigma} px"
+    text += f", {angle:.0f} degrees wide" if camera.model == "pinhole" else ""
+    return f"{text}; {_origin(rig.calibration, name)}"
+
+
+def _origin(calibration: dict[str, Any], name: str) -> str:
+    lenses = calibration.get("lenses")
+    entry = lenses.get(name) if isinstance(lenses, dict) else None
+    if not isinstance(entry, dict):
+        return "not calibrated with a board"
+    date, residual = str(entry.get("date", ""))[:10], entry.get("residual_px")
+    figure = f", residual {residual:.2f} px" if isinstance(residual, float) else ""
+    return f"calibrated with a board{f' on {date}' if date else ''}{figure}"

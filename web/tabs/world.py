@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fixes the floor, the origin and the axes from the page; `roundel calibrate world` does so in a terminal."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import viser
+
+from calib.live.collect import collect_frames
+from calib.rig.rig import Rig
+from calib.world.alignment import WorldChange, align_to_roundels, name_markers
+from calib.world.world_frame import is_collinear
+from camera_node.config import example_file, load_yaml
+from camera_node.geometry.body import Body
+from web.errors import WebError
+from web.feed import ArenaState
+from web.scene.surroundings import WorldPreview
+from web.subscription import Subscription
+from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.widgets import ActionButton, Answer
+
+COLLECT_S = 3.0
+STANDING, L_FRAME = "wand, upright at the origin", "L-frame, flat on the floor"
+L_FILE = "l.yaml"  # beside the wand's file; the example of the package unless it exists
+MEASURE_HINT = "detects the roundels for 3 s; nothing moves until you accept"
+
+
+class WorldPanel:
+    """The folder "Floor and origin": measures the new world, shows it in the scene, and has the server use it."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        subscription: Subscription,
+        files: CalibrationFiles,
+        collect_s: float = COLLECT_S,
+    ) -> None:
+        self._subscription, self._files, self._collect_s = subscription, files, collect_s
+        self._before: Rig | None = None
+        self._change: WorldChange | None = None
+        gui = server.gui
+        with gui.add_folder("Floor and origin", expand_by_default=False):
+            self._by = gui.add_dropdown("By", (STANDING, L_FRAME))
+            self._foot = gui.add_number(
+                "Lowest roundel, m",
+                0.0,
+                min=-1.0,
+                max=5.0,
+                step=0.001,
+                hint="of the standing wand: height of its centre above the floor",
+            )
+            answer = Answer(gui)
+            self._measure = ActionButton(gui, "Measure", self.measure, answer, MEASURE_HINT)
+            self._accept = ActionButton(gui, "Accept the new world", self.accept, answer)
+            self._discard = ActionButton(gui, "Discard it", self.discard, answer)
+        self._preview = WorldPreview(server.scene)
+
+    def update(self, state: ArenaState) -> None:
+        """Enable the buttons that can act; a rig that changed meanwhile voids the measurement."""
+        if self._change is not None and state.rig is not None and state.rig is not self._before:
+            self._forget()
+        placed = state.rig is not None and bool(state.rig.placed())
+        self._measure.show(enabled=placed and bool(state.cameras))
+        is_ready = self._change is not None
+        self._accept.show(enabled=is_ready, primary=is_ready)
+        self._discard.show(enabled=is_ready)
+
+    def measure(self) -> str:
+        """Measure the new world, and show its axes and floor in the present one.
+
+        Raises:
+            CalibrationError: no camera sends, or the roundels do not fix a world.
+            ConfigError: the file of the wand or of the L-frame is invalid.
+        """
+        rig = current_rig(self._subscription, self._files)
+        rig.require_placed(self._files.rig)
+        body = load_yaml(self._body_file(), Body)
+        standing = self._by.value == STANDING
+        if standing and not (len(body.markers) > 1 and is_collinear(body.points)):
+            raise WebError(
+                f"{self._files.wand} is not a straight wand with two or more roundels: use an L-frame"
+            )
+        session, arena = self._subscription.session, self._subscription.feed.keys.arena
+        collected, _ = collect_frames(session, arena, self._collect_s, lambda *_: "")
+        foot_m = float(self._foot.value) if standing else None
+        change = align_to_roundels(rig, name_markers(body), collected.messages, foot_m)
+        self._before, self._change = rig, change
+        self._preview.draw(change.origin_in(rig))
+        missed = f"; not used: roundel {', '.join(change.missing)}" if change.missing else ""
+        worst = 1e3 * max(change.distances.values(), default=0.0)
+        fit = f"; roundels within {worst:.1f} mm of their places" if change.distances else ""
+        return f"the new axes and floor are in the scene{fit}{missed}: accept or discard them"
+
+    def accept(self) -> str:
+        """Write the moved rig, and have the server use it. Raises WebError without a measurement."""
+        if self._change is None:
+            raise WebError("there is no measurement to accept; measure first")
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        misses = {name: round(1e3 * distance, 2) for name, distance in self._change.distances.items()}
+        world = {"date": now, "command": "the page", "misses_mm": misses}
+        rig = self._change.rig
+        rig = msgspec.structs.replace(rig, calibration={**rig.calibration, "world": world})
+        outcome = apply_rig(self._subscription, self._files, rig)
+        self._forget()
+        return f"the new world is {outcome}"
+
+    def discard(self) -> str:
+        """Forget the measurement."""
+        self._forget()
+        return "discarded"
+
+    def _forget(self) -> None:
+        self._change = self._before = None
+        self._preview.draw(None)
+
+    def _body_file(self) -> Path:
+        if self._by.value == STANDING:
+            return self._files.wand
+        own = self._files.wand.with_name(L_FILE)
+        return own if own.exists() else example_file(L_FILE)
