@@ -118,10 +118,10 @@ def test_standard_deviations_of_a_lens_are_read_and_checked():
 def test_widened_priors_make_the_covariance_of_changed_lenses_right():
     """Lenses 2.5 times as far off as their files say, which the recording does not show: covariances are too small
     until the priors are 2.5 times as wide."""
-    changed = tuple(2.5 * value for value in CAREFUL)
+    focal, centre_px, k1 = (2.5 * value for value in CAREFUL)
     narrow, wide, degrees = 0.0, 0.0, 0
     for seed in SEEDS:
-        rig = widen_lenses(roughly(recorded(seed).intrinsics, changed, True, seed), 1 / 2.5)
+        rig = widen_lenses(roughly(recorded(seed).intrinsics, (focal, centre_px, k1), True, seed), 1 / 2.5)
         for factor in (1.0, 2.5):
             result = calibrate(widen_lenses(rig, factor), WandScenario().wand, recorded(seed).messages)
             squared, more = joint_error(result, recorded(seed).truth)
