@@ -20,7 +20,7 @@ FLAT = {"web"}  # a program that has one folder for all its modules
 COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/arrays.py defines them
 
 # Commands of the command line: tyro turns each parameter into an option, so a function may have more of them.
-COMMANDS = {"define", "record", "run"}
+COMMANDS = {"define", "record", "ros2", "run"}
 
 
 def sources(*folders: str) -> list[Path]:

@@ -14,7 +14,7 @@ from camera_node.command_line import parse
 from camera_node.config import example_file
 from camera_node.errors import run
 from camera_node.logs import set_up_logging
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
 from web.feed import Feed
 from web.replay import RecordingPlayer
@@ -65,12 +65,9 @@ class Options:
 
 def show_live(options: Options, stop: threading.Event) -> None:
     """Show a running arena until `stop` is set."""
-    session = open_client(options.connect, options.zenoh)
-    try:
+    with ServerConnection(options.connect, options.zenoh) as connection:
         feed = Feed(options.arena)
-        _show(feed, Subscription(session, feed), options, stop)
-    finally:
-        session.close()
+        _show(feed, Subscription(connection, feed), options, stop)
 
 
 def show_recording(path: Path, options: Options, stop: threading.Event) -> None:

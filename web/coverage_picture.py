@@ -41,6 +41,11 @@ class CoveragePicture:
                 self._mask[np.clip(v + dv, 0, rows - 1), np.clip(u + du, 0, columns - 1)] = True
 
     @property
+    def n_marked(self) -> int:
+        """Number of marked pixels; it grows with each change of the picture."""
+        return int(np.count_nonzero(self._mask))
+
+    @property
     def share(self) -> float:
         """The covered share of the image, 0 to 1, counted in 8 x 8 cells."""
         return self._coverage.share()

@@ -18,7 +18,8 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
 from camera_node.errors import NetworkError
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import SourceSettings
 from camera_node.supervisor import Supervisor, log_path
@@ -127,12 +128,8 @@ class Demo:
     """
 
     def __init__(self, scene_path: Path, path: Path, listen: str | None = None) -> None:
-        self.scene, self.path, self._scene_path, self._listen = (
-            Scene.load(scene_path),
-            path,
-            scene_path,
-            listen,
-        )
+        self.scene, self.path = Scene.load(scene_path), path
+        self._scene_path, self._listen = scene_path, listen
         self._folder = create_folder(path, scene_path, self.scene)
         self._supervisor = Supervisor(self._ended, path, restarts=False)
         self._programs = ArenaPrograms(self._supervisor, self._folder, load_arena(self._folder.config))
@@ -145,12 +142,13 @@ class Demo:
             start = time.monotonic()
             self.endpoint = self._start_server()
             startup_s = time.monotonic() - start
-            self.session = stack.enter_context(open_client([self.endpoint]))
+            connection = stack.enter_context(ServerConnection([self.endpoint]))
+            self.session = connection.session(CONNECT_S)
             # cameras, page and calibration start together
             self.delay_s = start_delay_s(len(self.scene.cameras) + 2, startup_s)
             self.clock = SceneClock(self.scene, time.time_ns() + round(self.delay_s * 1e9))
             self.feed = Feed(ARENA, self._add_to_score)
-            stack.callback(Subscription(self.session, self.feed).close)
+            stack.callback(Subscription(connection, self.feed).close)
             self._reporter = ProgressReporter(self.session, ARENA, self.clock)
             self._stack = stack.pop_all()
         return self

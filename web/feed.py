@@ -15,6 +15,7 @@ import msgspec
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
+from camera_node.protocol.relative import RelativePositions
 from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage_picture import CoveragePicture
@@ -25,6 +26,8 @@ MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones 
 REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
 REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
 MAX_RIGS = 20  # in the history
+MAX_PENDING = 1024  # keys whose latest message is not decoded yet
+COVERAGE_S = 0.1  # shortest time between two frames of a camera that extend its coverage
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
 
 
@@ -47,6 +50,7 @@ class ArenaState:
     previews: dict[str, TimedMessage] = field(default_factory=dict)  # picture of each camera
     detections: dict[str, Detections] = field(default_factory=dict)  # latest of each camera
     coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
+    relative: dict[str, TimedMessage] = field(default_factory=dict)  # what each camera locates by itself
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
@@ -67,11 +71,21 @@ class ArenaState:
         return self.now_s - timed.received_s if timed else math.inf
 
 
+@dataclass(frozen=True, slots=True)
+class PendingMessage:
+    """A message that is not decoded yet, its key expression and its time of arrival."""
+
+    key_expr: str
+    data: bytes
+    received_s: float
+
+
 class Feed:
     """Decodes the messages of an arena and stores the latest of each kind.
 
     Messages arrive through `receive`, from Zenoh (`web.subscription`) or from a recording (`web.replay`). Invalid
-    messages are counted in `ArenaState.faults` and have no other effect. All methods are thread-safe.
+    messages are counted in `ArenaState.faults` and have no other effect. Poses, markers and detections arrive far more
+    often than they are drawn: of each key, only the latest message is decoded, by `state`. All methods are thread-safe.
     """
 
     def __init__(
@@ -84,20 +98,27 @@ class Feed:
 
         Args:
             arena: name of the arena, the first part of its Zenoh keys.
-            on_pose: is called with each valid pose, in the thread that calls `receive`.
+            on_pose: is called with each valid pose, in the thread that calls `receive`; each pose is decoded then.
             clock: returns seconds. The clock of a recording may stand still.
         """
         self.keys = Keys(arena)
         self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
         self._state = ArenaState(started_s=clock())
+        self._received_s = 0.0  # of the message that is being stored
+        self._pending: dict[str, PendingMessage] = {}  # by key
+        self._covered_s: dict[str, float] = {}  # when each camera's coverage was extended last
         keys = self.keys
+        self._deferred = {keys.markers, keys.detections()} | (
+            {keys.robot_pose()} if on_pose is None else set()
+        )
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
             keys.robot_pose(): (RobotPose, self._store_pose),
             keys.markers: (Markers, self._store_as("markers")),
             keys.fusion_status: (FusionStatus, self._store_status),
             keys.camera_status(): (CameraStatus, self._store_camera_status),
             keys.detections(): (Detections, self._add_coverage),
+            keys.relative(): (RelativePositions, self._store_relative),
             keys.preview(): (Preview, self._store_preview),
             keys.rig: (RigMessage, self._store_rig),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
@@ -110,10 +131,24 @@ class Feed:
 
     def receive(self, key_expr: str, key: str, data: bytes) -> None:
         """Store a message; `key_expr` is the one of `key_exprs` that includes its `key`."""
-        kind, store = self._kinds[key_expr]
+        if key_expr not in self._deferred:
+            self._decode(key, PendingMessage(key_expr, data, self._clock()))
+            return
+        camera = self.keys.camera_in(key)
+        with self._lock:
+            if key not in self._pending and len(self._pending) >= MAX_PENDING:
+                self.count_fault(f"more than {MAX_PENDING} keys")
+                return
+            self._pending[key] = PendingMessage(key_expr, data, self._clock())
+            if camera in self._state.detections:
+                self._state.message_counts[f"frames {camera}"] += 1
+
+    def _decode(self, key: str, pending: PendingMessage) -> None:
+        kind, store = self._kinds[pending.key_expr]
         try:
-            message = decode(data, kind)
+            message = decode(pending.data, kind)
             with self._lock:
+                self._received_s = pending.received_s
                 store(message, key)
                 self._state.message_counts[kind.__name__] += 1
         except MessageError as error:
@@ -125,6 +160,9 @@ class Feed:
     def state(self) -> ArenaState:
         """Return a copy of the state, which later messages do not change."""
         with self._lock:
+            pending, self._pending = self._pending, {}
+            for key, message in pending.items():
+                self._decode(key, message)
             copies = {name: getattr(self._state, name).copy() for name in _CONTAINERS}
             return replace(self._state, now_s=self._clock(), **copies)
 
@@ -137,6 +175,7 @@ class Feed:
         """Discard all messages; fault counts and the server's presence remain."""
         with self._lock:
             old = self._state
+            self._pending, self._covered_s = {}, {}
             self._state = ArenaState(
                 started_s=old.started_s, server_alive=old.server_alive, faults=old.faults
             )
@@ -148,7 +187,7 @@ class Feed:
             faults[reason if reason in faults or len(faults) < MAX_REASONS else "others"] += 1
 
     def _store_as(self, name: str) -> Callable[[msgspec.Struct, str], None]:
-        return lambda message, key: setattr(self._state, name, TimedMessage(message, self._clock()))
+        return lambda message, key: setattr(self._state, name, TimedMessage(message, self._received_s))
 
     def _store_pose(self, pose: RobotPose, key: str) -> None:
         self._store_named(self._state.poses, pose.robot, pose, key)
@@ -157,7 +196,7 @@ class Feed:
 
     def _store_status(self, status: FusionStatus, key: str) -> None:
         state = self._state
-        state.status = TimedMessage(status, self._clock())
+        state.status = TimedMessage(status, self._received_s)
         for robot in (
             state.poses.keys() - status.robots.keys() - status.not_acquired.keys()
         ):  # renamed or removed, unless it is new
@@ -174,15 +213,22 @@ class Feed:
     def _store_preview(self, preview: Preview, key: str) -> None:
         self._store_named(self._state.previews, preview.camera, preview, key)
 
+    def _store_relative(self, message: RelativePositions, key: str) -> None:
+        self._store_named(self._state.relative, message.camera, message, key)
+
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
         _check_name(self._state.coverage, camera, key)
+        if camera not in self._state.detections:  # later frames are counted when they arrive
+            self._state.message_counts[f"frames {camera}"] += 1
+        self._state.detections[camera] = detections
         picture = self._state.coverage.get(camera)
         if picture is None or picture.size != size:
             picture = self._state.coverage[camera] = CoveragePicture(*size)
+        elif self._received_s - self._covered_s.get(camera, -math.inf) < COVERAGE_S:
+            return
+        self._covered_s[camera] = self._received_s
         picture.add(detections)
-        self._state.detections[camera] = detections
-        self._state.message_counts[f"frames {camera}"] += 1
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
         state = self._state
@@ -194,10 +240,19 @@ class Feed:
         self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str
     ) -> None:
         _check_name(messages, name, key)
-        messages[name] = TimedMessage(message, self._clock())
+        messages[name] = TimedMessage(message, self._received_s)
 
 
-_CONTAINERS = ("poses", "cameras", "previews", "detections", "coverage", "message_counts", "faults")
+_CONTAINERS = (
+    "poses",
+    "cameras",
+    "previews",
+    "relative",
+    "detections",
+    "coverage",
+    "message_counts",
+    "faults",
+)
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from web.feed import Feed
 from web.replay import RecordingPlayer
+from web.scene.coverage import CoverageVolume
 from web.subscription import Subscription
 from web.tabs.calibrate import RigHistory
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
@@ -44,6 +45,7 @@ def add_live_page(
     view.add(header)
     with header.tabs["Cameras"]:
         view.add(CameraTable(gui))
+        view.add(CoverageVolume(view.server, view.feed.count_fault))
         pictures = LivePictures(view.server, subscription, view.cameras)
         closing.callback(pictures.close)
         view.add(pictures, is_live=True)

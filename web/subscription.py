@@ -4,13 +4,15 @@
 import contextlib
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, undo_rig
+from calib.live.rig_requests import redo_rig, request_rig_message, undo_rig
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
@@ -25,40 +27,38 @@ RIG_TIMEOUT_S = 5.0
 
 
 class Subscription:
-    """Subscribes a feed to all keys that it decodes. `close` ends the subscription; the session stays open."""
+    """Subscribes a feed to all keys that it decodes, as soon as the connection is open.
 
-    def __init__(self, session: zenoh.Session, feed: Feed) -> None:
-        self.session, self.feed = session, feed
-        keys = feed.keys
+    `close` ends the subscription; the connection stays open. A request raises NetworkError while no server answers.
+    """
+
+    def __init__(self, connection: ServerConnection, feed: Feed) -> None:
+        self.connection, self.feed = connection, feed
         self._lock = threading.Lock()
+        self._entities: list[Any] = []
         self._previews: zenoh.Subscriber | None = None
-        self._closed = False
+        self._watched, self._closed = False, False
         self._rig_requests = RateLimit(RIG_REQUESTS_HZ, 2.0)
-        self._entities: list[Any] = [self._subscribe(key_expr) for key_expr in feed.key_exprs]
-        self._entities += [
-            # The liveliness token may arrive before the rig's queryable exists, and a published rig may be dropped
-            # under congestion: each status of another rig asks again.
-            session.declare_subscriber(keys.fusion_status, guarded("a status", self._request_new_rig)),
-            session.liveliness().declare_subscriber(
-                keys.fusion_alive, guarded("the server's token", self._server_changed), history=True
-            ),
-        ]
+        connection.when_open(self._declare)
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session, for requests. Raises NetworkError while no server answers."""
+        return self.connection.session(REQUEST_TIMEOUT_S)
 
     def close(self) -> None:
         """End the subscription."""
-        self.watch_previews(False)
-        self._closed = True
-        for entity in self._entities:
+        with self._lock:
+            self._closed = True
+            entities = [*self._entities, *([self._previews] if self._previews else [])]
+            self._entities, self._previews = [], None
+        for entity in entities:
             entity.undeclare()
 
     def watch_previews(self, watched: bool) -> None:
         """Subscribe to the cameras' small pictures or not: the cameras send them only while someone subscribes."""
-        with self._lock:
-            if watched and self._previews is None and not self._closed:
-                self._previews = self._subscribe(self.feed.keys.preview())
-            elif not watched and self._previews is not None:
-                self._previews.undeclare()
-                self._previews = None
+        self._watched = watched
+        self.connection.when_open(self._follow_previews)
 
     def change_settings(self, camera: str, wanted: Settings | None = None) -> Settings:
         """Change settings of a camera, or none, and return those in use; raises as `request_settings`."""
@@ -109,31 +109,56 @@ class Subscription:
         redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
         return "the undone rig is in force on the server again"
 
-    def _subscribe(self, key_expr: str) -> zenoh.Subscriber:
+    def _declare(self, session: zenoh.Session) -> None:
+        keys = self.feed.keys
+        with self._lock:
+            if self._closed:
+                return
+            self._entities = [self._subscribe(session, key_expr) for key_expr in self.feed.key_exprs]
+            # The liveliness token may arrive before the rig's queryable exists, and a published rig may be dropped
+            # under congestion: each status of another rig asks again.
+            receive_status = guarded("a status", partial(self._request_new_rig, session))
+            receive_token = guarded("the server's token", partial(self._server_changed, session))
+            self._entities += [
+                session.declare_subscriber(keys.fusion_status, receive_status),
+                session.liveliness().declare_subscriber(keys.fusion_alive, receive_token, history=True),
+            ]
+
+    def _follow_previews(self, session: zenoh.Session) -> None:
+        with self._lock:
+            if self._watched and self._previews is None and not self._closed:
+                self._previews = self._subscribe(session, self.feed.keys.preview())
+            elif not self._watched and self._previews is not None:
+                self._previews.undeclare()
+                self._previews = None
+
+    def _subscribe(self, session: zenoh.Session, key_expr: str) -> zenoh.Subscriber:
         def receive(sample: zenoh.Sample) -> None:
             self.feed.receive(key_expr, str(sample.key_expr), sample.payload.to_bytes())
 
-        return self.session.declare_subscriber(key_expr, guarded("a message", receive))
+        return session.declare_subscriber(key_expr, guarded("a message", receive))
 
-    def _server_changed(self, sample: zenoh.Sample) -> None:
+    def _server_changed(self, session: zenoh.Session, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         self.feed.set_server_alive(alive)
         if alive:
-            self._request_rig()
+            self._request_rig(session)
 
-    def _request_new_rig(self, sample: zenoh.Sample) -> None:
+    def _request_new_rig(self, session: zenoh.Session, sample: zenoh.Sample) -> None:
         with contextlib.suppress(MessageError):
             t_ns = decode(sample.payload.to_bytes(), FusionStatus).rig_t_ns
             if t_ns is not None and t_ns != self.feed.state().rig_t_ns:
-                self._request_rig()
+                self._request_rig(session)
 
-    def _request_rig(self) -> None:
+    def _request_rig(self, session: zenoh.Session) -> None:
         key = self.feed.keys.rig
         if not self._rig_requests.passes():
             return
 
-        def receive(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                self.feed.receive(key, key, reply.ok.payload.to_bytes())
+        def request(arena: str) -> None:
+            if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
+                self.feed.receive(key, key, data)
 
-        self.session.get(key, guarded("a rig", receive), timeout=RIG_TIMEOUT_S)
+        # In a thread: Zenoh's thread, which calls this method, must not wait for replies.
+        request_rig = guarded("a request for the rig", request)
+        threading.Thread(target=request_rig, args=[self.feed.keys.arena], name="rig", daemon=True).start()

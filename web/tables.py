@@ -146,6 +146,8 @@ def _advise(own_advice: str, health: CameraHealth | None) -> str:
         return "not calibrated"
     if health is not None and health.excluded:
         return "moved: excluded until it is recalibrated"
+    if health is not None and health.frozen:
+        return "repeats an old image: excluded until it delivers new ones"
     if health is not None and health.clock == "excluded":
         return "its stamps jumped: excluded until they are corrected"
     if health is not None and health.clock == "corrected":

@@ -14,7 +14,7 @@ from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.requests import RequestError
 from camera_node.protocol.server_address import LOCAL, ServerAddress
-from camera_node.protocol.session import open_client, open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 
@@ -39,7 +39,7 @@ class Connection(ServerAddress):
             NetworkError: no server answers in time.
         """
         try:
-            with open_requester(self.connect, self.zenoh) as session:
+            with open_client(self.connect, self.zenoh) as session:
                 in_force = set_rig(session, self.arena, rig, program)
         except RequestError as error:
             raise RequestError(f"the rig in {file} is not in force; the server refuses it: {error}") from None

@@ -12,9 +12,9 @@ import tyro
 from calib.commands.output import check_folder
 from calib.plan.camera_kind import CameraKind, PlannedCamera
 from calib.plan.catalogue import CATALOGUE
-from calib.plan.description import MAX_CAMERAS, Plan, PlannedRobots, Suggestion
+from calib.plan.description import MAX_CAMERAS, Plan, Suggestion
 from calib.plan.placement import PlacementProblem, SuggestedPlaces, suggest_placement
-from calib.plan.planner import PlannedArena, evaluate
+from calib.plan.planner import PlannedArena, evaluate, plan_around
 from calib.plan.report import check_report, write_report
 from calib.plan.summary import describe, summarize
 from calib.rig.camera import Camera
@@ -22,8 +22,6 @@ from calib.rig.rig import load_rig
 from camera_node.config import dump_yaml, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.terminal import progress_bar, say
-
-DIAMETER_M = 0.09  # of the roundels that `roundel print` prints by default
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,16 +63,20 @@ class PlanArena:
     def _arena(self) -> PlannedArena:
         """The cameras to evaluate: suggested, calibrated, or those of the plan."""
         rig = {} if self.rig is None else load_rig(self.rig).require_placed(self.rig)
-        plan = plan_around(rig) if self.plan is None else load_yaml(self.plan, Plan)
+        plan = self._plan_of_rig(rig) if self.plan is None else load_yaml(self.plan, Plan)
         if self.suggest is not None:
             return self._suggest(plan, self.suggest)
         if rig:
-            first = next(iter(rig.values()))
-            kind = CameraKind(width=first.width, height=first.height, focal_px=first.fx)
-            return PlannedArena.of_cameras(plan, rig, kind)
+            return PlannedArena.of_rig(rig, plan)
         if not plan.cameras:
             raise ConfigError(f"{self.plan} names no cameras; add them, or let --suggest N place them")
         return PlannedArena.of(plan)
+
+    def _plan_of_rig(self, rig: dict[str, Camera]) -> Plan:
+        try:
+            return plan_around(rig)
+        except ValueError as error:
+            raise ConfigError(f"{self.rig}: {error}; give a plan with its own area_m") from None
 
     def _suggest(self, plan: Plan, count: int) -> PlannedArena:
         kind = (plan.suggest or _suggestion_like(plan, self.plan)).camera
@@ -107,20 +109,6 @@ class PlanArena:
     def _note(self, text: str) -> None:
         if not self.json:
             say(text)
-
-
-def plan_around(rig: dict[str, Camera]) -> Plan:
-    """A plan for the floor under the cameras of a rig, with robots that carry one printed roundel each."""
-    centres = np.array([camera.matrix()[:3, 3] for camera in rig.values()])
-    low, high = centres.min(axis=0), centres.max(axis=0)
-    middle = (low + high) / 2
-    half = np.maximum(high - low, 1.0) / 2
-    (x0, y0), (x1, y1) = (middle - half)[:2].tolist(), (middle + half)[:2].tolist()
-    return Plan(
-        area_m=(x0, y0, x1, y1),
-        ceiling_m=max(float(high[2]), 0.2),
-        robots=PlannedRobots(diameter_m=DIAMETER_M),
-    )
 
 
 def planned_cameras(placement: SuggestedPlaces, kind: CameraKind) -> dict[str, PlannedCamera]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.plan.camera_kind import CameraKind
-from calib.plan.description import Plan
+from calib.plan.description import MAX_ROOM_M, Plan, PlannedRobots
 from calib.plan.network import NetworkLoad, network_load
 from calib.plan.precision import ExpectedErrors, Uncertainty, combine_views, expected_errors
 from calib.plan.views import RoundelSensor
@@ -21,6 +21,8 @@ from camera_node.sensor_model.operational_space import OperationalSpace, operati
 from camera_node.sensor_model.threshold import threshold_D
 
 POINTS = 6000  # of the volume, about
+DIAMETER_M = 0.09  # of the roundels that `roundel print` prints by default
+LOW_M = 0.1  # height of the roundels of a ground robot
 SMALL_REGION = 2e-3  # of the volume; smaller blind spots are not listed
 
 
@@ -38,8 +40,17 @@ class PlannedArena:
         return cls(plan, {name: entry.camera() for name, entry in plan.cameras.items()}, plan.cameras)
 
     @classmethod
+    def of_rig(cls, cameras: Mapping[str, Camera], plan: Plan) -> "PlannedArena":
+        """The calibrated cameras of a rig; its file has neither rates nor exposures, so defaults count."""
+        kinds = {
+            name: CameraKind(width=camera.width, height=camera.height, focal_px=camera.fx, lens=camera.model)
+            for name, camera in cameras.items()
+        }
+        return cls(plan, cameras, kinds)
+
+    @classmethod
     def of_cameras(cls, plan: Plan, cameras: Mapping[str, Camera], kind: CameraKind) -> "PlannedArena":
-        """Cameras of one kind: those of a calibrated rig, or a suggested placement."""
+        """Cameras of one kind, such as a suggested placement."""
         return cls(plan, cameras, dict.fromkeys(cameras, kind))
 
     @property
@@ -125,6 +136,25 @@ class PlanReport:
         """Whether the plan's requirement is met; None without one."""
         required = self.arena.plan.required
         return None if required is None else self.share_within(required.error_mm) >= required.share
+
+
+def plan_around(cameras: Mapping[str, Camera], highest_m: float = LOW_M) -> Plan:
+    """A plan for the space under the cameras of a rig, with robots that carry one printed roundel each.
+
+    Args:
+        cameras: with poses, at least one.
+        highest_m: height up to which roundels are considered, at most four fifths of that of the cameras.
+    """
+    centres = np.array([camera.matrix()[:3, 3] for camera in cameras.values()])
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    middle = (low + high) / 2
+    half = np.maximum(high - low, 1.0) / 2
+    (x0, y0), (x1, y1) = (middle - half)[:2].tolist(), (middle + half)[:2].tolist()
+    ceiling = min(max(float(high[2]), 2 * LOW_M), MAX_ROOM_M)
+    robots = PlannedRobots(
+        diameter_m=DIAMETER_M, heights_m=(LOW_M, max(LOW_M, min(highest_m, 0.8 * ceiling)))
+    )
+    return Plan(area_m=(x0, y0, x1, y1), ceiling_m=ceiling, robots=robots)
 
 
 def evaluate(arena: PlannedArena, points: int = POINTS) -> PlanReport:

@@ -25,6 +25,10 @@ from camera_node.sensor_model.visibility import ImageOfDiscs, is_large_enough, l
 
 MAJOR_PX = np.geomspace(5.0, 400.0, 24)  # full axes of the ellipses in the table
 SLANT = np.linspace(0.08, 0.99, 16)  # minor over major axis
+# The detector finds roundels that the image's border cuts: measured by `python -m tests.benchmarks.plan coverage` and
+# `cut`, down to this distance of the centre from the border, in half extents, and with a standard deviation of the
+# centre that grows as this power of its inverse.
+LEAST_INSET, CUT_EXPONENT = 0.3, 1.3
 NEAR_M = 0.01  # roundels nearer to the camera's plane are not seen
 FOCAL_PX = 1000.0  # of the lens for which the table is computed; the precision in pixels hardly depends on it
 
@@ -86,16 +90,25 @@ class RoundelSensor:
         inside = camera.sees(uv)
         rows, uv, J = rows[inside], uv[inside], J[inside] @ T[:3, :3].T
         directions, axes = _axes(self.pattern.d_o / 2 * J[:, :, :2])
-        detected = self._is_complete(camera, uv, J) & self._is_large_enough(uv, axes)
-        rows, J = rows[detected], J[detected]
+        inset = self._inset(camera, uv, J)
+        detected = (inset >= LEAST_INSET) & self._is_large_enough(uv, axes)
+        rows, J, inset = rows[detected], J[detected], inset[detected]
         directions, axes = directions[detected], axes[detected]
-        noise = (directions * self._table.look_up(axes)[:, None]) @ directions.mT
-        return RoundelView(rows, J, noise, axes)
+        variance = self.centre_variances(axes) * np.minimum(inset, 1.0)[:, None] ** (-2 * CUT_EXPONENT)
+        return RoundelView(rows, J, (directions * variance[:, None]) @ directions.mT, axes)
 
-    def _is_complete(self, camera: Camera, uv: Array, J: Array) -> Mask:
-        """(N,) whether discs with centres uv (N, 2) are completely in the image."""
+    def centre_variances(self, axes_px: Array) -> Array:
+        """(N, 2) variances of the centres of complete ellipses with axes (N, 2), along the major and the minor axis."""
+        return self._table.look_up(axes_px)
+
+    def _inset(self, camera: Camera, uv: Array, J: Array) -> Array:
+        """(N,) distances of the centres uv (N, 2) from the nearest border of the image, in half extents of the discs.
+
+        From 1 on a disc is completely in the image.
+        """
         extent = np.linalg.norm(self.pattern.d_o / 2 * J[:, :, :2], axis=2)
-        return camera.sees(uv - extent) & camera.sees(uv + extent)
+        size = np.array([camera.width, camera.height])
+        return (np.minimum(uv + 0.5, size - 0.5 - uv) / extent).min(axis=1)
 
     def _is_large_enough(self, uv: Array, axes: Array) -> Mask:
         """(N,) whether ellipses with centres and full axes (N, 2) are large enough for the detector."""

@@ -21,7 +21,7 @@ from camera_node.protocol.camera_requests import (
 )
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
 
@@ -30,9 +30,9 @@ class CameraConnection(ServerAddress):
     """Where a camera is reached."""
 
     def open(self) -> Session:
-        """Open a session for requests; raises as `open_requester`."""
+        """Open a session for requests; raises as `open_client`."""
         require_name(self.arena, "an arena")
-        return open_requester(self.connect, self.zenoh)
+        return open_client(self.connect, self.zenoh)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +51,17 @@ class SaveSnapshot:
         """Save the image. Raises NetworkError if the camera does not answer, ConfigError for a bad file name."""
         require_name(self.name, "a camera")
         with self.server.open() as session:
-            data = request_snapshot(session, self.server.arena, self.name, self.draw)
-        try:
-            self.out.write_bytes(data)
-        except OSError as error:
-            raise ConfigError(
-                f"{self.out} can't be written: {error.strerror}; does its folder exist?"
-            ) from None
-        say(f"wrote {self.out}")
+            data = request_snapshot(session, self.server.arena, self.name, "draw" if self.draw else "")
+        save_picture(data, self.out)
+
+
+def save_picture(data: bytes, out: Path) -> None:
+    """Write a picture and say so. Raises ConfigError for a file that can't be written."""
+    try:
+        out.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"{out} can't be written: {error.strerror}; does its folder exist?") from None
+    say(f"wrote {out}")
 
 
 @dataclass(frozen=True, kw_only=True)

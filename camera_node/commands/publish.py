@@ -92,7 +92,8 @@ class Publish:
 
     def _open_session(self) -> "zenoh.Session":
         """Wait for the server, if there is to be one; the service is ready while it waits."""
-        from camera_node.protocol.session import open_router, open_when_reachable
+        from camera_node.protocol.connection import ServerConnection
+        from camera_node.protocol.session import open_router
 
         if self.listen:
             return open_router(self.listen, self.zenoh)
@@ -104,7 +105,7 @@ class Publish:
                 service.report("waits for a server")
                 service.progress()
 
-            session = open_when_reachable(self.connect, self.zenoh, report)
+            session = ServerConnection(self.connect, self.zenoh).wait(report)
             stack.pop_all()  # the service goes on
             return session
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 
 SCOUT_S = 1.5  # scouting repeats its question after 1 s
 CONNECT_S = 2.0  # to one router that was found
@@ -29,7 +29,7 @@ def find_arenas(timeout_s: float = SCOUT_S) -> list[FoundArena]:
     found = []
     for endpoints in _scout(timeout_s):
         try:
-            with open_requester(endpoints, timeout_s=CONNECT_S) as session:
+            with open_client(endpoints, timeout_s=CONNECT_S) as session:
                 replies = session.liveliness().get(ALIVE, timeout=CONNECT_S)
                 tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         except (NetworkError, zenoh.ZError):

@@ -4,10 +4,8 @@
 import json
 import logging
 import re
-import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import zenoh
@@ -17,18 +15,19 @@ from camera_node.errors import AddressError, ConfigError, NetworkError
 log = logging.getLogger("camera_node.network")
 
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
-CONNECT_S = 5.0  # for a server to accept a requester
-WAIT_S = 0.2  # between two looks at whether a session is open
+CONNECT_S = 5.0  # for a server to accept a client
+NO_SERVER = "no server answers at {} within {:g} s; check that roundel server runs there, and check --connect"
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
+# Of Zenoh; it retries endpoints of other protocols as if their host was away.
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|vsock|serial|unixsock-stream|unixpipe)/.+")
 OVER = b"Timeout"  # Zenoh's own error reply
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 OPEN_TIMEOUT_MS = 2000  # of one attempt; `close` waits this long for a listener that is not Zenoh
 LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
 ALWAYS = {
-    "mode": "router",
     "transport/link/tx/lease": LEASE_MS,
     # It maps 16 MB for each program that sends, bypasses access rights of the network, and a killed program leaves it.
     "transport/shared_memory/enabled": False,
@@ -47,7 +46,12 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
         ConfigError: the Zenoh configuration is missing or invalid.
     """
     # With a listening timeout other than 0, opening succeeds although the port is taken.
-    options = {"listen/endpoints": list(listen), "listen/timeout_ms": 0, "listen/exit_on_failure": True}
+    options = {
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "listen/timeout_ms": 0,
+        "listen/exit_on_failure": True,
+    }
     if has_assigned_port(listen):
         options |= {"adminspace/enabled": True, "adminspace/permissions/read": True}
     try:
@@ -84,109 +88,55 @@ def listening_endpoints(router: zenoh.Session, listen: Sequence[str]) -> tuple[s
     )
 
 
-def open_client(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
-    """Open a session that connects to the router as soon as it can, and reconnects after every loss.
-
-    The session is a Zenoh router without listeners. A Zenoh client does not open while no router answers, and a router
-    does not relay the publications of a Zenoh peer to other peers (measured with 1.10). Publications are dropped while
-    the session is not connected. Programs that can wait for a server use `open_when_reachable`.
-
-    Raises:
-        NetworkError: an endpoint is invalid.
-        ConfigError: the Zenoh configuration is missing or invalid.
-    """
-    return _open_connecting(connect, zenoh_config, "router")
-
-
-def open_when_reachable(
-    connect: Sequence[str], zenoh_config: Path | None = None, on_wait: Callable[[], object] = lambda: None
+def open_client(
+    connect: Sequence[str], zenoh_config: Path | None = None, timeout_s: float = CONNECT_S
 ) -> zenoh.Session:
-    """Open a session as a Zenoh client as soon as a server answers; it reconnects after every loss.
+    """Open a session with a server that runs, as a Zenoh client; it reconnects after every loss.
 
-    Sessions of `open_client` are routers, and several whose links were down sometimes stay without routes for good: 5
-    of 42 (measured with 1.10). Of 140 clients none did. Logs the server's absence once; a signal whose handler raises
-    ends the wait.
-
-    Args:
-        connect: endpoints of the server.
-        zenoh_config: a file.
-        on_wait: called again and again during the wait.
+    Publications are dropped while the session is not connected. Programs that may start before the server use
+    `ServerConnection`.
 
     Raises:
-        NetworkError: an endpoint is invalid.
+        NetworkError: an endpoint is invalid, or no server answers within `timeout_s`.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
-    future: Future[zenoh.Session] = Future()
-
-    def open_session() -> None:
-        try:
-            future.set_result(_open_connecting(connect, zenoh_config, "client"))
-        except (NetworkError, ConfigError) as error:
-            future.set_exception(error)
-
-    threading.Thread(target=open_session, daemon=True, name="open Zenoh session").start()
-    since_s, reported = time.monotonic(), False
-    while not wait([future], WAIT_S).done:
-        on_wait()
-        if not reported and time.monotonic() - since_s >= PATIENCE_S:
-            reported = True
-            log.warning(
-                "the server is away: none answers at %s; retrying. Check that it runs and that --connect is right",
-                " ".join(connect),
-            )
-    session = future.result()
-    if reported:
-        log.warning("the server is back")
-    return session
+    limits = {"connect/timeout_ms": round(timeout_s * 1000), "connect/exit_on_failure": True}
+    try:
+        return _open_client(connect, zenoh_config, limits)
+    except zenoh.ZError as error:
+        raise NetworkError(f"{NO_SERVER.format(' '.join(connect), timeout_s)} ({_brief(error)})") from None
 
 
-def _open_connecting(connect: Sequence[str], zenoh_config: Path | None, mode: str) -> zenoh.Session:
+def open_endless(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
+    """As `open_client`, but tries until a server answers: for threads that are daemons.
+
+    Raises:
+        NetworkError: an endpoint is invalid, or a certificate is missing.
+        ConfigError: the Zenoh configuration is missing or invalid.
+    """
+    limits = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+    try:
+        return _open_client(connect, zenoh_config, limits)
+    except zenoh.ZError as error:
+        raise NetworkError(f"can't connect to {' '.join(connect)}: {_brief(error)}") from None
+
+
+def _open_client(
+    connect: Sequence[str], zenoh_config: Path | None, limits: Mapping[str, object]
+) -> zenoh.Session:
+    if invalid := [endpoint for endpoint in connect if not ENDPOINT.fullmatch(endpoint)]:
+        raise NetworkError(f"can't connect to '{invalid[0]}': give an endpoint such as tcp/host:7447")
     options = {
-        "mode": mode,
+        "mode": "client",
         "listen/endpoints": [],
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": -1,  # no limit; 0 is a single attempt
-        "connect/exit_on_failure": False,
         "connect/retry": RETRY,
         "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
         "transport/link/tcp/so_sndbuf": SEND_BUFFER,
         "transport/link/tls/so_sndbuf": SEND_BUFFER,
         "transport/link/tx/queue/size/real_time": 1,  # batches
     }
-    try:
-        return zenoh.open(_config(zenoh_config, options))
-    except zenoh.ZError as error:
-        raise NetworkError(
-            f"can't connect to {' '.join(connect)}: give an endpoint such as tcp/host:7447 ({_brief(error)})"
-        ) from None
-
-
-def open_requester(
-    connect: Sequence[str], zenoh_config: Path | None = None, timeout_s: float = CONNECT_S
-) -> zenoh.Session:
-    """Open a session for requests to a server that runs, as a Zenoh client.
-
-    A session of `open_client` that opens within 0.1 s after another one was closed finds no queryable, ever (measured
-    with 1.10: the routers compute their routes with that delay). A Zenoh client finds all of them at once.
-
-    Raises:
-        NetworkError: an endpoint is invalid, or no server answers within `timeout_s`.
-        ConfigError: the Zenoh configuration is missing or invalid.
-    """
-    options = {
-        "mode": "client",
-        "connect/endpoints": list(connect),
-        "connect/timeout_ms": round(timeout_s * 1000),
-        "connect/exit_on_failure": True,
-        "connect/retry": RETRY,
-    }
-    try:
-        return zenoh.open(_config(zenoh_config, options))
-    except zenoh.ZError as error:
-        raise NetworkError(
-            f"no server answers at {' '.join(connect)} within {timeout_s:g} s; check that roundel server runs there, "
-            f"and check --connect ({_brief(error)})"
-        ) from None
+    return zenoh.open(_config(zenoh_config, {**options, **limits}))
 
 
 def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:

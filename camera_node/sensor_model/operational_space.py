@@ -78,8 +78,8 @@ def farthest_distance(lens: Lens, d_o: float, D: float, phi: float = 0.0, psi: f
 def base_at(lens: Lens, d_o: float, x: float) -> Array:
     """(2,) width and height, metres, of the part of the plane at distance x in which the pattern can be.
 
-    x w / f_x - 2 d_o and x h / f_y - 2 d_o. The paper prints f_x / w and f_y / h, which are not lengths after
-    multiplication by x. Of 2 d_o, one d_o keeps the disc inside the image, the other is a margin.
+    x w / f_x - 2 d_o and x h / f_y - 2 d_o. The paper prints f_x / w and f_y / h, with which a longer focal length
+    would widen the view. Of 2 d_o, one d_o keeps the disc inside the image, the other is a margin.
     """
     image_m = x * np.array([lens.width / lens.fx, lens.height / lens.fy])
     return np.maximum(image_m - 2 * d_o, 0.0)

@@ -133,7 +133,7 @@ def _trace_edge(
     by_turn = np.cross(unit * ratio * radial, by_point)  # g . (w x r) = w . (r x g)
     variance = imaging.blur_px**2 + PIXEL_VARIANCE + (across @ motion[:, :, None])[..., 0] ** 2 / 12
     return _Edge(
-        np.concatenate([by_point, by_turn @ frame[:, :, :2]], axis=-1),
+        np.asarray(np.concatenate([by_point, by_turn @ frame[:, :, :2]], axis=-1), float),
         unit * (by_point * radial).sum(-1),
         np.sqrt(variance),
         speed * 2 * np.pi / EDGE_POINTS,

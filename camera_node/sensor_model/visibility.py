@@ -107,8 +107,9 @@ def is_detected(
 ) -> Mask:
     """Predict which roundels our detector finds in a new image.
 
-    The disc is completely in the image, its printed side is visible, its axes are large enough for its slant and the
-    blur, and it moves by no more than its diameter during the exposure. Nothing occludes it.
+    At most a tenth of the disc's diameter is beyond the image's border, its printed side is visible, its axes are large
+    enough for its slant and the blur, and it moves by no more than three quarters of its diameter during the exposure.
+    Nothing occludes it, and the ground around its card has no more contrast than the print.
 
     Args:
         lens: the camera.
@@ -122,7 +123,8 @@ def is_detected(
     """
     motion_m = None if velocity_mps is None else np.atleast_2d(velocity_mps) * imaging.exposure_s
     image = project_discs(lens, pattern.d_o, position_m, normal, motion_m)
-    visible = (image.slant_rad < np.pi / 2) & is_in_image(lens, pattern.d_o, position_m, normal)
+    needed = (1 - 2 * threshold.CUT_SHARE) * pattern.d_o
+    visible = (image.slant_rad < np.pi / 2) & is_in_image(lens, needed, position_m, normal)
     return visible & is_large_enough(image, imaging)
 
 
@@ -162,7 +164,7 @@ def detection_range(
         low, high = np.flatnonzero(found)[[0, -1]]
         v_min, v_max = float(x[low]), float(x[high])
         nearer, farther = x[max(low - 1, 0)], x[min(high + 1, len(x) - 1)]
-        x = np.append(np.linspace(nearer, v_min, 40), np.linspace(v_max, farther, 40)).astype(float)
+        x = np.asarray([*np.linspace(nearer, v_min, 40), *np.linspace(v_max, farther, 40)], float)
     return v_min, v_max
 
 

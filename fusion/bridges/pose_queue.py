@@ -13,8 +13,8 @@ from typing import Annotated
 
 import tyro
 
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.server_address import ServerAddress
-from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
 
@@ -104,8 +104,7 @@ class PoseServer(ServerAddress):
             NetworkError: an endpoint is invalid.
             ConfigError: the Zenoh configuration is missing or invalid.
         """
-        session = open_client(self.connect, self.zenoh)
-        with Arena(session, self.arena, " ".join(self.connect), robot or "*") as client:
+        with Arena(ServerConnection(self.connect, self.zenoh), self.arena, robot or "*") as client:
             poses = PoseQueue(client)
             try:
                 yield poses

@@ -9,6 +9,7 @@ import hashlib
 import logging
 import re
 import struct
+import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -17,11 +18,13 @@ import zenoh
 
 from camera_node.errors import ConfigError
 from camera_node.logs import about
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
+from camera_node.protocol.relative import RelativePositions
+from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, relative_poses, transforms
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
 NODE = "roundel"
+RELATIVE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 NO_HASH = "TypeHashNotSupported"  # in place of the hash in ROS 2 Humble, which has none
 QOS = "::,10:,:,:,,"  # reliable, volatile, the last ten; everything else is rmw_zenoh's default
 MAX_DOMAIN = 232
@@ -45,6 +48,7 @@ class Ros2Node:
         self._session, self._domain, self._humble = session, domain, humble
         self._namespace = namespace
         self._topics: dict[str, Ros2Topic] = {}
+        self._lock = threading.Lock()  # of the topics: positions arrive in Zenoh's threads
         self._robots: dict[str, str] = {}  # name in ROS -> name in the arena
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
@@ -59,6 +63,13 @@ class Ros2Node:
         if shown:
             self._topic("tf", "tf2_msgs/msg/TFMessage").put(transforms(shown, frame, names))
 
+    def publish_relative(self, message: RelativePositions) -> None:
+        """Publish `<camera>/relative`: one message for each roundel that the camera locates, in its optical frame."""
+        name = ros_name(message.camera)
+        topic = self._topic(f"{self._namespace}/{name}/relative".lstrip("/"), RELATIVE)
+        for data in relative_poses(message, f"{name}_optical_frame"):
+            topic.put(data)
+
     def _has_name(self, robot: str) -> bool:
         """Whether no other robot has its name in ROS; counted otherwise."""
         first = self._robots.setdefault(ros_name(robot), robot)
@@ -67,6 +78,10 @@ class Ros2Node:
         return first == robot
 
     def _topic(self, name: str, kind: str) -> "Ros2Topic":
+        with self._lock:
+            return self._declared(name, kind)
+
+    def _declared(self, name: str, kind: str) -> "Ros2Topic":
         if name not in self._topics:
             log.info("publishes /%s, %s", name, kind, extra=about(name))
             package, _, message = kind.split("/")

@@ -26,10 +26,11 @@ from calib.rig.rig import Rig
 from camera_node.config import require_name
 from camera_node.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from camera_node.protocol.relative import RelativePositions
 from camera_node.protocol.requests import RETRY_S
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_address import LOCAL
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, RobotsRequest
 from fusion.protocol.requests import change_robots, request_robots
@@ -182,28 +183,31 @@ class Arena:
     """A connection to an arena's server. `faults` counts undecodable messages, by kind.
 
     Args:
-        session: an open session; it is closed with the arena.
+        connection: to the server; it is closed with the arena.
         arena: its name.
-        endpoints: of the server, for messages.
         robot: receive the poses of this robot only; "*" for all.
     """
 
-    def __init__(self, session: zenoh.Session, arena: str, endpoints: str, robot: str = "*") -> None:
+    def __init__(self, connection: ServerConnection, arena: str, robot: str = "*") -> None:
         self.keys = Keys(arena)
         self.faults: Counter[str] = Counter()
-        self._session, self._origin = session, f"from arena '{arena}' at {endpoints}"
+        self.connection = connection
+        self._origin = f"from arena '{arena}' at {connection.endpoints}"
         self._lock = threading.Lock()
         self._robots: dict[str, RobotStream] = {}
         self._streams: dict[str, Stream] = {}
         self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
         self._known: set[str] = set()
-        poses = session.declare_subscriber(self.keys.robot_pose(robot), guarded("a pose", self._take_pose))
-        self._subscribers: list[Any] = [poses]
+        self._subscribe(self.keys.robot_pose(robot), guarded("a pose", self._take_pose))
 
     @property
     def session(self) -> zenoh.Session:
-        """The Zenoh session, for what this class does not offer; it is closed with the arena."""
-        return self._session
+        """The Zenoh session, for what this class does not offer; it is closed with the arena.
+
+        Raises:
+            NetworkError: no server answers in time.
+        """
+        return self.connection.session(TIMEOUT_S)
 
     @property
     def origin(self) -> str:
@@ -217,8 +221,7 @@ class Arena:
         Raises:
             NetworkError: an endpoint is invalid.
         """
-        chosen: Sequence[str] = endpoints or ("tcp/127.0.0.1:7447",)
-        return cls(open_client(chosen, zenoh_config), arena, " ".join(chosen))
+        return cls(ServerConnection(endpoints or LOCAL, zenoh_config), arena)
 
     def __enter__(self) -> "Arena":
         return self
@@ -230,9 +233,7 @@ class Arena:
         """End all iterations and the connection."""
         for stream in (self._all, *self._robots.values(), *self._streams.values()):
             stream._close()
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-        self._session.close()
+        self.connection.close()
 
     def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> RobotStream:
         """The poses of a robot; iterating waits at most `timeout_s` for the next one (None: for ever)."""
@@ -271,7 +272,7 @@ class Arena:
         request = RobotsRequest(
             rename=rename or {}, remove=tuple(remove), define=define or {}, replace=replace
         )
-        return change_robots(self._session, self.keys.arena, request).robots
+        return change_robots(self.session, self.keys.arena, request).robots
 
     def declared_robots(self) -> Robots:
         """All robots that the server tracks, with their markers, and the names that a restart would lose.
@@ -279,7 +280,7 @@ class Arena:
         Raises:
             NetworkError: no server answers in time.
         """
-        return request_robots(self._session, self.keys.arena)
+        return request_robots(self.session, self.keys.arena)
 
     def set_rig(self, rig: Rig) -> RigMessage:
         """Have the server use another rig.
@@ -291,18 +292,18 @@ class Arena:
             RequestError: the server refuses it; the message is the server's.
             NetworkError: no server answers in time.
         """
-        return set_rig(self._session, self.keys.arena, rig, "fusion.client")
+        return set_rig(self.session, self.keys.arena, rig, "fusion.client")
 
     def undo_rig(self) -> RigMessage:
         """Have the server undo the last change of its rig: a calibration, or its recalibration of a moved camera.
 
         Returns and raises as `set_rig`.
         """
-        return undo_rig(self._session, self.keys.arena, "fusion.client")
+        return undo_rig(self.session, self.keys.arena, "fusion.client")
 
     def redo_rig(self) -> RigMessage:
         """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
-        return redo_rig(self._session, self.keys.arena, "fusion.client")
+        return redo_rig(self.session, self.keys.arena, "fusion.client")
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every frame set."""
@@ -333,7 +334,7 @@ class Arena:
                     self.faults["RelativePositions"] += 1
 
             take = guarded(key, self._taker(RelativePositions, put))
-            self._subscribers.append(self._session.declare_subscriber(key, take))
+            self._subscribe(key, take)
         self._streams[key].timeout_s = timeout_s
         return self._streams[key]
 
@@ -346,8 +347,8 @@ class Arena:
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             # queried before the rig: a session that was just opened may reach the server between both queries
-            is_reached = any(r.ok for r in self._session.get(self.keys.clock, timeout=min(left, 1.0)))
-            for reply in self._session.get(self.keys.rig, timeout=min(left, 1.0)):
+            is_reached = any(r.ok for r in self.session.get(self.keys.clock, timeout=min(left, 1.0)))
+            for reply in self.session.get(self.keys.rig, timeout=min(left, 1.0)):
                 if reply.ok is not None and (rig := self._read_rig(reply.ok.payload.to_bytes())):
                     return rig
             if is_reached:
@@ -366,9 +367,12 @@ class Arena:
         if key not in self._streams:
             stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s)
             take = guarded(content, self._taker(kind, stream._put))
-            self._subscribers.append(self._session.declare_subscriber(key, take))
+            self._subscribe(key, take)
         self._streams[key].timeout_s = timeout_s
         return self._streams[key]
+
+    def _subscribe(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
+        self.connection.when_open(lambda session: session.declare_subscriber(key, take))
 
     def _taker(self, kind: type, put: Callable[[Any], None]) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:

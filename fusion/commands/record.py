@@ -8,7 +8,7 @@ import tyro
 
 from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
 from camera_node.terminal import say
 from fusion.recordings.record import ArenaRecorder
@@ -42,8 +42,12 @@ def record(
     """
     rotation = Rotation(rotate_mb, rotate_minutes)
     opened = RotatingWriter(out, rotation) if rotation else RecordingWriter(out, overwrite=force)
-    with stopped_by_signals() as stop, opened as writer, open_client(connect, zenoh_config) as session:
-        recorder = ArenaRecorder(session, arena, writer)
+    with (
+        stopped_by_signals() as stop,
+        opened as writer,
+        ServerConnection(connect, zenoh_config) as connection,
+    ):
+        recorder = ArenaRecorder(connection, arena, writer)
         recorder.run(stop, seconds)
     for key, count in sorted(writer.counts.items()):
         say(f"{count:7} on {key}")

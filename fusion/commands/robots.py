@@ -9,7 +9,7 @@ import tyro
 import zenoh
 
 from camera_node.errors import ConfigError
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 from fusion.client.define import LOST_AT_RESTART
 from fusion.model.robot_frame import move_origin, turn_heading
@@ -62,7 +62,7 @@ def robots(
         raise ConfigError(f"{len(arguments)} arguments; use fusion robots {action} {USES[action]}".rstrip())
     if action == "save" and Path(arguments[0]).exists() and not force:
         raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         after = _apply(session, arena, action, arguments)
     if action == "save":
         save_robots(after.robots, Path(arguments[0]))

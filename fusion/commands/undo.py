@@ -10,7 +10,7 @@ import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig, undo_rig
 from calib.rig.messages import RigMessage
-from camera_node.protocol.session import open_requester
+from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 from fusion.model.corrections import corrected_camera
 
@@ -30,7 +30,7 @@ def undo(
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         say(_step(session, arena, undo_rig, "previous"))
     return 0
 
@@ -48,7 +48,7 @@ def redo(
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    with open_requester(connect, zenoh_config) as session:
+    with open_client(connect, zenoh_config) as session:
         say(_step(session, arena, redo_rig, "undone"))
     return 0
 

@@ -21,6 +21,7 @@ MAX_CLOCK_ERROR_MS = 1.0  # a robot at 1 m/s moves 1 mm in this time
 REMEDIES = {
     "sends no frames": "check its program: journalctl -u roundel-camera@NAME",
     "is not calibrated": "calibrate it: roundel calibrate wand --live --only NAME",
+    "repeats an old image": "restart its node, or replug the camera",
     "was moved and is excluded": "drive a robot through its view, or calibrate it again",
     "two nodes use its name": "give each node a --name of its own",
 }

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Mask
-from camera_node.geometry.pose import rotation_from_vector
+from camera_node.geometry.pose import rotation_from_vector, vector_from_rotation
 from fusion import _core
 
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -59,6 +59,11 @@ class States:
         for copy, name in zip(copies, self.__slots__, strict=True):
             copy[rows] = getattr(other, name)
         return States(*copies)
+
+    def minus(self, other: "States") -> Array:
+        """(N, 12) the errors that displace `other` to these states, to first order."""
+        rotation = vector_from_rotation(np.swapaxes(other.R, 1, 2) @ self.R)
+        return np.hstack([rotation, self.p - other.p, self.omega - other.omega, self.v - other.v])
 
     def retract(self, delta: Array) -> "States":
         """The states displaced by errors (N, 12)."""

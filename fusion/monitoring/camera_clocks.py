@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.arrays import Mask
 from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
@@ -31,7 +31,7 @@ from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_tim
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
 
-COMPARED_NS, CHECKED_NS = 45_000_000, 500_000_000  # between comparisons, and between searches for a drift
+COMPARED_NS, CHECKED_NS = 45_000_000, 250_000_000  # between comparisons, and between searches for a drift
 LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set
 JUMP_SIGMA_V, DRIFT_SIGMA_V = (
     0.5,
@@ -39,8 +39,8 @@ JUMP_SIGMA_V, DRIFT_SIGMA_V = (
 )  # of velocities, m/s: of a filter with wrong stamps, and of a mean velocity
 FAST_NS = 120_000_000  # of frame sets that show a jump
 JUMP_PX = 1.5  # RMS image motion that a jump must explain
-MIN_OFFSET_S, MAX_DRIFT_S = 0.0007, 0.01  # smallest and largest change of a correction by a slow offset
-MIN_STEP_S = 0.0002  # smallest change of a correction by a known rate
+MAX_DRIFT_S = 0.01  # largest change of a correction by a slow departure
+FOLLOWED_NS = 10_000_000_000  # after a departure, in which smaller ones of the same camera count
 REPORTED_NS = 500_000  # smallest correction that is reported; later ones when it has doubled
 KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
 MAX_KEPT = 200  # frames of an excluded camera
@@ -73,6 +73,7 @@ class _Clock:
 
     Attributes:
         correction_ns, sigma_s: added to its stamps, and the standard deviation.
+        departed_ns: when it was last found to depart slowly.
         frames: the last frames, with the present correction.
         since_ns: server time of the exclusion; 0 while the camera is in use.
         has_jumped: whether the arrival of its frames shows a jump.
@@ -83,6 +84,7 @@ class _Clock:
     state: ClockState = "correct"
     correction_ns: int = 0
     sigma_s: float = 0.0
+    departed_ns: int = 0
     check: StampCheck = field(default_factory=StampCheck)
     frames: deque[CalibratedFrame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     since_ns: int = 0
@@ -108,8 +110,8 @@ class CameraClocks:
         self._clocks = {name: _Clock() for name in cameras.names}
         self._history: deque[Snapshot] = deque()
         self._fast: deque[tuple[int, OffsetInformation]] = deque()
-        self._drifts = DriftMonitor(len(cameras.names))
-        self._lagged: deque[tuple[Snapshot, MatchedObservations, Array]] = deque()
+        self._drifts = DriftMonitor()
+        self._lagged: deque[tuple[Snapshot, MatchedObservations]] = deque()
         self._now_ns = self._undecided_ns = self._reported_ns = 0
         self._compared_ns = self._lagged_ns = self._checked_ns = 0
         self._undecided_s = 0.0
@@ -147,22 +149,30 @@ class CameraClocks:
         return frame
 
     def observe(
-        self, t_ns: int, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
+        self,
+        t_ns: int,
+        robots: tuple[States, Mask],
+        detections: DetectionTable,
+        assignments: Assignments,
+        is_doubtful: bool = False,
     ) -> None:
         """Compare the cameras in a frame set.
 
         Args:
             t_ns: time of the frame set.
-            states: after the update.
-            tracked: (R,) robots with status `tracked`.
+            robots: their states after the update, and (R,) those with status `tracked`.
             detections: of the frame set.
             assignments: of the detections.
+            is_doubtful: a camera contradicts the others, so that states may be wrong: nothing is compared.
         """
-        self._now_ns = t_ns
+        self._now_ns, (states, tracked) = t_ns, robots
         self._history.append(Snapshot(t_ns, states, tracked))
         while self._history[0].t_ns < t_ns - (RANGE_S + 0.5) * 1e9:
             self._history.popleft()
-        if t_ns >= self._compared_ns + COMPARED_NS:
+        if is_doubtful:
+            self._fast.clear()
+            self._lagged.clear()
+        elif t_ns >= self._compared_ns + COMPARED_NS:
             self._compare(states, tracked, detections, assignments)
         self._find_drifts()
         for name in self.excluded:
@@ -209,7 +219,7 @@ class CameraClocks:
         self._find_jumps(offset_information(self._cameras, states, observations, self._single, JUMP_SIGMA_V))
         if self._now_ns >= self._lagged_ns + LAGGED_NS:
             self._lagged_ns = self._now_ns
-            self._lagged.append((Snapshot(self._now_ns, states, tracked), observations, self._offsets_s()))
+            self._lagged.append((Snapshot(self._now_ns, states, tracked), observations))
 
     def _choose(
         self, states: States, robots: Mask, detections: DetectionTable, assignments: Assignments
@@ -220,10 +230,6 @@ class CameraClocks:
         order = np.argsort(-np.linalg.norm(states.v, axis=1) * robots)
         fits = robots[order] & (np.cumsum(count[order]) <= max(MAX_MARKERS, count[order][:1].sum()))
         return assignments.select(np.isin(robot, order[fits]))
-
-    def _offsets_s(self) -> Array:
-        """(C,) corrections in use."""
-        return np.array([self._clocks[name].correction_ns * 1e-9 for name in self._cameras.names])
 
     def _find_jumps(self, info: OffsetInformation) -> None:
         """Exclude the cameras that the last frame sets contradict."""
@@ -243,30 +249,32 @@ class CameraClocks:
             clock = self._clocks[self._cameras.names[k]]
             if clock.state != "excluded" and self._now_ns > clock.trusted_ns:
                 self._exclude(clock, self._now_ns, FAST_NS)
-        self._forget()
+        self._fast.clear()
 
     def _find_drifts(self) -> None:
         """Correct the cameras that depart slowly from the others."""
-        is_complete = False
         while self._lagged and self._now_ns >= self._lagged[0][0].t_ns + HALF_NS:
-            snapshot, observations, offsets_s = self._lagged.popleft()
+            snapshot, observations = self._lagged.popleft()
             states, known = with_mean_velocities(snapshot, self._history)
             observations = observations.select(known[observations.discs.body])
             info = offset_information(self._cameras, states, observations, self._single, DRIFT_SIGMA_V)
-            is_complete |= self._drifts.add(snapshot.t_ns, info.relative_to(-offsets_s))
+            self._drifts.add(snapshot.t_ns, info)
         if self._now_ns >= self._checked_ns + CHECKED_NS:
             self._checked_ns = self._now_ns
-            for drift in self._drifts.offsets(self._offsets_s()):
-                self._correct_drift(drift, MIN_OFFSET_S)
-        if is_complete:
-            for drift in self._drifts.rates(self._now_ns):
-                self._correct_drift(drift, MIN_STEP_S)
+            departing = {k for k, clock in enumerate(self._clocks.values()) if self._departs(clock)}
+            for drift in self._drifts.changes(departing) or self._drifts.offsets():
+                self._correct_drift(drift)
+
+    def _departs(self, clock: _Clock) -> bool:
+        """Whether a clock departed slowly from the others just now."""
+        return bool(clock.departed_ns) and self._now_ns < clock.departed_ns + FOLLOWED_NS
 
     # Changes.
 
     def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
         """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
         clock.state, clock.since_ns, clock.has_jumped = "excluded", now_ns, False
+        self._forget_since(now_ns - FAST_NS)
         while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
             clock.frames.popleft()
         if not back_ns:
@@ -302,42 +310,54 @@ class CameraClocks:
         """Use a camera again whose clock is not at fault."""
         clock.state = "corrected" if clock.correction_ns else "correct"
         clock.trusted_ns = self._now_ns + PAUSE_NS
-        self._forget()
+        self._forget_since(clock.since_ns)
 
     def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
         clock = self._clocks[name]
-        self._set(clock, clock.correction_ns + round(offset_s * 1e9), sigma_s)
+        clock.correction_ns += round(offset_s * 1e9)
+        clock.state, clock.sigma_s, clock.reported_ns = "corrected", sigma_s, clock.correction_ns
+        self._forget_since(clock.since_ns)
         clock.frames.clear()
         at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
         message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
         log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s, extra=about(name))
 
-    def _correct_drift(self, drift: Drift, min_s: float) -> None:
-        """Correct a camera that is in use by a change of more than `min_s`."""
+    def _correct_drift(self, drift: Drift) -> None:
+        """Correct a camera that is in use."""
         name = self._cameras.names[drift.camera]
-        clock, correction_ns = self._clocks[name], round(drift.offset_s * 1e9)
-        change_s = abs(correction_ns - clock.correction_ns) * 1e-9
-        if clock.state == "excluded" or not min_s < change_s < MAX_DRIFT_S:
+        clock, change_s = self._clocks[name], drift.at(self._now_ns)
+        if clock.state == "excluded":
             return
-        clock.state, clock.correction_ns, clock.sigma_s = "corrected", correction_ns, drift.sigma_s
+        if abs(change_s) > MAX_DRIFT_S:
+            self._exclude(clock, self._now_ns, FAST_NS)
+            return
+        clock.correction_ns += round(change_s * 1e9)
+        clock.state, clock.sigma_s, clock.departed_ns = "corrected", drift.sigma_s, self._now_ns
+        self._drifts.correct(drift)
         self._fast.clear()
-        if abs(correction_ns - clock.reported_ns) < REPORTED_NS + abs(clock.reported_ns):
+        self._lagged.clear()
+        if abs(clock.correction_ns - clock.reported_ns) < REPORTED_NS + abs(clock.reported_ns):
             return
-        clock.reported_ns = correction_ns
-        rate = f" by {-drift.ppm:.0f} ppm" if drift.ppm else ""
+        clock.reported_ns = clock.correction_ns
+        rate = f" by {-1e6 * drift.rate:.0f} ppm" if drift.rate else ""
         message = "camera %s: its clock drifts from the others%s; its stamps are corrected, now by %.1f ms"
-        log.warning(message, name, rate, correction_ns * 1e-6, extra=about(name))
+        log.warning(message, name, rate, clock.correction_ns * 1e-6, extra=about(name))
 
-    def _set(self, clock: _Clock, correction_ns: int, sigma_s: float) -> None:
-        clock.state, clock.correction_ns, clock.sigma_s = "corrected", correction_ns, sigma_s
-        clock.reported_ns = correction_ns
+    def rebase(self) -> None:
+        """A camera has another pose: its calibration errors, which bias offsets, are others."""
         self._forget()
 
     def _forget(self) -> None:
-        """Drop the information of frames with earlier corrections or of excluded cameras."""
+        """Drop all information about offsets."""
         self._fast.clear()
         self._lagged.clear()
         self._drifts.forget()
+
+    def _forget_since(self, t_ns: int) -> None:
+        """Drop the information of frames with an earlier correction, or of excluded cameras."""
+        self._fast.clear()
+        self._lagged.clear()
+        self._drifts.forget_since(t_ns)
 
     def _report_undecided(self, spread_s: float) -> None:
         self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)

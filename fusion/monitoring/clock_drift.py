@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finds cameras whose clocks depart slowly from the others, by an offset or at a rate; docs/time_offsets.md section 3.
+"""Finds cameras whose clocks depart slowly from the others, by an offset or at a rate; docs/time_offsets.md section 7.
 
-Information about the offsets is summed over windows of 2 s or more. Calibration errors bias an offset, but the bias is
-about the same in all windows as long as the robots move alike; a drift changes the offset from window to window at a
-constant rate.
+Information about the offsets is summed over windows of half a second or more. Calibration errors bias an offset, but
+the bias is about the same in all windows as long as the robots move alike; a clock that departs changes the offset from
+some window on, at once or at a constant rate.
 
 The velocity of a filter follows the stamps of one frame set, right or wrong. So velocities are mean ones over 0.2 s
 around the frame set, in which a wrong stamp displaces both ends alike.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,14 +20,17 @@ from fusion.model.states import States
 from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, contradiction
 from fusion.monitoring.time_search import Snapshot
 
-WINDOW_NS, WINDOW_PX = 2_000_000_000, 300.0  # smallest duration of a window, and smallest image motion in it
-MAX_WINDOWS, MAX_AGE_NS = 16, 60_000_000_000
+WINDOW_NS, WINDOW_PX = 500_000_000, 100.0  # smallest duration of a window, and smallest image motion in it
+MAX_WINDOWS, MAX_AGE_NS = 60, 60_000_000_000
 HALF_NS = 100_000_000  # before and after a frame set, for the velocities of its robots
-RECENT = 5  # windows that show an offset, with the open one
-MIN_NS = 3_000_000_000  # of the windows that show an offset
-MIN_WINDOWS = 4  # complete ones that show a rate
-OFFSET_PX, RATE_PX = 0.4, 0.2  # RMS image motion that an offset explains, and the change of one at a rate
-MIN_CHANGE_S = 0.0005  # of the offset in all windows, by a rate
+RECENT_NS, MIN_NS = 10_000_000_000, 3_000_000_000  # of the windows that show an offset: at most, at least
+MIN_BEFORE = 3  # windows before a change
+FOLLOWED_PX = 0.15  # that a change of a camera explains which departed before
+OFFSET_PX = 0.4  # RMS image motion that an offset explains
+SHORT_PX, LONG_PX = 0.45, 0.2  # that a change explains: at first, and after
+LONG_PATH_PX = 1500.0  # of image motion since the change, over which calibration errors are independent
+MIN_CHANGE_S = 0.0005
+MIN_CHI2 = 36.0  # that a change explains, with any of some hundred onsets
 NOISE_CHI2 = 11.0  # 99 % of chi-square with three degrees of freedom
 PRIOR_FREEDOM = 3.0  # degrees of freedom of the prior variance factor, 1
 WEAK = 1.0  # prior information about an offset, 1 / s^2
@@ -39,14 +42,20 @@ class Drift:
 
     Attributes:
         camera: its index.
-        offset_s, sigma_s: true capture time minus its stamps now, before any correction.
-        ppm: rate of the departure, 1e-6; 0 for an offset without a known rate.
+        since_ns: when it began to depart.
+        step_s, rate: true capture time minus stamps at a later t: step_s + rate * (t - since).
+        sigma_s: of that now.
     """
 
     camera: int
-    offset_s: float
+    since_ns: int
+    step_s: float
+    rate: float
     sigma_s: float
-    ppm: float = 0.0
+
+    def at(self, t_ns: int) -> float:
+        """The offset at a time, s."""
+        return self.step_s + self.rate * (t_ns - self.since_ns) * 1e-9 if t_ns >= self.since_ns else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +66,10 @@ class _Window:
     until_ns: int
     info: OffsetInformation
 
+    @property
+    def middle_ns(self) -> int:
+        return (self.since_ns + self.until_ns) // 2
+
     def is_complete(self, t_ns: int) -> bool:
         """Whether the next window begins: calibration errors at other places in the images are independent."""
         seconds = (t_ns - self.since_ns) * 1e-9
@@ -65,10 +78,9 @@ class _Window:
 
 
 class DriftMonitor:
-    """Accumulates the information of frame sets about the offsets of `n_cameras` cameras, before any correction."""
+    """Accumulates the information of frame sets about the offsets of cameras from their corrected stamps."""
 
-    def __init__(self, n_cameras: int) -> None:
-        self._n = n_cameras
+    def __init__(self) -> None:
         self._windows: deque[_Window] = deque(maxlen=MAX_WINDOWS + 1)
 
     def add(self, t_ns: int, info: OffsetInformation) -> bool:
@@ -83,88 +95,114 @@ class DriftMonitor:
         return len(self._windows) > 1
 
     def forget(self) -> None:
-        """Drop all information: an offset changed at once."""
+        """Drop all information: the poses of cameras changed."""
         self._windows.clear()
 
-    def offsets(self, corrections_s: Array) -> list[Drift]:
-        """Cameras with an offset in the last windows that differs from the corrections (C,) in use."""
-        recent = list(self._windows)[-RECENT:]
-        if not recent or recent[-1].until_ns < recent[0].since_ns + MIN_NS:
-            return []
-        lines = _Lines.of(recent, recent[-1].until_ns)
-        found = contradiction(*lines.offsets(corrections_s), lines.speed_px, OFFSET_PX)
-        return [Drift(k, offset + corrections_s[k], sigma) for k, offset, sigma in _rows(found)]
+    def forget_since(self, t_ns: int) -> None:
+        """Drop the windows that reach beyond a time, at which an offset changed at once."""
+        while self._windows and self._windows[-1].until_ns >= t_ns:
+            self._windows.pop()
 
-    def rates(self, t_ns: int) -> list[Drift]:
-        """Cameras whose offsets change at a constant rate, and their offsets at `t_ns`."""
-        windows = [w for w in list(self._windows)[:-1] if len(np.flatnonzero(w.info.count)) > 1]
-        if len(windows) < MIN_WINDOWS:
+    def correct(self, drift: Drift) -> None:
+        """Express all information relative to stamps that are corrected by this drift."""
+        for k, window in enumerate(self._windows):
+            offsets = np.zeros(len(window.info.count))
+            offsets[drift.camera] = drift.at(window.middle_ns)
+            self._windows[k] = replace(window, info=window.info.relative_to(offsets))
+
+    def offsets(self) -> list[Drift]:
+        """Cameras with an offset in the last windows, whenever it began."""
+        if not self._windows:
             return []
-        lines = _Lines.of(windows, t_ns)
-        span_s = (windows[-1].until_ns - windows[0].since_ns) * 1e-9
-        found = contradiction(*lines.rates(), lines.speed_px * span_s, RATE_PX, NOISE_CHI2)
-        drifting = [k for k, rate, _ in _rows(found) if abs(rate) * span_s > MIN_CHANGE_S]
-        return lines.fit(drifting) if drifting else []
+        now_ns = self._windows[-1].until_ns
+        recent = [w for w in self._windows if w.since_ns > now_ns - RECENT_NS]
+        if not recent or now_ns < recent[0].since_ns + MIN_NS:
+            return []
+        parts = _Parts.of(recent)
+        M, y = parts.M.sum(0), parts.y.sum(0)
+        found = contradiction(M, y, parts.speed_px, OFFSET_PX)
+        return [Drift(k, self._windows[0].since_ns, x, 0.0, sigma) for k, x, sigma in _rows(found)]
+
+    def changes(self, departing: Collection[int] = ()) -> list[Drift]:
+        """Cameras whose offset changed from some window on, at once or at a constant rate.
+
+        Args:
+            departing: indices of the cameras that are known to depart: smaller changes count.
+        """
+        windows = [w for w in self._windows if len(np.flatnonzero(w.info.count)) > 1]
+        if len(windows) <= MIN_BEFORE:
+            return []
+        since_ns = [w.since_ns for w in windows[MIN_BEFORE:]]
+        now_ns, at_ns = windows[-1].until_ns, np.array([w.middle_ns for w in windows])
+        steps = (at_ns >= np.array(since_ns)[:, None]).astype(float)
+        ramps = np.maximum(0.0, (at_ns - np.array([windows[1].since_ns, *since_ns])[:, None]) * 1e-9)
+        parts = _Parts.of(windows)
+        M, y, factor, best = parts.best_change(np.concatenate([steps, ramps]))
+        if best < 0:
+            return []
+        is_step = best < len(steps)
+        onset_ns = since_ns[best] if is_step else [windows[1].since_ns, *since_ns][best - len(steps)]
+        span = 1.0 if is_step else (now_ns - onset_ns) * 1e-9
+        path_px = float(parts.speed_px.mean()) * (now_ns - onset_ns) * 1e-9
+        min_px = LONG_PX if path_px > LONG_PATH_PX else SHORT_PX
+        if path_px <= LONG_PATH_PX:  # calibration errors are correlated so far: only their allowance counts
+            factor = max(factor, 1.0)
+        found = contradiction(M / factor, y / factor, parts.speed_px * span, FOLLOWED_PX, NOISE_CHI2)
+        return [
+            Drift(k, onset_ns, x * is_step, x * (not is_step), sigma * span)
+            for k, x, sigma in _rows(found)
+            if abs(x) * span > MIN_CHANGE_S and (k in departing or abs(x) * span * parts.speed_px[k] > min_px)
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Lines:
-    """Least squares about the offsets of C cameras as linear functions of time.
+class _Parts:
+    """The information of W windows about the offsets of C cameras, shifts of the images eliminated.
 
     Attributes:
-        M: (3, C, C) sums of the information of the windows, times 1, t and t^2; t is the time until now, s (negative).
-        y: (2, C) sums of the right sides, times 1 and t.
-        factor: variance of the windows about the lines, relative to the one that the information states.
+        M, y: (W, C, C) and (W, C).
         speed_px: (C,) RMS image speed, px/s.
     """
 
     M: Array
     y: Array
-    factor: float
     speed_px: Array
 
     @classmethod
-    def of(cls, windows: Sequence[_Window], now_ns: int) -> "_Lines":
-        """Fit all cameras to the windows; the factor has a weak prior of 1."""
-        t = np.array([(w.since_ns + w.until_ns) / 2 - now_ns for w in windows]) * 1e-9
+    def of(cls, windows: Sequence[_Window]) -> "_Parts":
         parts = [w.info.with_unknown_shifts() for w in windows]
-        M, y = np.array([part[0] for part in parts]), np.array([part[1] for part in parts])
-        lines = cls(
-            np.array([np.einsum("w,wij->ij", t**k, M) for k in range(3)]),
-            np.array([y.sum(0), t @ y]),
-            1.0,
-            np.sqrt(
-                sum(w.info.motion_px2 for w in windows) / np.maximum(1.0, sum(w.info.count for w in windows))
-            ),
-        )
-        squares = sum(_explained(*part) for part in zip(M, y, strict=True))
-        squares -= _explained(lines.M[0], lines.y[0]) + _explained(*lines.rates())
-        freedom = max(0, len(t) - 2) * (np.count_nonzero(lines.speed_px) - 1)
-        factor = (max(squares, 0.0) + PRIOR_FREEDOM) / (freedom + PRIOR_FREEDOM)
-        return cls(lines.M, lines.y, float(factor), lines.speed_px)
+        motion_px2 = np.sum([w.info.motion_px2 for w in windows], 0)
+        count = np.sum([w.info.count for w in windows], 0)
+        speed_px = np.sqrt(motion_px2 / np.maximum(1.0, count))
+        return cls(np.array([part[0] for part in parts]), np.array([part[1] for part in parts]), speed_px)
 
-    def offsets(self, known_s: Array) -> tuple[Array, Array]:
-        """M (C, C) and y (C,) of the mean offsets minus the known ones (C,)."""
-        return self.M[0] / self.factor, (self.y[0] - self.M[0] @ known_s) / self.factor
+    def best_change(self, courses: Array) -> tuple[Array, Array, float, int]:
+        """M (C, C) and y (C,) of the changes with the best course, the offsets before eliminated.
 
-    def rates(self) -> tuple[Array, Array]:
-        """M (C, C) and y (C,) of the rates alone, the offsets eliminated."""
+        Args:
+            courses: (K, W) of the changes over time, in each window.
+
+        Returns:
+            M, y, the variance of the windows about this course relative to the one that the information states, and
+            the row of the course; -1 if none explains enough.
+        """
         n = self.y.shape[1]
-        by_offset = np.linalg.solve(self.M[0] + WEAK * np.eye(n), np.column_stack([self.M[1], self.y[0]]))
-        M = self.M[2] - self.M[1] @ by_offset[:, :n]
-        return M / self.factor, (self.y[1] - self.M[1] @ by_offset[:, n]) / self.factor
+        A = self.M.sum(0) + WEAK * np.eye(n)
+        B, D = np.einsum("kw,wij->kij", courses, self.M), np.einsum("kw,wij->kij", courses**2, self.M)
+        by_offset = np.linalg.solve(A, np.concatenate([B, self._total[None, :, None].repeat(len(B), 0)], 2))
+        M = D - B @ by_offset[:, :, :n]
+        y = courses @ self.y - np.einsum("kij,kj->ki", B, by_offset[:, :, n])
+        explained = np.einsum("ki,kij,kj->k", y, np.linalg.pinv(M, rcond=1e-6, hermitian=True), y)
+        best = int(np.argmax(explained))
+        squares = sum(_explained(*part) for part in zip(self.M, self.y, strict=True))
+        squares -= _explained(A, self._total) + explained[best]
+        freedom = max(0, len(self.y) - 2) * (np.count_nonzero(self.speed_px) - 1)
+        factor = (max(float(squares), 0.0) + PRIOR_FREEDOM) / (freedom + PRIOR_FREEDOM)
+        return M[best], y[best], factor, best if explained[best] > MIN_CHI2 * factor else -1
 
-    def fit(self, cameras: list[int]) -> list[Drift]:
-        """The lines of these cameras, if all others have the offset 0."""
-        at, n = np.ix_(cameras, cameras), len(cameras)
-        M = np.block([[self.M[0][at], self.M[1][at]], [self.M[1][at], self.M[2][at]]]) / self.factor
-        inverse = np.linalg.inv(M)
-        solution = inverse @ self.y[:, cameras].ravel() / self.factor
-        sigma = np.sqrt(np.diag(inverse))
-        return [
-            Drift(k, float(solution[i]), float(sigma[i]), 1e6 * float(solution[n + i]))
-            for i, k in enumerate(cameras)
-        ]
+    @property
+    def _total(self) -> Array:
+        return self.y.sum(0)
 
 
 def _explained(M: Array, y: Array) -> float:

@@ -15,12 +15,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray, Exposures
+from camera_node.arrays import Mask
+from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import MarkerTable
 from fusion.model.states import States
-from fusion.monitoring.recalibration import ExpectedFrame, recalibrate
+from fusion.monitoring.expected_views import ExpectedViews
+from fusion.monitoring.recalibration import ExpectedFrame, fits_equally, recalibrate
 
 AGREEMENT_PX = 2.0  # between an expected and a detected roundel of a camera that was not moved
 MEMORY_NS = 700_000_000  # of the comparisons that decide about a camera
@@ -33,9 +34,9 @@ MIN_OTHERS = 2  # other cameras that must see a robot, and that must be correct
 RECALIBRATION_MARKERS = 300  # expected markers from which a recalibration is tried
 FRESH_NS = 4_000_000_000  # older frames of a moved camera are discarded
 RETRY_NS = 300_000_000  # between recalibrations
+MAX_EARLIER = 4  # poses of a camera, to which it may return
 MAX_COMPARED = 20  # markers of a frame
 INTERVAL_NS = 250_000_000  # between comparisons with so many markers; shorter with fewer
-MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,10 +60,17 @@ class TrackedScene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtrinsicsCorrection:
-    """A camera was moved: `camera` is None when it is excluded, and has the new pose when it is recalibrated."""
+    """A camera was moved.
+
+    Attributes:
+        name: of the camera.
+        camera: with its new pose when it is recalibrated; None when it is excluded.
+        has_returned: whether the new pose is one that it had before.
+    """
 
     name: str
     camera: Camera | None
+    has_returned: bool = False
 
 
 @dataclass(slots=True)
@@ -93,6 +101,7 @@ class ExtrinsicsMonitor:
         self.excluded: set[str] = set()
         self.pinned: set[str] = set()
         self._cameras: dict[str, _MonitoredCamera] = {}
+        self._earlier: dict[str, deque[Camera]] = {}
         self._offset = 0  # rotates through more than MAX_COMPARED markers
         self._turns: dict[str, int] = {}  # of each camera at its last comparison
 
@@ -117,24 +126,29 @@ class ExtrinsicsMonitor:
                 self._compare(frame, frame_set.t_ns, scene)
         corrections = []
         if (name := self._find_moved()) is not None and is_clock(name):
-            self.readmit(name)
+            self._use(name)
         elif name is not None:
             self.excluded.add(name)
             corrections.append(ExtrinsicsCorrection(name, None))
         for name in sorted(self.excluded) if recalibrates else ():
-            if (camera := self._recalibrate(name, scene.cameras[name])) is not None:
-                corrections.append(ExtrinsicsCorrection(name, camera))
+            if (correction := self._recalibrate(name, scene.cameras[name])) is not None:
+                corrections.append(correction)
         return tuple(corrections)
 
     def readmit(self, name: str) -> None:
-        """Use the detections of a camera again, and forget its comparisons."""
-        self.excluded.discard(name)
-        self._cameras.pop(name, None)
+        """Use the detections of a camera that was calibrated again; its earlier poses are forgotten."""
+        self._use(name)
+        self._earlier.pop(name, None)
 
     def pin(self, name: str) -> None:
         """Readmit a camera whose pose a user confirmed; it is not excluded again."""
         self.readmit(name)
         self.pinned.add(name)
+
+    def _use(self, name: str) -> None:
+        """Use the detections of a camera again, and forget its comparisons."""
+        self.excluded.discard(name)
+        self._cameras.pop(name, None)
 
     def _is_due(self, frame: CalibratedFrame, cameras: CameraArray, n_markers: int) -> bool:
         """Whether it is the turn of the camera; the turns of the cameras are staggered."""
@@ -151,9 +165,10 @@ class ExtrinsicsMonitor:
         markers = np.flatnonzero((scene.tracked & (n_others >= MIN_OTHERS))[scene.marker_table.robot])
         markers = np.roll(markers, -self._offset)[:MAX_COMPARED]
         self._offset += MAX_COMPARED + 1
-        points = _expected_points(scene, frame.camera, (frame.t_ns - t_ns) * 1e-9, markers)
-        if points.shape[1]:
-            self._note(scene.cameras[frame.camera], ExpectedFrame(frame, points))
+        tau, rows = (frame.t_ns - t_ns) * 1e-9, (scene.marker_table, markers)
+        expected = ExpectedViews.of(scene.cameras, frame.camera, scene.states, tau, rows)
+        if len(expected.rows):
+            self._note(scene.cameras[frame.camera], ExpectedFrame(frame, expected.points))
 
     def _note(self, camera: Camera, expected: ExpectedFrame) -> None:
         """Add the comparison of a frame; discard old ones."""
@@ -180,7 +195,7 @@ class ExtrinsicsMonitor:
         moved = [name for name, share in shares.items() if share < MOVED_SHARE and name not in ignored]
         return moved[0] if len(moved) == 1 and len(correct) >= MIN_OTHERS else None
 
-    def _recalibrate(self, name: str, camera: Camera) -> Camera | None:
+    def _recalibrate(self, name: str, camera: Camera) -> ExtrinsicsCorrection | None:
         """The camera with its present pose, or None while its frames do not determine it."""
         monitored = self._cameras.get(name)
         if monitored is None or not monitored.views:
@@ -192,20 +207,12 @@ class ExtrinsicsMonitor:
         monitored.tried_ns = now_ns
         recalibrated = recalibrate(camera, list(views))
         if recalibrated is not None:
-            self.readmit(name)
-            return recalibrated
+            earlier = self._earlier.setdefault(name, deque(maxlen=MAX_EARLIER))
+            same = next((c for c in earlier if fits_equally(c, recalibrated, list(views))), None)
+            if camera not in earlier:
+                earlier.append(camera)
+            self._use(name)
+            return ExtrinsicsCorrection(name, same or recalibrated, same is not None)
         for _ in range(len(views) // 2):  # the camera may have been moving in the older ones
             views.popleft()
         return None
-
-
-def _expected_points(scene: TrackedScene, name: str, tau: float, markers: Index) -> Array:
-    """(3, N) points, world frame, that project to the outlines' centres of markers that the camera should see."""
-    camera, lens = scene.cameras.index[name], scene.cameras[name]
-    exposures = Exposures.exact(np.array([camera]), np.array([tau]))
-    discs = scene.marker_table.discs(markers, np.zeros(len(markers), np.intp))
-    views = scene.cameras.views(scene.states, exposures, discs)
-    points = scene.cameras.R_cam_world[camera].T @ views.q + scene.cameras.centres[camera][:, None]
-    uv, size = lens.project(views.q.T), np.array([lens.width, lens.height])
-    inside = ((uv > MARGIN_PX) & (uv < size - MARGIN_PX)).all(1)
-    return points[:, inside & (views.facing > MIN_FACING)]

@@ -2,7 +2,9 @@
 """Detects frame sets with unusual residuals, and the camera that causes them.
 
 A slightly moved camera keeps its detections within their gates but biases the robots. Where the residuals of a frame
-set rise, the tracker leaves out each camera in turn; the one without which they fall is the suspect.
+set rise, the tracker leaves out each camera in turn. The camera at fault is the one without which observations and
+predictions of all robots agree: of residuals alone, those of the last two or three cameras always fall, because
+position and velocity of a robot adapt to them.
 """
 
 import numpy as np
@@ -12,13 +14,17 @@ from camera_node.arrays import Array
 MIN_RESIDUALS = 12  # in a frame set
 MIN_PX, MIN_RATIO = 0.2, 2.0  # of an unusual median residual: absolute, and relative to the usual one
 LEARNED = 15  # frame sets that define the usual residual
+CAUCHY, REJECTED = (
+    4.0,
+    100.0,
+)  # scale of the cost, standard deviations; square that a rejected observation has
 
 
 class ResidualMonitor:
-    """The usual residual of a frame set, and the last suspect."""
+    """The usual residual of a frame set."""
 
     def __init__(self) -> None:
-        self._usual_px, self._learned, self._suspect = 0.0, 0, ""
+        self._usual_px, self._learned = 0.0, 0
 
     def is_unusual(self, squared_px: Array) -> bool:
         """Whether the squared residuals (N,) of a frame set, px^2, are far above the usual ones; learns others."""
@@ -39,16 +45,32 @@ class ResidualMonitor:
         self._learned += 1
         self._usual_px += (median_px - self._usual_px) / min(self._learned, LEARNED)
 
-    def suspects(self, names: tuple[str, ...]) -> list[str]:
-        """All cameras, the last suspect first."""
-        return sorted(names, key=lambda name: name != self._suspect)
 
-    def confirms(self, name: str, without_px2: Array, with_px2: Array) -> bool:
-        """Whether the residuals without this camera are far below those with it; it is then the last suspect."""
-        if not len(without_px2) or np.nanmedian(without_px2) > np.nanmedian(with_px2) / MIN_RATIO**2:
-            return False
-        self._suspect = name
-        return True
+def camera_at_fault(cost: float, without: dict[str, float]) -> str | None:
+    """The camera without which the cost of a frame set falls, far below that without any other; None without one.
+
+    Args:
+        cost: with all cameras, as by `cost_of`.
+        without: the cost without each camera, by name.
+    """
+    if len(without) < 2:
+        return None
+    best, second = sorted(without, key=lambda name: without[name])[:2]
+    return best if without[best] < min(cost, without[second]) / MIN_RATIO else None
+
+
+def cost_of(squared: Array, n_rejected: int, corrections: Array, information: Array) -> float:
+    """The robust cost of an update: observations and predictions.
+
+    Args:
+        squared: (N,) squared residuals in standard deviations; infinite where not visible.
+        n_rejected: observations of robots that these contradict.
+        corrections: (R, 12) of the predicted states.
+        information: (R, 12, 12) of the predictions.
+    """
+    bounded = np.append(np.minimum(squared, REJECTED), np.full(n_rejected, REJECTED))
+    observed = CAUCHY**2 * np.log1p(bounded / CAUCHY**2).sum()
+    return float(observed + np.einsum("ri,rij,rj->", corrections, information, corrections))
 
 
 def _median_px(squared_px: Array) -> float:

@@ -5,9 +5,12 @@ from collections import deque
 
 import numpy as np
 
+from camera_node.arrays import Array
+
 HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
 MIN_JUMP_NS = 4_000_000
 MIN_IRREGULAR = 0.1  # of the interval between frames
+MAX_SWAPPED = 3  # intervals by which a frame may overtake another
 MAX_GAP = 5  # intervals; a longer gap of a recording may be a jump
 
 
@@ -29,7 +32,7 @@ class StampCheck:
         """Whether the stamp `t_ns` of the next frame jumped; the frames before it are forgotten then."""
         lag, jumped = received_ns - t_ns, False
         if len(self._lags) >= LEARNED:
-            first, usual, late, last = np.percentile(self._lags, [0, 50, 95, 100])
+            first, usual, late, last = np.percentile(self._expected_lags(), [0, 50, 95, 100])
             is_known = not first == last == lag
             is_early = lag < first - MIN_JUMP_NS and not self._is_next(t_ns)
             is_late = (lag > late + MIN_JUMP_NS or not is_known) and self._is_irregular(t_ns)
@@ -46,13 +49,24 @@ class StampCheck:
         """By how much the stamps jumped, from the lags before and since; None if arrivals do not show it."""
         return None if self._usual_ns is None else self._usual_ns - float(np.median(self._lags))
 
+    def _expected_lags(self) -> Array:
+        """The lags so far, displaced to the next frame by their trend: those of a clock that drifts."""
+        lags = np.array(self._lags, float)
+        half = len(lags) // 2
+        slope = (np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
+        return lags + slope * np.arange(len(lags), 0, -1)
+
     def _interval_ns(self) -> float:
-        return max(1.0, float(np.median(np.diff(self._stamps))))
+        return max(1.0, float(np.median(np.diff(np.sort(self._stamps)))))
 
     def _is_irregular(self, t_ns: int) -> bool:
-        """Whether the time since the last stamp is no multiple of the usual interval."""
+        """Whether the time since the last stamp is no multiple of the usual interval, nor that of a swapped frame."""
         interval, since = self._interval_ns(), t_ns - self._stamps[-1]
-        return abs(since - max(1, round(since / interval)) * interval) > MIN_IRREGULAR * interval
+        n = round(since / interval)
+        is_new = min(abs(t_ns - stamp) for stamp in self._stamps) > MIN_IRREGULAR * interval
+        if -MAX_SWAPPED <= n < 0 and is_new:
+            return abs(since - n * interval) > MIN_IRREGULAR * interval
+        return abs(since - max(1, n) * interval) > MIN_IRREGULAR * interval
 
     def _is_next(self, t_ns: int) -> bool:
         """Whether one usual interval passed since the last stamp; a lag that falls is then that of queued frames."""

@@ -78,6 +78,7 @@ def camera_problems(health: CameraHealth) -> list[str]:
         "sends no frames": health.fps == 0,
         "is not calibrated": not health.calibrated,
         "was moved and is excluded": health.excluded,
+        "repeats an old image": health.frozen,
         "two nodes use its name": health.duplicate_publisher,
     }
     return [problem for problem, holds in states.items() if holds]

@@ -229,6 +229,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     late: int  # frames dropped since the start because they arrived too late
     calibrated: bool
     excluded: bool = False  # the camera was moved: its detections are excluded until it is recalibrated
+    frozen: bool = False  # the camera repeats an old image: excluded until it delivers new ones
     duplicate_publisher: bool = False  # two nodes publish under its name
     faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason
     clock: str = "correct"  # or "excluded" while its stamps are wrong by an unknown time, or "corrected"

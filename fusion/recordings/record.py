@@ -20,6 +20,7 @@ from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
@@ -87,7 +88,7 @@ class ArenaRecorder:
     """Receives all messages of an arena and writes them. Time and memory stay bounded for any input.
 
     Args:
-        session: an open session, which stays open.
+        connection: to the server; it stays open. Recording begins as soon as the server answers.
         arena: its name.
         writer: of the files.
 
@@ -95,9 +96,14 @@ class ArenaRecorder:
         lost: messages that were not written, by reason.
     """
 
-    def __init__(self, session: zenoh.Session, arena: str, writer: RecordingWriter | RotatingWriter) -> None:
+    def __init__(
+        self, connection: ServerConnection, arena: str, writer: RecordingWriter | RotatingWriter
+    ) -> None:
         self.lost: Counter[str] = Counter()
-        self._session, self._arena, self._writer = session, arena, writer
+        self._connection, self._arena, self._writer = connection, arena, writer
+        self._session: zenoh.Session | None = None
+        self._subscriber: zenoh.Subscriber | None = None
+        self._is_over = False
         self._missing = {Keys(arena).rig, robots_key(arena)}
         self._request_at_s, self._pause_s = 0.0, FIRST_PAUSE_S
         self._received: queue.Queue[Entry] = queue.Queue(QUEUE_SIZE)
@@ -111,15 +117,27 @@ class ArenaRecorder:
             ConfigError: the disk is full; the file is closed.
         """
         end_s = time.monotonic() + (math.inf if seconds is None else seconds)
-        subscriber = self._session.declare_subscriber(f"{self._arena}/**", self._enqueue)
+        self._connection.when_open(self._subscribe)
         try:
             while not stop.is_set() and time.monotonic() < end_s:
                 self._request_missing()
                 self._write_next(WAIT_S)
         finally:
-            subscriber.undeclare()
+            self._unsubscribe()
         for _ in range(self._received.qsize()):
             self._write_next(0.0)
+
+    def _subscribe(self, session: zenoh.Session) -> None:
+        with self._lock:
+            if not self._is_over:
+                self._subscriber = session.declare_subscriber(f"{self._arena}/**", self._enqueue)
+                self._session = session
+
+    def _unsubscribe(self) -> None:
+        with self._lock:
+            self._is_over, subscriber = True, self._subscriber
+        if subscriber is not None:
+            subscriber.undeclare()
 
     def _enqueue(self, sample: zenoh.Sample) -> None:
         """Queue a message; called from Zenoh's threads."""
@@ -151,7 +169,8 @@ class ArenaRecorder:
 
     def _request_missing(self) -> None:
         """Query the server for the rig and the robots; the replies are recorded as if they were published."""
-        if not self._missing or time.monotonic() < self._request_at_s:
+        session = self._session
+        if session is None or not self._missing or time.monotonic() < self._request_at_s:
             return
         self._request_at_s = time.monotonic() + self._pause_s
         self._pause_s = min(2 * self._pause_s, REQUEST_S)
@@ -161,4 +180,4 @@ class ArenaRecorder:
                 self._enqueue(reply.ok)
 
         for key in self._missing:
-            self._session.get(key, take, timeout=REQUEST_S)
+            session.get(key, take, timeout=REQUEST_S)

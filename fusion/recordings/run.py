@@ -13,7 +13,6 @@ from camera_node.sources.observations import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.recordings.report import Summary
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import TrackingResult
@@ -59,7 +58,7 @@ def fuse_recording(
     """
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
-    yield from _fuse(_synchronize(messages, tracker.clocks, arena, summary.faults), tracker, arena, summary)
+    yield from _fuse(_synchronize(messages, tracker, arena, summary.faults), tracker, arena, summary)
 
 
 def fuse_frame_sets(
@@ -108,7 +107,7 @@ def read_detections(
 
 def _synchronize(
     messages: Iterable[tuple[int, Detections]],
-    clocks: CameraClocks,
+    tracker: Tracker,
     arena: OfflineArena,
     faults: Counter[str],
 ) -> Iterator[FrameSet]:
@@ -120,12 +119,14 @@ def _synchronize(
         elif (message.width, message.height) != (camera.width, camera.height):
             faults[f"frames of camera '{message.camera}', whose size is not the rig's"] += 1
         else:
-            frame = clocks.admit(CalibratedFrame.of(message, camera, received_ns))
+            frame = tracker.admit(CalibratedFrame.of(message, camera, received_ns))
             if frame is not None:
                 synchronizer.add(frame)
             else:
                 synchronizer.ignore(message.camera)
-                faults[f"frames of camera '{message.camera}', whose clock was wrong"] += 1
+                faults[
+                    f"frames of camera '{message.camera}', whose clock was wrong or whose image was frozen"
+                ] += 1
             yield from synchronizer.take(received_ns)
     for name, late in synchronizer.late.items():
         if late:

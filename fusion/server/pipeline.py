@@ -205,20 +205,24 @@ class TrackingPipeline:
             self.early = self.tracker.associate_early(frame_set, n_missing, self.early)
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
-        """A frame in corrected time; None while the clock of its camera is unknown, or if it is in the future."""
-        return self.tracker.clocks.admit(frame) if self.tracker else frame
+        """A frame in corrected time; None while its camera is withheld, or if it is in the future."""
+        return self.tracker.admit(frame) if self.tracker else frame
 
     def clocks(self) -> dict[str, ClockHealth]:
         """The clocks of the cameras."""
         return self.tracker.clocks.health() if self.tracker else {}
 
-    def excluded_clocks(self) -> set[str]:
-        """Cameras whose clocks are wrong by an unknown time."""
-        return self.tracker.clocks.excluded if self.tracker else set()
+    def withheld_cameras(self) -> set[str]:
+        """Cameras whose frames are not used: their clocks are unknown, or their images frozen."""
+        return self.tracker.withheld if self.tracker else set()
 
     def excluded_cameras(self) -> set[str]:
         """Cameras that were moved, whose detections are excluded."""
         return set(self.tracker.extrinsics.excluded) if self.tracker else set()
+
+    def frozen_cameras(self) -> set[str]:
+        """Cameras that repeat an old image."""
+        return self.tracker.frozen.names if self.tracker else set()
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""

@@ -196,7 +196,12 @@ class Server:
         self.pipeline.correct_rig(correction, self.clock.now_ns())
         if self.pipeline.active_rig.message is not None:
             self._publisher.publish_rig(self.pipeline.active_rig.message)
-        log.warning("camera %s is recalibrated and used again; roundel undo reverts that", correction.name)
+        if correction.has_returned:
+            log.warning("camera %s is back at an earlier pose, and used again", correction.name)
+        else:
+            log.warning(
+                "camera %s is recalibrated and used again; roundel undo reverts that", correction.name
+            )
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""
@@ -206,6 +211,7 @@ class Server:
             limits=self.config.limits,
             calibrated=frozenset(self.pipeline.cameras),
             excluded=frozenset(self.pipeline.excluded_cameras()),
+            frozen=frozenset(self.pipeline.frozen_cameras()),
             clocks=self.pipeline.clocks(),
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
@@ -230,7 +236,7 @@ class Server:
         frame, name = self.pipeline.admit(frame), frame.camera
         if frame is None:
             self.pipeline.synchronizer.ignore(name)
-            if name not in self.pipeline.excluded_clocks():
+            if name not in self.pipeline.withheld_cameras():
                 self.statistics.count_fault("implausible time", name)
             return
         age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns

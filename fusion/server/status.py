@@ -31,6 +31,7 @@ class PipelineStatus:
         limits: with which the server tracks.
         calibrated: cameras with a pose in the active rig.
         excluded: cameras that were moved, whose detections are excluded.
+        frozen: cameras that repeat an old image.
         clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         not_acquired: why robots were not acquired, by name.
@@ -41,6 +42,7 @@ class PipelineStatus:
     limits: Limits | None = None
     calibrated: frozenset[str] = frozenset()
     excluded: frozenset[str] = frozenset()
+    frozen: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
@@ -234,6 +236,7 @@ def _camera_health(
         late=camera.late,
         calibrated=name in pipeline.calibrated,
         excluded=name in pipeline.excluded,
+        frozen=name in pipeline.frozen,
         duplicate_publisher=camera.has_two_publishers,
         faults=dict(camera.faults),
         clock=clock.state,

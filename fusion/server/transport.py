@@ -27,6 +27,7 @@ from fusion.server.task_queue import Task, TaskQueue
 
 log = logging.getLogger("fusion")
 MESSAGES = 256  # queued, of one key that is not a camera's
+LEADER_S = 30.0  # for the leading shard to listen
 REQUESTS = 16  # queued, of one key
 ABOVE_QUOTA = "frames above the quota"
 TOO_SLOW = "messages that the server was too slow for"
@@ -49,7 +50,7 @@ def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
         raise ConfigError(
             f"shard {config.shard} connects to {' '.join(config.listen)}; give the first shard's port in --listen"
         )
-    return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config)
+    return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config, LEADER_S)
 
 
 class Transport:

@@ -7,17 +7,20 @@ from functools import partial
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Index, Mask
+from camera_node.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray
-from fusion.model.frames import FrameSet
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
+from fusion.monitoring.frame_consistency import AssignedFrames, FrameConsistency
+from fusion.monitoring.frozen_images import FrozenImages
 from fusion.monitoring.geometry_check import GeometryCheck
-from fusion.monitoring.residual_monitor import ResidualMonitor
+from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
+from fusion.monitoring.time_search import Snapshot
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
@@ -65,6 +68,7 @@ class Update:
         prediction, tracked: see `AssociatedFrames`.
         detections: of all cameras that are not excluded.
         assignments: of the detections, with residuals.
+        associated: the assignments before those were dropped that do not fit.
         summary: of the assignments.
         poses: by row of the robot; acquisition does not change these.
     """
@@ -74,8 +78,32 @@ class Update:
     tracked: Mask
     detections: DetectionTable
     assignments: Assignments
+    associated: Assignments
     summary: ObservationSummary
     poses: dict[int, RobotPose]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """An update: the states, and the assignments that fit.
+
+    Attributes:
+        prediction: the robots before the update.
+        squared: (N,) squared residuals of the assignments in standard deviations.
+        n_rejected: observations of the robots that these contradict.
+    """
+
+    states: States
+    assignments: Assignments
+    prediction: Prediction
+    squared: Array
+    n_rejected: int
+
+    @property
+    def cost(self) -> float:
+        """See `cost_of`."""
+        corrections = self.states.minus(self.prediction.states)
+        return cost_of(self.squared, self.n_rejected, corrections, self.prediction.information)
 
 
 class Tracker:
@@ -112,11 +140,27 @@ class Tracker:
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
         self.clocks = CameraClocks(self.cameras, self.table.markers, self.table.single)
+        self.frozen = FrozenImages(self.cameras, self.table.markers)
+        self.consistency = FrameConsistency(self.cameras, self.table.markers)
         self.extrinsics = ExtrinsicsMonitor()
         self.residuals = ResidualMonitor()
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
+
+    @property
+    def withheld(self) -> set[str]:
+        """Cameras whose frames `admit` refuses: their clocks are unknown, or their images frozen."""
+        return self.clocks.excluded | self.frozen.names
+
+    def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
+        """A frame in corrected time; None while its camera is withheld, or if that time is in the future."""
+        admitted = self.clocks.admit(frame)
+        if admitted is None:
+            return None
+        t_ns, table = self.table.t_ns, self.table
+        now = None if t_ns is None else Snapshot(t_ns, table.states, table.tracked)
+        return None if self.frozen.is_frozen(admitted, now) else admitted
 
     def track(self, frame_set: FrameSet) -> TrackingResult:
         """Track all robots and markers through a complete frame set."""
@@ -167,20 +211,23 @@ class Tracker:
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, assignments = associated.association.collect(self._admitted(frame_set))
-        assignments = self._update_states(associated.prediction, detections, assignments)
+        detections, all_assigned = self._collect(associated, self._admitted(frame_set))
+        assignments = self._update_states(associated.prediction, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         self.geometry.note(summary.residual_px)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
-        return Update(t_ns, associated.prediction, tracked, detections, assignments, summary, poses)
+        return Update(
+            t_ns, associated.prediction, tracked, detections, assignments, all_assigned, summary, poses
+        )
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         update, found = self._acquire(update)
         table = self.table
-        self.clocks.observe(update.t_ns, table.states, table.tracked, update.detections, update.assignments)
+        robots, is_doubtful = (table.states, table.tracked), bool(self._in_doubt(update.t_ns))
+        self.clocks.observe(update.t_ns, robots, update.detections, update.associated, is_doubtful)
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
@@ -194,7 +241,13 @@ class Tracker:
         for correction in corrections:
             if correction.camera is not None:
                 self.cameras.place(correction.name, correction.camera)
+                self.consistency.forget(correction.name)
+                self.clocks.rebase()
         return corrections
+
+    def _in_doubt(self, t_ns: int) -> set[str]:
+        """Cameras that contradict the others, or whose poses are unknown."""
+        return self.consistency.in_doubt(t_ns) | self.extrinsics.excluded
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
@@ -212,6 +265,8 @@ class Tracker:
         """
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
         other.clocks.inherit(self.clocks)
+        other.frozen.inherit(self.frozen)
+        other.consistency.inherit(self.consistency)
         other.extrinsics, other.residuals = self.extrinsics, self.residuals
         other.acquires_none = self.acquires_none
         other.table.inherit(self.table, renamed)
@@ -222,6 +277,20 @@ class Tracker:
         missing = np.flatnonzero(self.table.owned & ~self.table.alive).tolist()
         default = PAUSED if self.acquires_none else "not searched for yet"
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
+
+    def _collect(
+        self, associated: AssociatedFrames, frame_set: FrameSet
+    ) -> tuple[DetectionTable, Assignments]:
+        """Detections and assignments of the frames that do not contradict the tracked robots."""
+        association = associated.association
+        detections, assignments = association.collect(frame_set)
+        states, tracked = associated.prediction.states, associated.tracked
+        given = AssignedFrames(frame_set.t_ns, states, tracked, detections, assignments)
+        wrong = set(self.consistency.contradicting(given).tolist())
+        if not wrong:
+            return detections, assignments
+        frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
+        return association.collect(FrameSet(frame_set.t_ns, frames))
 
     def _is_current(self, association: Association, t_ns: int) -> bool:
         """Whether an association is of this frame set, and of the present robots and camera poses."""
@@ -252,40 +321,39 @@ class Tracker:
         """Update the states of owned robots; returns the assignments that fit, with residuals."""
         own = self.table.owned[self.table.markers.robot[assignments.marker]]
         others, assignments = assignments.select(~own), assignments.select(own)
-        states, fitted = self._fit(prediction, detections, assignments)
-        if self.residuals.is_unusual(fitted.squared_px):
-            states, fitted = self._leave_one_out(prediction, detections, fitted, states)
-        self.table.states = states
-        return fitted.joined(others)
+        fitted = self._fit(prediction, detections, assignments)
+        if self.residuals.is_unusual(fitted.assignments.squared_px):
+            fitted = self._leave_one_out(prediction, detections, assignments, fitted)
+        self.table.states = fitted.states
+        return fitted.assignments.joined(others)
 
-    def _fit(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
-    ) -> tuple[States, Assignments]:
+    def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> _Fit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
         observations = MatchedObservations.of(assignments, detections, self.table.markers)
         states, residuals = self.estimator.update(prediction, observations)
         assignments = assignments.with_residuals(residuals)
         body, n = observations.discs.body, len(self.table.robots)
-        contradicted = mean_by_body(misfit(observations, residuals) > MAX_CHI2, body, n) > CONTRADICTED
-        if not contradicted.any():
-            return states, assignments
-        rows = np.flatnonzero(contradicted)
-        states = states.with_rows(rows, prediction.states.select(rows))
-        return states, assignments.select(~contradicted[body])
+        squared = misfit(observations, residuals)
+        contradicted = mean_by_body(squared > MAX_CHI2, body, n) > CONTRADICTED
+        rows, fits = np.flatnonzero(contradicted), ~contradicted[body]
+        if len(rows):
+            states = states.with_rows(rows, prediction.states.select(rows))
+        return _Fit(states, assignments.select(fits), prediction, squared[fits], len(body) - int(fits.sum()))
 
     def _leave_one_out(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments, states: States
-    ) -> tuple[States, Assignments]:
-        """States and assignments without the camera that contradicts the others, if there is one."""
-        for name in self.residuals.suspects(self.cameras.names):
-            others = detections.camera[assignments.detection] != self.cameras.index[name]
-            if others.all():
-                continue
-            fitted, remaining = self._fit(prediction, detections, assignments.select(others))
-            if self.residuals.confirms(name, remaining.squared_px, assignments.squared_px):
-                return fitted, remaining
-        self.residuals.learn(assignments.squared_px)
-        return states, assignments
+        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments, fitted: _Fit
+    ) -> _Fit:
+        """The fit without the camera that contradicts predictions and all others, if there is one."""
+        camera = detections.camera[assignments.detection]
+        without = {
+            self.cameras.names[k]: self._fit(prediction, detections, assignments.select(camera != k))
+            for k in np.unique(camera).tolist()
+        }
+        name = camera_at_fault(fitted.cost, {name: fit.cost for name, fit in without.items()})
+        if name is None:
+            self.residuals.learn(fitted.assignments.squared_px)
+            return fitted
+        return without[name]
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""

@@ -7,7 +7,6 @@ follow ten robots. Nothing may crash, every fault is reported, and poses are rig
 
 import random
 import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +18,8 @@ from rich.table import Table
 from camera_node.terminal import console, say, track
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.judge import Gap, WrongPose
-from tests.benchmarks.faults.kinds import KINDS, LONGEST_S, SHORT_S, Evidence, Fault
+from tests.benchmarks.faults.kinds import KINDS, LONGEST_S, SHORT_S, VIRTUAL, Evidence, Fault
+from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.fuzz import EXTRA, MAX_MB_PER_MIN
 
 PAUSE_S = 0.5, 3.0  # between two faults
@@ -139,16 +139,16 @@ class Chaos:
         kinds: the names of the kinds to choose from.
     """
 
-    def __init__(self, arena: LiveArena, rng: random.Random, kinds: Sequence[str]) -> None:
+    def __init__(self, arena: LiveArena | VirtualArena, rng: random.Random, kinds: Sequence[str]) -> None:
         self.arena, self.rng, self.kinds = arena, rng, kinds
         self.result = ChaosResult()
         self._waits: list[tuple[float, dict[str, float]]] = []
 
     def run(self, seconds: float) -> Iterator[float]:
         """Cause faults for a time; yields the seconds since the start after each."""
-        begun_s = time.monotonic()
+        begun_s = self.arena.clock.now_s()
         order: list[str] = []
-        while (elapsed_s := time.monotonic() - begun_s) < seconds:
+        while (elapsed_s := self.arena.clock.now_s() - begun_s) < seconds:
             order = order or self._shuffled()
             self._cause(order.pop())
             yield elapsed_s
@@ -162,36 +162,36 @@ class Chaos:
         return names
 
     def _cause(self, kind: str) -> None:
-        arena = self.arena
-        fault = KINDS[kind][1](arena, self.rng)
+        arena, clock = self.arena, self.arena.clock
+        fault = KINDS[kind][1](arena, self.rng)  # pyright: ignore[reportArgumentType] virtual: see VIRTUAL
         counted = dict(arena.status.faults) if arena.status else {}
-        evidence = Evidence(arena, counted=counted, begun_ns=time.time_ns())
-        episode = Episode(kind, fault, time.monotonic(), time.monotonic() + fault.seconds)
+        evidence = Evidence(arena, counted=counted, begun_ns=clock.now_ns())  # pyright: ignore[reportArgumentType]
+        episode = Episode(kind, fault, clock.now_s(), clock.now_s() + fault.seconds)
         self.result.episodes.append(episode)
         fault.begin()
         self._look((episode, evidence), fault.seconds)
         fault.end()
-        episode.ended_s = time.monotonic()
+        episode.ended_s = clock.now_s()
         self._look((episode, evidence), self.rng.uniform(*PAUSE_S))
 
     def _look(self, current: tuple[Episode, Evidence] | None, seconds: float) -> None:
         """Follow logs and status for a time."""
-        end_s, next_s, waits_s = time.monotonic() + seconds, 0.0, 0.0
-        while time.monotonic() < end_s:
-            self.arena.wait(STEP_S)
-            lines = [f"{program}: {line}" for program, line in self.arena.programs.new_lines()]
+        arena, now_s = self.arena, self.arena.clock.now_s
+        end_s, next_s, waits_s = now_s() + seconds, 0.0, 0.0
+        while now_s() < end_s:
+            arena.wait(STEP_S)
+            lines = [f"{program}: {line}" for program, line in arena.new_lines()]
             if current and current[0].fault.report and current[0].reported_s is None:
                 episode, evidence = current
                 evidence.lines += lines
                 if report := current[0].fault.report(evidence):
-                    episode.reported_s, episode.report = time.monotonic(), report
-            if time.monotonic() > waits_s:
-                self._waits.append((time.monotonic(), self.arena.programs.waited_s()))
-                waits_s = time.monotonic() + WAITS_S
-            self.arena.programs.check()
-            if time.monotonic() > next_s:
-                self.arena.programs.sample_memory()
-                next_s = time.monotonic() + 1.0
+                    episode.reported_s, episode.report = now_s(), report
+            if now_s() > waits_s:
+                self._waits.append((now_s(), arena.waited_s()))
+                waits_s = now_s() + WAITS_S
+            arena.inspect(samples_memory=now_s() > next_s)
+            if now_s() > next_s:
+                next_s = now_s() + 1.0
             self._note_gaps()
 
     def _note_gaps(self) -> None:
@@ -232,6 +232,19 @@ def chaos(
         yield from run.run(seconds)
     run.result.crashes = arena.programs.crashes
     run.result.slopes_mb_per_min = {n: max(s) for n, s in arena.programs.slopes_mb_per_min.items()}
+    yield run.result
+
+
+def virtual_chaos(
+    folder: Path, seconds: float, seed: int, kinds: Sequence[str] = VIRTUAL
+) -> Iterator[float | ChaosResult]:
+    """The same in virtual time; the kinds are faults of cameras and robots."""
+    with VirtualArena(folder, small_load(), seed) as arena:
+        arena.wait(2 * SETTLE_S)
+        arena.judge.forget()
+        arena.new_lines()
+        run = Chaos(arena, random.Random(seed), kinds)
+        yield from run.run(seconds)
     yield run.result
 
 

@@ -17,7 +17,9 @@ from tests.benchmarks.faults.network import Namespaces, why_not
 from tests.web.browser import CHROMIUM
 from tests.web.roundel.first_arena import CAMERAS, RADIUS_M, FirstArena, play, render
 
-WIDTHS = {"cameras": (1600,), "wand": (1600,), "robots": (1100,), "status": (1600, 1100, 420)}
+WIDTHS = {"cameras": 1600, "wand": 1600, "robots": 1100, "status": 420}
+TABS = {"cameras": "Cameras", "wand": "Calibrate", "robots": "Robots", "status": "Status"}
+JPEG_QUALITY = 85
 HEIGHT = 1000
 NO_NOTICE = ".mantine-Notifications-root { display: none }"  # that the browser renders in software
 SETTLE_MS = 1500  # for the page to draw at its new width
@@ -28,7 +30,7 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
 
     Args:
         recording: a folder of an earlier run for the rendered pictures; rendered there if it does not exist.
-        pictures: a folder for pictures of the page at 1600, 1100 and 420 pixels, `page_STEP_WIDTH.png`.
+        pictures: a folder for pictures of the page at 1600, 1100 and 420 pixels, `page_STEP.jpg`.
     """
     if reason := "chromium is not installed" if CHROMIUM is None else why_not():
         sys.exit(f"this machine can't run the benchmark: {reason}")
@@ -41,8 +43,8 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
 
         def show(page: Page, step: str) -> None:
             print(f"{time.monotonic() - start:.0f} s: {step}", flush=True)
-            if pictures is not None:
-                take_pictures(page, step, pictures)
+            if pictures is not None and step in WIDTHS:
+                take_picture(page, step, pictures)
 
         with Namespaces([CAMERAS]) as network, FirstArena(network, recording, folder) as arena:
             outcome = play(arena, folder, show)
@@ -53,14 +55,14 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
     )
 
 
-def take_pictures(page: Page, step: str, folder: Path) -> None:
-    """Save the page at the widths of a step, then show it as before."""
+def take_picture(page: Page, step: str, folder: Path) -> None:
+    """Save the page at the width of a step, then show it as before."""
     page.add_style_tag(content=NO_NOTICE)
-    for width in WIDTHS.get(step, ()):
-        page.set_viewport_size({"width": width, "height": HEIGHT})
-        page.wait_for_timeout(SETTLE_MS)
-        page.screenshot(path=folder / f"page_{step}_{width}.png")
-    page.set_viewport_size({"width": 1600, "height": HEIGHT})
+    page.set_viewport_size({"width": WIDTHS[step], "height": HEIGHT})
+    page.get_by_role("tab", name=TABS[step]).click()  # a narrow page begins with its first tab
+    page.wait_for_timeout(SETTLE_MS)
+    page.screenshot(path=folder / f"page_{step}.jpg", quality=JPEG_QUALITY)
+    page.set_viewport_size({"width": WIDTHS["cameras"], "height": HEIGHT})
 
 
 if __name__ == "__main__":

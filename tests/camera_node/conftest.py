@@ -7,6 +7,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import NetworkError
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port
 from tests.waiting import Inbox, poll
@@ -16,7 +17,7 @@ class Network:
     """Routers and clients that are closed when the test ends."""
 
     def __init__(self) -> None:
-        self._sessions: list[zenoh.Session] = []
+        self._sessions: list[zenoh.Session | ServerConnection] = []
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
 
     def router(self) -> zenoh.Session:
@@ -33,7 +34,14 @@ class Network:
         return self._register(open_router([self.endpoint]))
 
     def client(self) -> zenoh.Session:
+        """Open a session with the router."""
         return self._register(open_client([self.endpoint]))
+
+    def connection(self) -> ServerConnection:
+        """Begin to connect to the router, which may open later."""
+        connection = ServerConnection([self.endpoint])
+        self._sessions.append(connection)
+        return connection
 
     def _register(self, session: zenoh.Session) -> zenoh.Session:
         self._sessions.append(session)

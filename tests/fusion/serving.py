@@ -65,7 +65,7 @@ def serving(settings: ArenaConfig) -> Iterator[tuple[Server, Client]]:
 def connected(server: Server) -> Iterator[Client]:
     """A client that has reached the server."""
     with Client.connect(*server.endpoints, arena="test") as client:
-        until(lambda: list(client._session.get(KEYS.clock, timeout=1.0)))
+        until(lambda: list(client.session.get(KEYS.clock, timeout=1.0)))
         yield client
 
 

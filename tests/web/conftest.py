@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import drawing, loopback
@@ -26,12 +26,12 @@ def arena() -> Iterator[LiveArena]:
 @pytest.fixture
 def subscription(arena: LiveArena) -> Iterator[Subscription]:
     """A connected feed: it receives every later message."""
-    session = open_client([arena.endpoint])
-    subscription = Subscription(session, Feed("test"))
+    connection = ServerConnection([arena.endpoint])
+    subscription = Subscription(connection, Feed("test"))
     wait_for(lambda: subscription.feed.state().markers, lambda: arena.markers([(0, 0, 0)]))
     yield subscription
     subscription.close()
-    session.close()
+    connection.close()
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import pytest
 from camera_node.protocol.messages import encode
 from tests.calib.rig.hostile import as_publication, hostile_messages
 from tests.waiting import wait_for
-from tests.web.arena import LiveArena, four_cameras
-from web.feed import MAX_REASONS, REMOVED_CAMERA_S, Feed
+from tests.web.arena import ArenaMessages, LiveArena, four_cameras
+from web.feed import MAX_PENDING, MAX_REASONS, REMOVED_CAMERA_S, Feed
 from web.messages import DemoProgress, progress_key
 from web.subscription import Subscription
 
@@ -39,6 +39,7 @@ def test_invalid_bytes_are_counted(arena: LiveArena, feed: Feed, data: bytes):
         keys.fusion_status,
         keys.camera_status("north"),
         keys.detections("north"),
+        keys.relative("north"),
         keys.rig,
         progress_key("test"),
     ]
@@ -54,11 +55,57 @@ def test_invalid_bytes_are_counted(arena: LiveArena, feed: Feed, data: bytes):
 
 def test_an_invalid_pose_is_counted(arena: LiveArena, feed: Feed):
     """A position beyond any arena, a pose under another robot's key, and another kind of message."""
-    arena.pose("rover", (1e300, 0.0, 0.0))
-    arena.pose("drone", (0.0, 0.0, 0.0), key="rover")
-    arena.put(arena.keys.robot_pose("rover"), encode(DemoProgress(t_ns=0, text="", share=0.5)))
-    wait_for(lambda: feed.state().faults.total() == 3)
+    for k, send in enumerate(
+        (
+            lambda: arena.pose("rover", (1e300, 0.0, 0.0)),
+            lambda: arena.pose("drone", (0.0, 0.0, 0.0), key="rover"),
+            lambda: arena.put(
+                arena.keys.robot_pose("rover"), encode(DemoProgress(t_ns=0, text="", share=0.5))
+            ),
+        )
+    ):
+        send()  # the next one would supersede it before it is decoded
+        wait_for(lambda k=k: feed.state().faults.total() == k + 1)
     assert not feed.state().poses
+
+
+def test_only_the_latest_pose_is_decoded():
+    """When the state is read, with its time of arrival; with a callback each pose is decoded when it arrives."""
+    now, got = [0.0], []
+    arena = Recorded()
+    for x in (1.0, 2.0, 3.0):
+        arena.pose("rover", (x, 0.0, 0.0))
+    feeds = [Feed("test", clock=lambda: now[0]), Feed("test", got.append, clock=lambda: now[0])]
+    for feed in feeds:
+        for key, data in arena.messages:
+            now[0] += 1.0
+            feed.receive(feed.keys.robot_pose(), key, data)
+    lazy, eager = (feed.state() for feed in feeds)
+    assert lazy.poses["rover"].message.position[0] == eager.poses["rover"].message.position[0] == 3.0
+    assert (lazy.poses["rover"].received_s, eager.poses["rover"].received_s) == (3.0, 6.0)
+    assert (lazy.message_counts["RobotPose"], eager.message_counts["RobotPose"]) == (1, 3)
+    assert [pose.position[0] for pose in got] == [1.0, 2.0, 3.0]
+
+
+def test_the_number_of_undecoded_messages_is_limited():
+    """A sender of ever new keys is counted."""
+    arena, feed = Recorded(), Feed("test")
+    arena.pose("rover", (0.0, 0.0, 0.0))
+    for k in range(MAX_PENDING + 10):
+        feed.receive(feed.keys.robot_pose(), feed.keys.robot_pose(f"r{k}"), arena.messages[0][1])
+    faults = feed.state().faults
+    assert faults[f"more than {MAX_PENDING} keys"] == 10
+    assert faults.total() == MAX_PENDING + 10, "the names in the others differ from their keys"
+
+
+class Recorded(ArenaMessages):
+    """Stores the messages."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[str, bytes]] = []
+
+    def put(self, key: str, data: bytes) -> None:
+        self.messages.append((key, data))
 
 
 def test_an_invalid_rig_is_counted(arena: LiveArena, feed: Feed):

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Page, TimeoutError
 
 from camera_node.errors import RoundelError
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot
 from tests.fusion.synthetic import WIDE
@@ -32,8 +32,8 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     """
     monkeypatch.setattr("web.view.PERIOD_S", 0.2)
     monkeypatch.setattr("web.view.PANEL_INTERVAL", 2)
-    with serving_an_unknown_robot(tmp_path) as (endpoint, client), open_client([endpoint]) as session:
-        subscription = Subscription(session, Feed("test"))
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client), ServerConnection([endpoint]) as connection:
+        subscription = Subscription(connection, Feed("test"))
         view = View(subscription.feed, loopback())
         picker = MarkerPicker(view.server, subscription)
         view.add(picker)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from fusion.commands.record import recordings
 from fusion.recordings.summary import list_recordings
 from tests.fusion.serving import serving_an_unknown_robot
@@ -30,8 +30,8 @@ EXPORT_MS = 120_000  # on a busy machine: a process starts and fuses the recordi
 @pytest.fixture
 def view(tmp_path: Path) -> Iterator[View]:
     """The page of a running arena."""
-    with serving_an_unknown_robot(tmp_path) as (endpoint, _), open_client([endpoint]) as session:
-        subscription = Subscription(session, Feed("test"))
+    with serving_an_unknown_robot(tmp_path) as (endpoint, _), ServerConnection([endpoint]) as connection:
+        subscription = Subscription(connection, Feed("test"))
         view = View(subscription.feed, loopback())
         with ExitStack() as closing, drawing(view):
             add_live_page(view, subscription, endpoint, None, closing, tmp_path / "recordings")

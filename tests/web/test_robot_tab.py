@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from fusion.model.robot_frame import turn_heading
 from fusion.model.robots import load_robots
@@ -27,8 +27,11 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     """A running server that declares the robot a, and its page."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "server").mkdir()
-    with serving(config(tmp_path / "server")) as (server, client), open_client(server.endpoints) as session:
-        subscription = Subscription(session, Feed("test"))
+    with (
+        serving(config(tmp_path / "server")) as (server, client),
+        ServerConnection(server.endpoints) as connection,
+    ):
+        subscription = Subscription(connection, Feed("test"))
         view = View(subscription.feed, loopback())
         with ExitStack() as closing, drawing(view):
             add_live_page(view, subscription, server.endpoints[0], None, closing)

@@ -8,8 +8,8 @@ import zenoh
 from calib.rig.messages import RigMessage, undo_rig_key
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError, RoundelError
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
-from camera_node.protocol.session import open_client
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.feed import Feed
@@ -20,9 +20,9 @@ def test_a_late_subscriber_receives_the_rig(arena: LiveArena):
     """A feed that starts after the calibration requests the rig when it sees the server."""
     queryable = arena.serve_rig(four_cameras())
     token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
-    session = open_client([arena.endpoint])
+    connection = ServerConnection([arena.endpoint])
     late = Feed("test")
-    subscription = Subscription(session, late)
+    subscription = Subscription(connection, late)
     wait_for(lambda: late.state().rig, arena.status)  # each status repeats the request
     rig = late.state().rig
     assert rig is not None
@@ -32,7 +32,7 @@ def test_a_late_subscriber_receives_the_rig(arena: LiveArena):
     wait_for(lambda: not late.state().server_alive)
     queryable.undeclare()
     subscription.close()
-    session.close()
+    connection.close()
 
 
 def test_a_snapshot_of_an_absent_camera_is_none(subscription: Subscription):

@@ -7,11 +7,12 @@ commands appears at once. `COMMANDS` is the list in the order of the work; the o
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import requires, version
 
 # Before NumPy is loaded, as in fusion.__main__: `roundel server` runs in this process.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -94,11 +95,12 @@ COMMANDS = {
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras",
+        "list, rename and forget cameras; show what one refuses, and why",
         _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
+            "roundel cameras why north refused.jpg",
         ),
     ),
     "settings": Command(
@@ -144,9 +146,13 @@ COMMANDS = {
         logging.WARNING,
     ),
     "plan": Command(
-        "predict range, coverage and precision before you mount cameras",
+        "predict coverage and precision, and where to mount cameras",
         _plan,
-        ("roundel plan plan.yaml",),
+        (
+            "roundel plan configs/plan.yaml --report plan.html",
+            "roundel plan configs/plan.yaml --suggest 6 --out suggested.yaml",
+            "roundel plan --rig rig.yaml --json",
+        ),
         logging.WARNING,
     ),
     "server": Command(
@@ -209,7 +215,24 @@ def execute(name: str, *arguments: str) -> int | None:
     if command is None:
         raise ConfigError(f"{name} needs a command before it; roundel --help lists them")
     set_up_logging(command.log_level)
-    return command.run(f"roundel {name}", arguments, command.examples)
+    try:
+        return command.run(f"roundel {name}", arguments, command.examples)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if (extra := _extra_of(package)) is None:
+            raise
+        raise ConfigError(
+            f"roundel {name} needs {package}, which a camera's machine does not; pip install 'roundel[{extra}]'"
+        ) from None
+
+
+def _extra_of(package: str) -> str | None:
+    """The extra that installs a package; None if none does."""
+    for requirement in requires("roundel") or ():
+        name, extra = re.match(r"[\w-]+", requirement), re.search(r"extra == ['\"](\w+)", requirement)
+        if name and extra and name[0] == package:
+            return extra[1]
+    return None
 
 
 def overview() -> str:

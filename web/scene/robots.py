@@ -16,6 +16,7 @@ BODY_RADIUS_M, BODY_HEIGHT_M = 0.13, 0.03
 LABEL_OFFSET_M = np.array([0.0, 0.0, 0.16])
 LABEL_SCALE = 0.8
 LABEL_STEP_M = 0.01  # a label follows its robot in steps of so much
+MAX_LABELS = 20  # moved in one slow drawing
 
 
 class RobotDrawing:
@@ -29,6 +30,8 @@ class RobotDrawing:
         self._bodies: Any = None
         self._trail_lines: Any = None
         self._labels: dict[str, Any] = {}
+        self._label_positions = np.empty((0, 3))
+        self._next_label = 0
 
     def draw(self, state: ArenaState, is_slow: bool) -> None:
         """Draw the latest poses; labels and trails change in slow drawings only, which cost ten times as much."""
@@ -47,12 +50,19 @@ class RobotDrawing:
             self._extend_trails(names, positions, tracking)
 
     def _draw_labels(self, names: list[str], positions: NDArray, tracking: list[str]) -> None:
-        for name, position, robot in zip(names, positions, tracking, strict=True):
+        """Draw the labels that changed, at most `MAX_LABELS`, in turn: Viser has no batch of labels."""
+        for name, robot in zip(names, tracking, strict=True):
             label, text = self._labels[name], name if robot == "tracked" else f"{name}: {robot}"
-            if np.linalg.norm(label.position - position - LABEL_OFFSET_M) > LABEL_STEP_M:
-                label.position = position + LABEL_OFFSET_M
             if label.text != text:
                 label.text = text
+        wanted = positions + LABEL_OFFSET_M
+        moved = np.flatnonzero(np.linalg.norm(wanted - self._label_positions, axis=1) > LABEL_STEP_M)
+        first = np.searchsorted(moved, self._next_label)
+        chosen = np.roll(moved, -first)[:MAX_LABELS]
+        for k in chosen.tolist():
+            self._labels[names[k]].position = wanted[k]
+        self._label_positions[chosen] = wanted[chosen]
+        self._next_label = int(chosen[-1]) + 1 if len(chosen) else 0
 
     def _extend_trails(self, names: list[str], positions: ArrayLike, tracking: list[str]) -> None:
         for name, position, robot in zip(names, np.asarray(positions), tracking, strict=True):
@@ -69,6 +79,7 @@ class RobotDrawing:
             if handle is not None and not names:
                 handle.remove()
         self._names = names
+        self._label_positions, self._next_label = np.full((len(names), 3), np.inf), 0
         for name, position in zip(names, positions, strict=True):
             if name not in self._labels:
                 self._labels[name] = self.scene.add_label(

@@ -38,14 +38,16 @@ class CameraTable:
         self._coverage_folder = gui.add_folder("Wand coverage", visible=False)
         with self._coverage_folder:
             self._coverage = gui.add_image(montage({}))
+        self._marked: dict[str, int] = {}  # pixels of the pictures that are shown
 
     def update(self, state: ArenaState) -> None:
         """Show the state."""
         set_content(self._table, tabulate_cameras(state).html())
         calibrated = state.rig is not None and bool(state.rig.placed())
         set_property(self._coverage_folder, "visible", bool(state.coverage) and not calibrated)
-        if self._coverage_folder.visible:
-            self._coverage.image = montage(state.coverage)
+        marked = {name: picture.n_marked for name, picture in state.coverage.items()}
+        if self._coverage_folder.visible and marked != self._marked:
+            self._marked, self._coverage.image = marked, montage(state.coverage)
 
 
 class LivePictures:

@@ -167,7 +167,7 @@ class Recorder:
             self._thread.join(CLOSE_S)
 
     def _record(self, writer: RecordingWriter) -> None:
-        recorder = ArenaRecorder(self._subscription.session, self._subscription.feed.keys.arena, writer)
+        recorder = ArenaRecorder(self._subscription.connection, self._subscription.feed.keys.arena, writer)
         try:
             recorder.run(self._stop)
             writer.__exit__()

@@ -61,7 +61,9 @@ def mavlink(
     ):
         bridge = MavlinkBridge(autopilot, converter, rate, message)
         poses.client.status().on_message(bridge.resets.add_status)
-        clock = ClockSync(poses.client.session, poses.client.keys).start()
+        if (session := poses.client.connection.wait_unless(stop)) is None:
+            return 0
+        clock = ClockSync(session, poses.client.keys).start()
         say(f"MAVLink: '{robot}' to {to}")
         while not stop.is_set():
             bridge.step(poses, clock)

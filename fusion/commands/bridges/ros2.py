@@ -3,7 +3,7 @@
 
 import os
 
-from camera_node.protocol.session import open_client
+from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
 from camera_node.terminal import say
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
@@ -18,6 +18,7 @@ def ros2(
     namespace: str = "",
     frame: str = "world",
     humble: bool = False,
+    relative: tuple[str, ...] = (),
 ) -> int:
     """Publish an arena's robots to ROS 2, for nodes that run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, until stopped.
 
@@ -28,16 +29,21 @@ def ros2(
         namespace: prefix of the robots' topics, such as lab1.
         frame: the name of the world in headers and in tf.
         humble: the nodes are of ROS 2 Humble, whose topics have no type hash.
+        relative: cameras that locate roundels by themselves, as on a robot; publish what they locate, too.
     """
     ros_domain = parse_domain(os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else str(domain))
     prefix = parse_namespace(namespace)
     with (
         stopped_by_signals() as stop,
         server.receive_poses() as poses,
-        open_client(ros or server.connect, None if ros else server.zenoh) as session,
+        ServerConnection(ros or server.connect, None if ros else server.zenoh) as connection,
     ):
+        if (session := connection.wait_unless(stop)) is None:
+            return 0
         node = Ros2Node(session, ros_domain, prefix, humble)
         say(f"ROS 2, domain {ros_domain}")
+        for camera in relative:
+            poses.client.relative(camera).on_message(node.publish_relative)
         while not stop.is_set():
             node.publish(poses.take(WAIT_S), frame)
         log_faults(node.faults)

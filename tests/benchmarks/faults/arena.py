@@ -17,7 +17,7 @@ from fusion.protocol.messages import FusionStatus
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.network import Loopback
 from tests.benchmarks.faults.programs import Programs, python
-from tests.benchmarks.faults.world import CameraCommand, CameraFault, RobotEvent, World
+from tests.benchmarks.faults.world import CameraCommand, CameraFault, Clock, RobotEvent, World
 from tests.benchmarks.fusion_load import Load
 from tests.conftest import ROOT, free_port
 
@@ -56,7 +56,8 @@ class LiveArena:
         self.folder, self.load, self.extra = folder, load, extra
         self.network = network or Loopback()
         self.rig = dict(load.rig)
-        self.world = World(load, time.time_ns())
+        self.clock = Clock()
+        self.world = World(load, self.clock.now_ns())
         self.judge = PoseJudge(self.world)
         self.keys = Keys(ARENA)
         self.cameras = tuple(load.rig)
@@ -80,7 +81,7 @@ class LiveArena:
             self.client = stack.enter_context(Client.connect(self.endpoint, arena=ARENA))
             self.client.poses().on_message(self.judge.receive)
             self.client.status().on_message(lambda status: setattr(self, "status", status))
-            self.session = self.client._session
+            self.session = self.client.session
             subscriber = self.session.declare_subscriber(self.keys.camera_status(), self._take_camera_status)
             stack.callback(subscriber.undeclare)
             self._stack = stack.pop_all()
@@ -88,6 +89,20 @@ class LiveArena:
 
     def __exit__(self, *exception: object) -> None:
         self._stack.close()
+
+    def new_lines(self) -> list[tuple[str, str]]:
+        """The lines that the programs logged since the last call, with the programs' names."""
+        return self.programs.new_lines()
+
+    def waited_s(self) -> dict[str, float]:
+        """For how long each thread has waited for a processor."""
+        return self.programs.waited_s()
+
+    def inspect(self, samples_memory: bool) -> None:
+        """Note programs that ended by themselves, and the memory of all."""
+        self.programs.check()
+        if samples_memory:
+            self.programs.sample_memory()
 
     def wait(self, seconds: float) -> None:
         """Wait; the arena goes on."""

@@ -29,6 +29,7 @@ from tests.benchmarks.faults.world import CameraCommand, CameraFault, World
 from tests.benchmarks.fusion_load import Load, Scene
 
 READOUT_NS = 5_000_000
+STAMP_SIGMA_NS = 20_000  # of a driver: no two frames have exactly the same stamp
 GREY = {"black": 0, "bright": 255}  # levels of the images; others are grey
 
 
@@ -61,6 +62,8 @@ class SceneCamera(Source):
 
     def __init__(self, world: World, name: str, detector: SceneDetector) -> None:
         self.dropped, self.fault = 0, CameraFault()
+        self._shown = no_roundels()  # by the last frame
+        self._held: list[tuple[Frame, Roundels]] = []  # of frames that arrive in the wrong order
         self._world, self._scene, self._detector = world, Scene(world.load), detector
         self._name, self._index = name, self._scene.cameras.names.index(name)
         self._phase = world.load.phases()[self._index]
@@ -72,18 +75,33 @@ class SceneCamera(Source):
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
-        held: list[tuple[Frame, Roundels]] = []
-        seq = self._newest() + 1
-        while self._wait_until(self._time_ns(seq) + READOUT_NS + round(self.fault.delay_ms * 1e6)):
-            fault, t_ns = self.fault, self._time_ns(seq)
-            seq = max(seq + 1, self._newest() - round(fault.delay_ms * 1e-3 * self._world.load.hz))
-            if fault.silent or self._rng.random() < fault.loss:
-                continue
-            held += [self._expose(t_ns, fault)] * (2 if fault.doubled else 1)
-            if not (fault.swapped and len(held) < 2):
-                for frame, self._detector.current in reversed(held):
-                    yield frame
-                held.clear()
+        seq = self.next_after(-1, time.time_ns())
+        while self._wait_until(self.due_ns(seq)):
+            fault = self.fault
+            for frame, roundels in self.deliver(seq):
+                self._detector.current = roundels
+                yield frame
+            seq = self.next_after(seq, time.time_ns(), fault.delay_ms)
+
+    def due_ns(self, seq: int) -> int:
+        """The Unix time at which a frame is delivered."""
+        return self._time_ns(seq) + READOUT_NS + round(self.fault.delay_ms * 1e6)
+
+    def next_after(self, seq: int, now_ns: int, delay_ms: float = 0.0) -> int:
+        """The number of the next frame; frames that nobody fetched in time are skipped."""
+        elapsed_s = (now_ns - self._world.epoch_ns - READOUT_NS) * 1e-9 - delay_ms * 1e-3
+        return max(seq + 1, math.floor(elapsed_s * self._world.load.hz - self._phase) + (seq < 0))
+
+    def deliver(self, seq: int) -> list[tuple[Frame, Roundels]]:
+        """The frames that become available with this one: none, one, or two."""
+        fault = self.fault
+        if fault.silent or self._rng.random() < fault.loss:
+            return []
+        self._held += [self._expose(self._time_ns(seq), fault)] * (2 if fault.doubled else 1)
+        if fault.swapped and len(self._held) < 2:
+            return []
+        delivered, self._held = self._held[::-1], []
+        return delivered
 
     def place(self, fault: CameraFault) -> None:
         """Set the faults, and the true pose of the camera."""
@@ -97,16 +115,18 @@ class SceneCamera(Source):
         self._closed.set()
 
     def _expose(self, t_ns: int, fault: CameraFault) -> tuple[Frame, Roundels]:
-        world, shown_ns = self._world, fault.since_ns if fault.picture == "frozen" else t_ns
-        rng = np.random.default_rng(shown_ns) if fault.picture == "frozen" else self._rng
+        world = self._world
         image = self._images[fault.picture if fault.picture in GREY else ""]
+        stamp_ns = fault.stamp_ns(t_ns) + round(self._rng.normal() * STAMP_SIGMA_NS)
         if fault.picture in GREY:
-            return Frame(image, fault.stamp_ns(t_ns)), no_roundels()
-        hidden = world.hidden(shown_ns)
-        roundels = self._scene.roundels(self._index, world.states(shown_ns), rng, hidden)
+            return Frame(image, stamp_ns), no_roundels()
+        if fault.picture == "frozen":
+            return Frame(image, stamp_ns), self._shown
+        roundels = self._scene.roundels(self._index, world.states(t_ns), self._rng, world.hidden(t_ns))
         if fault.false:
             roundels = joined(roundels, self._false(min(fault.false, MAX_ROUNDELS - len(roundels))))
-        return Frame(image, fault.stamp_ns(t_ns)), roundels
+        self._shown = roundels
+        return Frame(image, stamp_ns), roundels
 
     def _false(self, n: int) -> Roundels:
         camera, rng = self._world.load.rig[self._name], self._rng
@@ -117,10 +137,6 @@ class SceneCamera(Source):
 
     def _time_ns(self, seq: int) -> int:
         return self._world.epoch_ns + round((seq + self._phase) / self._world.load.hz * 1e9)
-
-    def _newest(self) -> int:
-        elapsed_s = (time.time_ns() - self._world.epoch_ns - READOUT_NS) * 1e-9
-        return math.floor(elapsed_s * self._world.load.hz - self._phase)
 
     def _wait_until(self, t_ns: int) -> bool:
         return not self._closed.wait(max(0, t_ns - time.time_ns()) * 1e-9)

@@ -2,14 +2,13 @@
 """Compares received poses with the truth, and finds the gaps between them."""
 
 import threading
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fusion.model.states import POSITION
 from fusion.protocol.messages import RobotPose
-from tests.benchmarks.faults.world import World
+from tests.benchmarks.faults.world import Clock, World
 
 MAX_ERROR_M = 0.010  # a tracked pose is wrong if its error is above this and above MAX_SIGMAS
 MAX_SIGMAS = 5.0
@@ -46,6 +45,7 @@ class PoseJudge:
     Attributes:
         min_gap_s: gaps that are longer are kept.
         max_error_m: smaller errors are right.
+        clock: by which poses arrive.
         count, rms_m, largest_m: of tracked poses: their number, and their errors.
     """
 
@@ -54,6 +54,7 @@ class PoseJudge:
     max_error_m: float = MAX_ERROR_M
     gaps: list[Gap] = field(default_factory=list)
     wrong: list[WrongPose] = field(default_factory=list)
+    clock: Clock = field(default_factory=Clock)
     count: int = 0
     squared_m2: float = 0.0
     largest_m: float = 0.0
@@ -68,14 +69,14 @@ class PoseJudge:
         if pose.state != "tracked" or pose.robot not in self.world.names:
             return
         with self._lock:
-            now_s = time.monotonic()
+            now_s = self.clock.now_s()
             self._close_gap(pose.robot, now_s)
             self._last_s[pose.robot] = now_s
             self._compare(pose, now_s)
 
     def tracked(self, within_s: float) -> int:
         """How many robots had a tracked pose within the last seconds."""
-        now_s = time.monotonic()
+        now_s = self.clock.now_s()
         return sum(now_s - at_s < within_s for at_s in tuple(self._last_s.values()))
 
     def forget(self) -> None:
@@ -95,7 +96,7 @@ class PoseJudge:
         """At the end: gaps of robots that did not come back."""
         with self._lock:
             for robot in self.world.names:
-                self._close_gap(robot, time.monotonic())
+                self._close_gap(robot, self.clock.now_s())
 
     def _close_gap(self, robot: str, now_s: float) -> None:
         begun_s = self._last_s.get(robot)
@@ -108,7 +109,7 @@ class PoseJudge:
     def _visible_since_s(self, robot: str, now_s: float) -> float:
         """When the robot was last uncovered, by the monotonic clock."""
         event = self.world.events.get(robot)
-        return now_s + (event.hidden_until_ns - time.time_ns()) * 1e-9 if event else 0.0
+        return now_s + (event.hidden_until_ns - self.clock.now_ns()) * 1e-9 if event else 0.0
 
     def _compare(self, pose: RobotPose, now_s: float) -> None:
         if pose.t_ns != self._truth_ns:

@@ -3,7 +3,6 @@
 
 import contextlib
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -213,7 +212,7 @@ def carried(arena: LiveArena, rng: random.Random, moved_m: float) -> Fault:
     name, seconds = rng.choice(arena.world.names), rng.uniform(0.8, 3.0)
 
     def begin() -> None:
-        old, now_ns = arena.world.events.get(name), time.time_ns()
+        old, now_ns = arena.world.events.get(name), arena.clock.now_ns()
         place = old.after if old else (0.0, 0.0, 0.0)
         x, y = (rng.uniform(-moved_m, moved_m) for _ in range(2))
         new = (x, y, rng.uniform(0, moved_m)) if moved_m else place
@@ -352,7 +351,7 @@ def camera_fault(
     """A fault of a simulated camera that goes on running."""
 
     def begin() -> None:
-        arena.place(name, replace(fault, since_ns=time.time_ns()))
+        arena.place(name, replace(fault, since_ns=arena.clock.now_ns()))
 
     return Fault(name, begin, lambda: arena.place(name, CameraFault()), report, seconds, gap_s)
 
@@ -382,3 +381,18 @@ KINDS: dict[str, tuple[int, Callable[[LiveArena, random.Random], Fault]]] = {  #
     "robots changed": (2, changed_robots),
     "fuzz": (2, fuzz_burst),
 }
+
+VIRTUAL = (  # kinds that need no programs besides cameras and server
+    "camera silent",
+    "camera frozen",
+    "false roundels",
+    "frames lost",
+    "frames late",
+    "frames swapped",
+    "frames doubled",
+    "clock stepped",
+    "clock drifts",
+    "camera moved",
+    "robot covered",
+    "robot carried",
+)

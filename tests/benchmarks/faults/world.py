@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The true state of a simulated arena at any time, and the faults that its cameras and robots are given."""
 
+import time
 from dataclasses import replace
 
 import msgspec
@@ -10,6 +11,18 @@ from fusion.model.states import States
 from tests.benchmarks.fusion_load import Load
 
 Vector = tuple[float, float, float]
+
+
+class Clock:
+    """The time of an arena that runs in real time."""
+
+    def now_s(self) -> float:
+        """Of the monotonic clock."""
+        return time.monotonic()
+
+    def now_ns(self) -> int:
+        """Unix time."""
+        return time.time_ns()
 
 
 class RobotEvent(msgspec.Struct, frozen=True, kw_only=True):

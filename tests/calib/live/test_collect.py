@@ -34,5 +34,9 @@ def test_detections_are_collected_past_invalid_messages(endpoint: str):
 
 
 def test_no_detections_is_an_error_that_names_the_key(endpoint: str):
-    with open_client([endpoint]) as client, pytest.raises(CalibrationError, match="no detections on test/"):
+    with (
+        open_router([endpoint]),
+        open_client([endpoint]) as client,
+        pytest.raises(CalibrationError, match="no detections on test/"),
+    ):
         collect_with_progress(client, "test", 0.1, "collecting")

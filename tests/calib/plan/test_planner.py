@@ -16,7 +16,7 @@ from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
 from camera_node.config import load_yaml
 from camera_node.sensor_model.operational_space import Pattern
-from camera_node.sensor_model.visibility import is_detected
+from camera_node.sensor_model.visibility import is_detected, is_in_image
 from fusion.model.limits import Limits
 from tests.conftest import ROOT
 
@@ -45,7 +45,7 @@ def test_more_cameras_see_more_and_are_more_precise():
 
 
 def test_a_camera_detects_what_the_sensor_model_says():
-    """The vectorised views agree with `is_detected`, which projects every outline, except within 2 px of a limit."""
+    """The views agree with `is_detected`, which projects every outline, except near a limit; they see cut discs too."""
     camera, sensor = CAMERAS["c0"], RoundelSensor.of(ARENA.plan, KIND)
     points = np.random.default_rng(1).uniform([-4, -4, 0], [4, 4, 2.5], (4000, 3))
     T = camera.matrix()
@@ -53,8 +53,24 @@ def test_a_camera_detects_what_the_sensor_model_says():
     normal = np.tile(T[2, :3], (len(points), 1))
     expected = is_detected(camera, Pattern.of(ROBOT.diameter_m), local, normal, sensor.imaging)
     found = np.isin(np.arange(len(points)), sensor.view(camera, points).rows)
+    complete = is_in_image(camera, ROBOT.diameter_m, local, normal)
     assert 0.1 < found.mean() < 0.9
-    assert (found != expected).mean() < 0.01
+    assert (found != expected)[complete].mean() < 0.01
+    cut = found & ~complete
+    assert cut.any()
+    uv = camera.project_world(points[cut])
+    assert camera.sees(uv).all()
+
+
+def test_a_roundel_that_the_border_cuts_is_less_precise():
+    camera, sensor = CAMERAS["c0"], RoundelSensor.of(ARENA.plan, KIND)
+    places = np.column_stack([np.zeros(400), np.linspace(0.0, 3.0, 400), np.full(400, 0.3)])
+    view = sensor.view(camera, places)
+    sigma = np.sqrt(np.trace(view.noise, axis1=1, axis2=2))
+    last, uv = view.rows[-1], camera.project_world(places[view.rows])
+    assert last < 399
+    assert sigma[-1] > 3 * sigma[len(sigma) // 2]
+    assert (np.diff(np.abs(uv[:, 0] - camera.cx)) > 0).all()  # the path leaves the image sideways
 
 
 def test_predicted_errors_are_those_of_triangulation():

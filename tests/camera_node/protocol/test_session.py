@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Zenoh sessions open without a router, find it, reconnect after its loss, and the router relays between them."""
+"""Zenoh sessions find the router, reconnect after its loss, and the router relays between them."""
 
 import logging
 import re
@@ -33,10 +33,12 @@ class Ticker:
 
 @pytest.fixture
 def ticking(network):
-    """A client that puts to a/b before there is a router."""
-    ticker = Ticker(network.client(), "a/b")
+    """A program that puts to a/b and starts before the router."""
+    tickers = []
+    network.connection().when_open(lambda session: tickers.append(Ticker(session, "a/b")))
     yield
-    ticker.close()
+    for ticker in tickers:
+        ticker.close()
 
 
 def test_a_client_delivers_after_the_router_opens_and_after_it_reopens(network, inbox, ticking):
@@ -97,6 +99,7 @@ def test_an_error_names_the_invalid_endpoint(endpoint: str):
 
 
 def test_a_zenoh_configuration_is_used_or_refused(tmp_path: Path, network):
+    network.router()
     with pytest.raises(ConfigError, match=r"none\.json5 does not exist"):
         open_client([network.endpoint], tmp_path / "none.json5")
     broken = tmp_path / "broken.json5"
@@ -112,7 +115,9 @@ def test_a_zenoh_configuration_is_used_or_refused(tmp_path: Path, network):
 
 def test_publications_while_the_router_is_away_are_dropped(network, inbox, eventually):
     """10,000 publications of 4 kB are 40 MB; the first that arrives was sent later."""
+    router = network.router()
     publisher = network.client().declare_publisher("a/b")
+    router.close()
     for _ in range(10_000):
         publisher.put(bytes(4096))
     got = inbox()
@@ -124,6 +129,7 @@ def test_publications_while_the_router_is_away_are_dropped(network, inbox, event
 def test_the_servers_absence_and_return_are_logged_once_each(network, eventually, caplog):
     """However often the absence is checked; a server that was never present is absent as well."""
     caplog.set_level(logging.WARNING, "camera_node.protocol.session")
+    router = network.router()
     watch = ServerWatch(network.client(), "a/alive", patience_s=0.0)
 
     def logged() -> list[str]:
@@ -132,7 +138,7 @@ def test_the_servers_absence_and_return_are_logged_once_each(network, eventually
     for _ in range(3):
         watch.report_absence()
     assert logged() == ["the server is away"]
-    token = network.router_again().liveliness().declare_token("a/alive")
+    token = router.liveliness().declare_token("a/alive")
     assert eventually(lambda: len(logged()) == 2)
     token.undeclare()
     assert eventually(lambda: len(logged()) == 3, watch.report_absence)

@@ -25,7 +25,7 @@ from tests.fusion.synthetic import WIDE
 
 def request_reply(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:
     """The reply, or the text of the error."""
-    for reply in client._session.get(key, payload=payload, timeout=DEADLINE_S):
+    for reply in client.session.get(key, payload=payload, timeout=DEADLINE_S):
         if reply.ok is not None:
             return reply.ok.payload.to_bytes(), ""
         return None, reply.err.payload.to_string()
@@ -124,7 +124,7 @@ def test_the_robots_command_lists_renames_removes_and_saves(tmp_path):
 def test_no_robot_is_acquired_while_a_wand_is_recorded(tmp_path):
     """Another program declares the token, as calib does while it records; it is counted until that ends."""
     with serving(config(tmp_path)) as (server, client):
-        wand = client._session.liveliness().declare_token(KEYS.wand)
+        wand = client.session.liveliness().declare_token(KEYS.wand)
         until(lambda: client.status(DEADLINE_S).next().not_acquired == {"a": PAUSED})
         first = live(ARENA.messages(30))
         send(server, first)

@@ -58,7 +58,7 @@ def test_a_request_that_fails_is_answered_at_once(tmp_path: Path, caplog):
     """Before: its sender waited for the timeout."""
     with serving(config(tmp_path)) as (server, client):
         server.transport.answer_on_server_thread("test/broken", lambda query: raise_error() or b"")
-        reply = until(lambda: next(iter(client._session.get("test/broken", timeout=DEADLINE_S)), None))
+        reply = until(lambda: next(iter(client.session.get("test/broken", timeout=DEADLINE_S)), None))
         assert reply is not None
         assert reply.err is not None
         assert "internal error (ValueError)" in reply.err.payload.to_string()

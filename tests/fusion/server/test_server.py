@@ -138,7 +138,7 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
 
 def test_the_clock_is_answered(tmp_path):
     with serving(config(tmp_path)) as (_, client):
-        replies = client._session.get(KEYS.clock, timeout=DEADLINE_S)
+        replies = client.session.get(KEYS.clock, timeout=DEADLINE_S)
         data = next(reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
         t_ns = decode(data, ClockReply).t_ns
         assert abs(t_ns - time.time_ns()) < 5e9

@@ -48,7 +48,7 @@ STEP_MS = 60_000  # for the page to show the outcome of a step, on a loaded mach
 CALIBRATION_MS = 150_000
 LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s, grade ., expected error"  # three rounds of the wand
 WAIT_S = 60.0  # for the robot to drive
-N_POSES = 1500  # at about 80 a second
+N_POSES = 500  # two rounds at 20 a second
 STOOD_M = 0.1
 
 WAND_MOTION = {
@@ -260,13 +260,13 @@ class FirstArena:
             yield page
             browser.close()
 
-    def run_program(self, code: str, n_poses: int) -> list[str]:
-        """Run a program on the server's machine until it printed so many lines; return them."""
+    def run_program(self, code: str, is_enough: Callable[[list[str]], bool]) -> list[str]:
+        """Run a program on the server's machine until it printed enough lines; return them."""
         path = self._folder / "poses.py"
         path.write_text(code)
         program = Program(self._network.command(SERVER, [sys.executable, "-P", str(path)]), self._folder)
         try:
-            wait_for(lambda: len(program.lines) >= n_poses, deadline_s=2 * ROUND_S + WAIT_S)
+            wait_for(lambda: is_enough(list(program.lines)), deadline_s=WAND_S + STANDING_S + WAIT_S)
         finally:
             program.stop(signal.SIGKILL)
         return program.lines
@@ -279,7 +279,7 @@ def read_poses(lines: Iterable[str]) -> tuple[Array, Array]:
         for line in lines
         if (match := re.match(r"(\d+) \w+ \(([^)]*)\) \(", line))
     ]
-    return np.array([t for t, _ in rows]), np.array([position for _, position in rows])
+    return np.array([t for t, _ in rows]), np.array([position for _, position in rows]).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -342,7 +342,8 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
         calibration = operator.calibrate()
         operator.define_robot("rover")
         code = operator.program()
-        t_ns, positions = driven(*read_poses(arena.run_program(code, N_POSES)))
+        lines = arena.run_program(code, lambda lines: len(driven(*read_poses(lines))[0]) > N_POSES)
+        t_ns, positions = driven(*read_poses(lines))
         picture(page, "status")
     rig = load_rig(folder / "lab" / "rig.yaml")
     return Outcome(
@@ -352,6 +353,6 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
 
 def driven(t_ns: Array, positions: Array) -> tuple[Array, Array]:
     """The poses since the robot left the place where it stood."""
-    moving = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > STOOD_M)
-    assert len(moving), "the robot did not move"
-    return t_ns[moving[0] :], positions[moving[0] :]
+    moved = np.linalg.norm(positions - positions[:1], axis=1) > STOOD_M
+    first = int(np.argmax(moved)) if moved.any() else len(moved)
+    return t_ns[first:], positions[first:]

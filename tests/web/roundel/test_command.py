@@ -107,6 +107,21 @@ def test_a_command_imports_its_own_program_only():
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "package"), [("up", "websockets"), ("server", "gtsam"), ("replay", "mcap")]
+)
+def test_a_camera_s_machine_says_what_to_install(command: str, package: str, tmp_path: Path):
+    """One line with the extra, where the packages of the server are missing."""
+    code = f"import sys; sys.modules[{package!r}] = None\n{MAIN}"
+    words = [command, *(["x.mcap"] if command == "replay" else [])]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    line = f"error: roundel {command} needs {package}, .* pip install 'roundel\\[server\\]'\n"
+    assert re.fullmatch(line, done.stderr), done.stderr
+    assert done.returncode == 2
+
+
 def test_opencv_writes_no_warning(tmp_path: Path):
     """A broken picture and a broken video are one line each, that of this project."""
     board = ("--board", "chessboard:4x5:0.05", "--out", "rig.yaml")

@@ -67,9 +67,9 @@ def test_subscribers_receive_the_rig_of_the_server_only(tmp_path: Path):
     """A rig that somebody else publishes has no effect on the server."""
     with serving(config(tmp_path)) as (server, client), connected(server) as other:
         received = []
-        subscriber = other._session.declare_subscriber(server.keys.rig, received.append)
+        subscriber = other.session.declare_subscriber(server.keys.rig, received.append)
         until(lambda: client.set_rig(FEWER) and received)
-        other._session.put(server.keys.rig, received[0].payload)
+        other.session.put(server.keys.rig, received[0].payload)
         client.set_rig(GIVEN)
         assert client.rig(DEADLINE_S) == GIVEN
         subscriber.undeclare()
@@ -218,7 +218,7 @@ def test_a_client_without_a_server_is_told(endpoint: str):
         Client.connect(endpoint, arena="test") as client,
         pytest.raises(Exception, match="no server answers"),
     ):
-        set_rig(client._session, "test", GIVEN, "test", timeout_s=0.2)
+        set_rig(client.session, "test", GIVEN, "test", timeout_s=0.2)
 
 
 def test_the_saved_file_is_the_rig_in_force(tmp_path: Path):

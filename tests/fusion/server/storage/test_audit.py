@@ -84,9 +84,9 @@ def test_changes_of_the_rig_are_noted_with_their_claimed_source(tmp_path: Path):
         rig = server.pipeline.active_rig.rig
         assert rig is not None
         cameras = {name: rig.cameras[name] for name in sorted(rig.cameras)[:3]}
-        set_rig(client._session, "test", Rig(cameras=cameras), "calib wand")
-        undo_rig(client._session, "test", "calib undo")
-        redo_rig(client._session, "test", "calib redo")
+        set_rig(client.session, "test", Rig(cameras=cameras), "calib wand")
+        undo_rig(client.session, "test", "calib undo")
+        redo_rig(client.session, "test", "calib redo")
     assert [(line["change"], line["claimed_source"]["program"]) for line in lines(audit)] == [
         ("change of the rig", "calib wand"),
         ("undo of the rig", "calib undo"),

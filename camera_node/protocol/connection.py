@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A connection to the server that is opened in the background, for programs that start before the server."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from pathlib import Path
+
+import zenoh
+
+from camera_node.errors import ConfigError, NetworkError
+from camera_node.protocol.callbacks import guarded
+from camera_node.protocol.session import NO_SERVER, PATIENCE_S, open_endless
+
+log = logging.getLogger("camera_node.network")
+
+FIRST_S = 0.5  # in which the session opens if the server runs, and invalid endpoints are found
+WAIT_S = 0.2  # between two looks at whether a session is open
+
+
+class ServerConnection:
+    """A Zenoh session that opens as soon as the server answers, and reconnects after every loss.
+
+    A Zenoh client does not open while no router answers. Sessions in mode router open at once, but they sometimes stay
+    without routes after an outage or beside another one that opens or closes (measured with 1.10, DECISIONS 106).
+
+    Args:
+        connect: endpoints of the server.
+        zenoh_config: a file.
+
+    Raises:
+        NetworkError: an endpoint is invalid.
+        ConfigError: the Zenoh configuration is missing or invalid.
+    """
+
+    def __init__(self, connect: Sequence[str], zenoh_config: Path | None = None) -> None:
+        self.endpoints = " ".join(connect)
+        self._future: Future[zenoh.Session] = Future()
+        self._lock = threading.Lock()
+        self._actions: list[Callable[[zenoh.Session], object]] = []
+        self._closed = False
+        arguments = connect, zenoh_config
+        threading.Thread(target=self._open, args=arguments, daemon=True, name="open Zenoh session").start()
+        self._opened_within(FIRST_S)
+
+    def __enter__(self) -> "ServerConnection":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the session, or do not open it."""
+        with self._lock:
+            self._closed = True
+            self._actions.clear()
+        if self._future.done() and self._future.exception() is None:
+            self._future.result().close()
+
+    def when_open(self, action: Callable[[zenoh.Session], object]) -> None:
+        """Call `action` with the session: now if it is open, otherwise once it opens, on another thread.
+
+        What an action raises on the other thread is logged.
+        """
+        with self._lock:
+            if not self._future.done():
+                self._actions.append(guarded("an action at the opening of the session", action))
+                return
+        if not self._closed:
+            action(self._future.result())
+
+    def session(self, timeout_s: float) -> zenoh.Session:
+        """The open session.
+
+        Raises:
+            NetworkError: no server answers within `timeout_s`.
+        """
+        session = self._opened_within(timeout_s)
+        if session is None:
+            raise NetworkError(NO_SERVER.format(self.endpoints, timeout_s))
+        return session
+
+    def wait(self, on_wait: Callable[[], object]) -> zenoh.Session:
+        """Wait for the session; logs the server's absence once.
+
+        Args:
+            on_wait: called again and again; its exceptions end the wait.
+        """
+        absence = _Absence(self.endpoints)
+        while (session := self._opened_within(WAIT_S)) is None:
+            on_wait()
+            absence.report()
+        absence.end()
+        return session
+
+    def wait_unless(self, stop: threading.Event) -> zenoh.Session | None:
+        """As `wait`, but None as soon as `stop` is set."""
+        absence = _Absence(self.endpoints)
+        while (session := self._opened_within(WAIT_S)) is None:
+            if stop.is_set():
+                return None
+            absence.report()
+        absence.end()
+        return session
+
+    def _opened_within(self, timeout_s: float) -> zenoh.Session | None:
+        try:
+            return self._future.result(timeout_s)
+        except FutureTimeout:
+            return None
+
+    def _open(self, connect: Sequence[str], zenoh_config: Path | None) -> None:
+        try:
+            session = open_endless(connect, zenoh_config)
+        except (NetworkError, ConfigError) as error:
+            self._future.set_exception(error)
+            return
+        while (actions := self._taken_actions(session)) is not None:
+            for action in actions:
+                action(session)
+        if self._closed:
+            session.close()
+
+    def _taken_actions(self, session: zenoh.Session) -> list[Callable[[zenoh.Session], object]] | None:
+        """The actions to call next; None, and the connection is open, once there are none."""
+        with self._lock:
+            taken, self._actions = self._actions, []
+            if taken and not self._closed:
+                return taken
+            self._future.set_result(session)
+            return None
+
+
+class _Absence:
+    """Logs once that no server answers, and once that one does."""
+
+    def __init__(self, endpoints: str) -> None:
+        self._endpoints, self._since_s, self._is_reported = endpoints, time.monotonic(), False
+
+    def report(self) -> None:
+        if self._is_reported or time.monotonic() - self._since_s < PATIENCE_S:
+            return
+        self._is_reported = True
+        log.warning(
+            "the server is away: none answers at %s; retrying. Check that it runs and that --connect is right",
+            self._endpoints,
+        )
+
+    def end(self) -> None:
+        if self._is_reported:
+            log.warning("the server is back")

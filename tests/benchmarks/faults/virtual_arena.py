@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""An arena in virtual time: the server's own steps and the cameras of `SceneCamera`, without network and processes.
+
+It causes the same faults of cameras and robots as `LiveArena`, repeatably and faster than real time. Faults of
+programs need a `LiveArena`.
+"""
+
+import heapq
+import logging
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calib.rig.rig import Rig, save_rig
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode
+from fusion.protocol.messages import FusionStatus, RobotPose
+from fusion.server.config import ArenaConfig
+from fusion.server.publisher import ArenaPublisher
+from fusion.server.server import Server
+from tests.benchmarks.faults.camera import SceneCamera, SceneDetector
+from tests.benchmarks.faults.judge import PoseJudge
+from tests.benchmarks.faults.world import CameraFault, Clock, RobotEvent, World
+from tests.benchmarks.fusion_load import START_NS, Load
+
+ARENA = "virtual"
+TICK_NS = 5_000_000  # between two looks of the server for frame sets that are due
+TRANSIT_S = 0.002  # mean of the exponential distribution of a message's transit
+
+
+class VirtualClock(Clock):
+    """Time that only `VirtualArena.wait` advances."""
+
+    def __init__(self) -> None:
+        self.t_ns = START_NS
+
+    def now_s(self) -> float:
+        return self.t_ns * 1e-9
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+class Outbox:
+    """Takes what the server publishes: poses go to the judge."""
+
+    def __init__(self, judge: PoseJudge) -> None:
+        self._judge = judge
+
+    def publish(self, key: str, message: msgspec.Struct) -> None:
+        """Judge a pose."""
+        if isinstance(message, RobotPose):
+            self._judge.receive(message)
+
+
+class VirtualArena:
+    """Server, cameras and judge in virtual time; a context manager.
+
+    Args:
+        folder: for the server's files.
+        load: robots and cameras.
+        seed: of the transit of messages.
+        rig: the server's calibration, if it is not the true one.
+    """
+
+    def __init__(self, folder: Path, load: Load, seed: int = 1, rig: Rig | None = None) -> None:
+        self.load, self.clock = load, VirtualClock()
+        self.world = World(load, START_NS)
+        self.judge = PoseJudge(self.world, clock=self.clock)
+        self.cameras = tuple(load.rig)
+        self.status: FusionStatus | None = None
+        self.camera_status: dict[str, CameraStatus] = {}
+        self._rng, self._keys = np.random.default_rng(seed), Keys(ARENA)
+        self._sources = {name: SceneCamera(self.world, name, SceneDetector()) for name in self.cameras}
+        self._sent = dict.fromkeys(self.cameras, 0)
+        self._due: list[tuple[int, str, int]] = []
+        self._arrivals: list[tuple[int, str, int, bytes]] = []
+        self._arrived_ns = dict.fromkeys(self.cameras, 0)
+        self._tick_ns = START_NS
+        self._log = _Lines()
+        self.server = self._server(folder, rig or Rig(cameras=load.rig))
+
+    def __enter__(self) -> "VirtualArena":
+        logging.getLogger("fusion").addHandler(self._log)
+        for name, source in self._sources.items():
+            self._schedule(name, source.next_after(-1, self.clock.t_ns))
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        logging.getLogger("fusion").removeHandler(self._log)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        end_ns = self.clock.t_ns + round(seconds * 1e9)
+        while (at_ns := min(self._tick_ns, self._due[0][0], self._next_arrival_ns())) < end_ns:
+            self.clock.t_ns = at_ns
+            if at_ns == self._due[0][0]:
+                self._deliver()
+            elif at_ns == self._tick_ns:
+                self._tick_ns += TICK_NS
+                self._serve()
+            else:
+                self._receive()
+        self.clock.t_ns = end_ns
+
+    def place(self, camera: str, fault: CameraFault) -> None:
+        """Give a camera other faults."""
+        self._sources[camera].place(fault)
+
+    def cover(self, event: RobotEvent) -> None:
+        """Cover a robot for a while."""
+        self.world.events[event.robot] = event
+
+    def new_lines(self) -> list[tuple[str, str]]:
+        """The lines that the server logged since the last call."""
+        lines, self._log.lines = self._log.lines, []
+        return [("server", line) for line in lines]
+
+    def waited_s(self) -> dict[str, float]:
+        """Nothing waits for a processor in virtual time."""
+        return {}
+
+    def inspect(self, samples_memory: bool) -> None:
+        """There are no programs that could end."""
+
+    def _server(self, folder: Path, rig: Rig) -> Server:
+        save_rig(rig, folder / "rig.yaml")
+        bodies = {name: msgspec.to_builtins(body) for name, body in self.load.bodies.items()}
+        (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
+        server = Server(
+            ArenaConfig(arena=ARENA, rig=str(folder / "rig.yaml"), robots=str(folder / "robots.yaml"))
+        )
+        server.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
+        outbox = Outbox(self.judge)
+        server._publisher = ArenaPublisher(outbox, self._keys, server.shard)  # pyright: ignore[reportArgumentType]
+        return server
+
+    def _schedule(self, name: str, seq: int) -> None:
+        heapq.heappush(self._due, (self._sources[name].due_ns(seq), name, seq))
+
+    def _deliver(self) -> None:
+        """The next camera sends the frames that became available."""
+        _, name, seq = heapq.heappop(self._due)
+        source, lens = self._sources[name], self.load.rig[name]
+        for frame, roundels in source.deliver(seq):
+            message = Detections.pack(
+                roundels,
+                camera=name,
+                seq=self._sent[name],
+                t_ns=frame.t_ns,
+                sent_ns=frame.t_ns,
+                width=lens.width,
+                height=lens.height,
+            )
+            self._sent[name] += 1
+            transit_ns = round(self._rng.exponential(TRANSIT_S) * 1e9)
+            arrival_ns = max(self._arrived_ns[name] + 1, self.clock.t_ns + transit_ns)
+            self._arrived_ns[name] = arrival_ns
+            heapq.heappush(self._arrivals, (arrival_ns, name, message.seq, encode(message)))
+        self._schedule(name, source.next_after(seq, self.clock.t_ns, source.fault.delay_ms))
+
+    def _next_arrival_ns(self) -> int:
+        return self._arrivals[0][0] if self._arrivals else self._tick_ns
+
+    def _receive(self) -> None:
+        arrival_ns, name, _, data = heapq.heappop(self._arrivals)
+        self.server._receive_detections(data, self._keys.detections(name), arrival_ns)
+        self._serve()
+
+    def _serve(self) -> None:
+        self.server._fuse(self.clock.t_ns, False)
+        self.status = self.server._report_status(self.clock.t_ns) or self.status
+
+
+class _Lines(logging.Handler):
+    """Collects what the server logs."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
