@@ -96,11 +96,12 @@ COMMANDS = {
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras",
+        "list, rename and forget cameras; show what one refuses, and why",
         _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
+            "roundel cameras why north refused.jpg",
         ),
     ),
     "settings": Command(
