@@ -61,11 +61,14 @@ class LivePictures:
             "Live pictures", True, hint="each camera sends a small picture about three times a second"
         )
         self._grid = server.gui.add_html("")
+        self._is_watched = False
 
     def update(self, state: ArenaState) -> None:
         """Show the recent pictures; those of a silent camera disappear."""
         is_watched = self._wanted.value and bool(self._server.get_clients())
-        self._subscription.watch_previews(is_watched)
+        if is_watched != self._is_watched:
+            self._is_watched = is_watched
+            self._subscription.watch_previews(is_watched)
         recent = {
             name: timed.message
             for name, timed in sorted(state.previews.items())
