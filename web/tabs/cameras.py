@@ -110,7 +110,7 @@ class CameraSettings:
         self._folder = gui.add_folder("One camera")
         with self._folder:
             self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
-            self._new_name = gui.add_text("New name", "", hint="in the rig, in files and on the network")
+            self._new_name = gui.add_text("Rename to", "", hint="in the rig, in files and on the network")
             self._exposure = gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0)
             self._gain = gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units")
             self._contrast = gui.add_number(
@@ -123,7 +123,7 @@ class CameraSettings:
             )
             answer = Answer(gui)
             self._buttons = (
-                ActionButton(gui, "Rename", self.rename, answer),
+                ActionButton(gui, "Rename the camera", self.rename, answer),
                 ActionButton(gui, "Read the settings", self.read, answer),
                 ActionButton(gui, "Apply", self.apply, answer, "zero leaves exposure or gain as it is"),
                 ActionButton(gui, "Take a snapshot", self._show_snapshot, answer),
