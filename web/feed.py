@@ -232,8 +232,9 @@ class Feed:
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
         state = self._state
-        if message.t_ns != state.rig_t_ns or not state.rigs:  # a query repeats the one in force
-            state.rigs = (*state.rigs, message)[-MAX_RIGS:]
+        if message.t_ns == state.rig_t_ns and message.rig == state.rig:  # a query repeats the one in force
+            return
+        state.rigs = (*state.rigs, message)[-MAX_RIGS:]
         state.rig, state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(
