@@ -128,12 +128,8 @@ class Demo:
     """
 
     def __init__(self, scene_path: Path, path: Path, listen: str | None = None) -> None:
-        self.scene, self.path, self._scene_path, self._listen = (
-            Scene.load(scene_path),
-            path,
-            scene_path,
-            listen,
-        )
+        self.scene, self.path = Scene.load(scene_path), path
+        self._scene_path, self._listen = scene_path, listen
         self._folder = create_folder(path, scene_path, self.scene)
         self._supervisor = Supervisor(self._ended, path, restarts=False)
         self._programs = ArenaPrograms(self._supervisor, self._folder, load_arena(self._folder.config))

@@ -15,6 +15,7 @@ import msgspec
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
+from camera_node.protocol.relative import RelativePositions
 from camera_node.text import printable
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose
 from web.coverage_picture import CoveragePicture
@@ -49,6 +50,7 @@ class ArenaState:
     previews: dict[str, TimedMessage] = field(default_factory=dict)  # picture of each camera
     detections: dict[str, Detections] = field(default_factory=dict)  # latest of each camera
     coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
+    relative: dict[str, TimedMessage] = field(default_factory=dict)  # what each camera locates by itself
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
@@ -116,6 +118,7 @@ class Feed:
             keys.fusion_status: (FusionStatus, self._store_status),
             keys.camera_status(): (CameraStatus, self._store_camera_status),
             keys.detections(): (Detections, self._add_coverage),
+            keys.relative(): (RelativePositions, self._store_relative),
             keys.preview(): (Preview, self._store_preview),
             keys.rig: (RigMessage, self._store_rig),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
@@ -210,6 +213,9 @@ class Feed:
     def _store_preview(self, preview: Preview, key: str) -> None:
         self._store_named(self._state.previews, preview.camera, preview, key)
 
+    def _store_relative(self, message: RelativePositions, key: str) -> None:
+        self._store_named(self._state.relative, message.camera, message, key)
+
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
         _check_name(self._state.coverage, camera, key)
@@ -226,8 +232,9 @@ class Feed:
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
         state = self._state
-        if message.t_ns != state.rig_t_ns or not state.rigs:  # a query repeats the one in force
-            state.rigs = (*state.rigs, message)[-MAX_RIGS:]
+        if message.t_ns == state.rig_t_ns and message.rig == state.rig:  # a query repeats the one in force
+            return
+        state.rigs = (*state.rigs, message)[-MAX_RIGS:]
         state.rig, state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(
@@ -237,7 +244,16 @@ class Feed:
         messages[name] = TimedMessage(message, self._received_s)
 
 
-_CONTAINERS = ("poses", "cameras", "previews", "detections", "coverage", "message_counts", "faults")
+_CONTAINERS = (
+    "poses",
+    "cameras",
+    "previews",
+    "relative",
+    "detections",
+    "coverage",
+    "message_counts",
+    "faults",
+)
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:

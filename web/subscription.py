@@ -9,7 +9,7 @@ from typing import Any
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, undo_rig
+from calib.live.rig_requests import redo_rig, request_rig_message, undo_rig
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
@@ -155,8 +155,10 @@ class Subscription:
         if not self._rig_requests.passes():
             return
 
-        def receive(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                self.feed.receive(key, key, reply.ok.payload.to_bytes())
+        def request(arena: str) -> None:
+            if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
+                self.feed.receive(key, key, data)
 
-        session.get(key, guarded("a rig", receive), timeout=RIG_TIMEOUT_S)
+        # In a thread: Zenoh's thread, which calls this method, must not wait for replies.
+        request_rig = guarded("a request for the rig", request)
+        threading.Thread(target=request_rig, args=[self.feed.keys.arena], name="rig", daemon=True).start()

@@ -17,6 +17,7 @@ from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding
 from web.scene.cameras import CameraDrawing
 from web.scene.markers import MarkerCloud, TruePoints
+from web.scene.relative import RelativeFrames
 from web.scene.robots import RobotDrawing
 from web.scene.surroundings import FIELD_OF_VIEW, add_floor, add_lights, default_viewpoint
 
@@ -60,6 +61,7 @@ class View:
         self._robots = RobotDrawing(self.server.scene)
         self._markers = MarkerCloud(self.server.scene)
         self.true_points = TruePoints(self.server.scene)
+        self._relative = RelativeFrames(self.server.scene)
         add_lights(self.server.scene)
         add_floor(self.server.scene)
         self.server.initial_camera.fov = FIELD_OF_VIEW
@@ -96,6 +98,7 @@ class View:
             self._robots.draw(state, is_slow=self._drawings % SLOW_INTERVAL == 0)
             self._markers.draw(state)
             self.true_points.draw(state)
+            self._relative.draw(state)
             if self._drawings % PANEL_INTERVAL == 0:
                 for section, is_live in self._sections:
                     section.update(live if is_live else state)

@@ -15,6 +15,7 @@ from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import ANSWER_S, REQUEST_S, RequestSource, send_request
+from camera_node.protocol.session import reply_of_server
 
 
 def set_rig(
@@ -53,10 +54,15 @@ def redo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float 
 
 def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig | None:
     """The rig in force; None if the server has none, or does not answer in time."""
-    for reply in session.get(Keys(arena).rig, timeout=timeout_s):
-        if reply.ok is not None:
-            return _read(reply.ok.payload.to_bytes()).rig
-    return None
+    data = request_rig_message(session, arena, timeout_s)
+    return None if data is None else _read(data).rig
+
+
+def request_rig_message(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> bytes | None:
+    """The encoded `RigMessage` of the server, in preference to answers of other programs; None as `request_rig`."""
+    every = zenoh.ConsolidationMode.NONE
+    reply = reply_of_server(session, session.get(Keys(arena).rig, consolidation=every, timeout=timeout_s))
+    return reply.ok.payload.to_bytes() if reply is not None and reply.ok is not None else None
 
 
 def _read(data: bytes) -> RigMessage:

@@ -51,14 +51,17 @@ class SaveSnapshot:
         """Save the image. Raises NetworkError if the camera does not answer, ConfigError for a bad file name."""
         require_name(self.name, "a camera")
         with self.server.open() as session:
-            data = request_snapshot(session, self.server.arena, self.name, self.draw)
-        try:
-            self.out.write_bytes(data)
-        except OSError as error:
-            raise ConfigError(
-                f"{self.out} can't be written: {error.strerror}; does its folder exist?"
-            ) from None
-        say(f"wrote {self.out}")
+            data = request_snapshot(session, self.server.arena, self.name, "draw" if self.draw else "")
+        save_picture(data, self.out)
+
+
+def save_picture(data: bytes, out: Path) -> None:
+    """Write a picture and say so. Raises ConfigError for a file that can't be written."""
+    try:
+        out.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"{out} can't be written: {error.strerror}; does its folder exist?") from None
+    say(f"wrote {out}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`cameras`: lists, renames and forgets the cameras that registered; `settings` changes the settings of one."""
+"""`cameras`: lists, renames and forgets the cameras that registered, and shows what one of them refuses."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,19 +7,21 @@ from typing import Annotated, Literal
 import msgspec
 import tyro
 
+from camera_node.commands.adjust import save_picture
+from camera_node.config import require_name
 from camera_node.errors import ConfigError
-from camera_node.protocol.camera_requests import change_camera, request_cameras
+from camera_node.protocol.camera_requests import change_camera, request_cameras, request_snapshot
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 
-USES = {"list": "", "rename": "OLD NEW", "forget": "NAME"}
-N_ARGUMENTS = {"list": 0, "rename": 2, "forget": 1}
+USES = {"list": "", "rename": "OLD NEW", "forget": "NAME", "why": "NAME [PICTURE.jpg]"}
+N_ARGUMENTS = {"list": (0,), "rename": (2,), "forget": (1,), "why": (1, 2)}
 
 
 def cameras(
-    action: Literal["list", "rename", "forget"],
+    action: Literal["list", "rename", "forget", "why"],
     arguments: tuple[str, ...] = (),
     /,
     *,
@@ -27,18 +29,23 @@ def cameras(
     arena: str = "arena",
     zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
 ) -> int:
-    """List, rename or forget the cameras of the running server.
+    """List, rename or forget the cameras of the running server, or save a picture of what one refuses, and why.
 
     Args:
-        action: list; rename OLD NEW, in the rig too; forget NAME.
+        action: list; rename OLD NEW, in the rig too; forget NAME; why NAME [PICTURE.jpg].
         arguments: as the action needs them.
         connect: the server's Zenoh endpoints.
         arena: the arena's name.
         zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
     """
-    if len(arguments) != N_ARGUMENTS[action]:
+    if len(arguments) not in N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
     with open_client(connect, zenoh_config) as session:
+        if action == "why":
+            name = require_name(arguments[0], "a camera")
+            out = Path(arguments[1] if len(arguments) > 1 else f"{name}_why.jpg")
+            save_picture(request_snapshot(session, arena, name, "why"), out)
+            return 0
         registered = (
             request_cameras(session, arena)
             if action == "list"

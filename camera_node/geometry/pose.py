@@ -85,6 +85,16 @@ def vector_from_rotation(R: ArrayLike) -> Array:
     return q[..., 1:] * (2 * np.arctan2(sine, q[..., :1]) / np.maximum(sine, 1e-12))
 
 
+def rotation_with_z(z: ArrayLike) -> Array:
+    """(..., 3, 3) rotations whose third columns are the unit vectors `z` (..., 3), and the first ones as near as
+    possible to (1, 0, 0); arbitrary for `z` parallel to that."""
+    z = np.asarray(z, float)
+    y = np.cross(z, [1.0, 0.0, 0.0])
+    length = np.linalg.norm(y, axis=-1, keepdims=True)
+    y = np.where(length > 1e-9, y / np.maximum(length, 1e-9), [0.0, 1.0, 0.0])
+    return np.stack([np.cross(y, z), y, z], axis=-1)
+
+
 def invert(T: Array) -> Array:
     """The inverse of a (4, 4) rigid motion."""
     inverse = np.eye(4)

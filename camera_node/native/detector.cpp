@@ -269,8 +269,8 @@ std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    return explain_refusals(
-        linear, {limits_, noise_level(linear), response_.edge_noise(), response_.shading_sigma()});
+    return explain_refusals(linear, {limits_, noise_level(linear), response_.edge_noise(),
+                                     response_.shading_sigma(), response_.curvature_sigma()});
 }
 
 std::optional<double> Detector::theta() const {

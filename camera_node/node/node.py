@@ -14,7 +14,8 @@ from typing import Any
 import zenoh
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.overlay import draw_roundels
+from camera_node.detection.overlay import draw_refused, draw_roundels
+from camera_node.detection.refusals import explain
 from camera_node.detection.relative import DiscLocalizer
 from camera_node.node.clock_sync import ClockSync
 from camera_node.node.preview import Content, PreviewPublisher
@@ -28,7 +29,7 @@ from camera_node.protocol.requests import (
     RequestError,
     encode_jpeg,
     encode_reply,
-    parse_draw,
+    parse_flag,
     parse_quality,
     parse_request,
     payload_of,
@@ -43,6 +44,7 @@ log = logging.getLogger("camera_node")
 
 STATUS_S = 1.0
 SNAPSHOTS_HZ = 10.0  # a snapshot costs as much as the detection of several frames
+EXPLANATIONS_HZ = 2.0  # a search for everything that is ring-like, while the detector waits
 CHANGES_HZ = 10.0  # of settings: one can build a new detector
 LISTENER_S = 5.0  # longest time that a recording waits for a subscriber
 ROUTES_S = 0.3  # Zenoh routers announce a subscriber about 0.1 s before the route to it is ready
@@ -96,6 +98,7 @@ class Node:
         self.on_settings: Callable[[Settings], object] = lambda wanted: None
         self._changing = threading.Lock()  # of the detector, by requests
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
+        self._explanations = RateLimit(EXPLANATIONS_HZ, EXPLANATIONS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
         self._previews: PreviewPublisher | None = None
@@ -257,9 +260,7 @@ class Node:
 
     def _summarize(self) -> CameraStatus:
         now_ns = self._clock.to_server(time.time_ns())
-        return self._statistics.summarize(
-            now_ns, self._clock.estimate(), self._source, self._detector.threshold
-        )
+        return self._statistics.summarize(now_ns, self._clock.estimate(), self._source, self._detector)
 
     def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:
         if not respond(query, answer):
@@ -271,9 +272,14 @@ class Node:
             raise RequestError(f"more than {SNAPSHOTS_HZ:g} snapshots a second; ask again later")
         if latest is None:
             raise RequestError("no frame yet; ask again when the camera delivers")
-        image = latest.frame.image
-        if parse_draw(query.parameters):
-            image = draw_roundels(image, latest.roundels)
+        image, why = latest.frame.image, parse_flag(query.parameters, "why")
+        if why and not self._explanations.passes():
+            raise RequestError(f"more than {EXPLANATIONS_HZ:g} explanations a second; ask again later")
+        if why or parse_flag(query.parameters, "draw"):
+            canvas = draw_roundels(image, latest.roundels)
+            if why:
+                draw_refused(canvas, explain(self._detector, image, latest.roundels))
+            image = canvas
         return encode_jpeg(image, parse_quality(query.parameters))
 
     def _answer_settings(self, query: zenoh.Query) -> bytes:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.arrays import Array, Grey
+from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.detection.sharpness import edge_blur_px
 from camera_node.protocol.messages import CameraStatus
@@ -70,7 +71,7 @@ class NodeStatistics:
             self._refused += 1
 
     def summarize(
-        self, t_ns: int, clock: tuple[int, float] | None, source: Source, threshold: float | None
+        self, t_ns: int, clock: tuple[int, float] | None, source: Source, detector: Detector
     ) -> CameraStatus:
         """Build the status of the time since the last call.
 
@@ -78,7 +79,7 @@ class NodeStatistics:
             t_ns: the time of the status, server's time.
             clock: the server's time minus this machine's and the bound of its error, ns; None where unknown.
             source: the source of the frames.
-            threshold: theta of `--detector paper`, grey levels; None with other detectors.
+            detector: the detector in use, for what it has learned.
         """
         latest = self.latest
         image, uv = (latest.frame.image, latest.roundels.uv) if latest else (NO_IMAGE, NO_CENTRES)
@@ -96,7 +97,9 @@ class NodeStatistics:
                 dropped=source.dropped,
                 detect_ms=self._detect_us / n / 1000,
                 roundels=self._roundels / n,
-                threshold=threshold,
+                threshold=detector.threshold,
+                found_ratios=detector.found_ratios,
+                tone_exponent=detector.tone_exponent,
                 saturated=saturated_share(image[::STRIDE, ::STRIDE]),
                 exposure_us=source.exposure_us,
                 gain=source.gain,

@@ -3,6 +3,7 @@
 
 import queue
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import zenoh
@@ -48,10 +49,20 @@ def request_settings(
 
 
 def request_snapshot(
-    session: zenoh.Session, arena: str, camera: str, draw: bool = False, timeout_s: float = REQUEST_S
+    session: zenoh.Session,
+    arena: str,
+    camera: str,
+    drawn: Literal["", "draw", "why"] = "",
+    timeout_s: float = REQUEST_S,
 ) -> bytes:
-    """A camera's current image as JPEG, in full size, with `draw` with the roundels drawn; raises as above."""
-    key = Keys(arena).snapshot(camera) + ("?draw" if draw else "")
+    """A camera's current image as JPEG, in full size; raises as above.
+
+    Args:
+        session, arena, camera: which camera, and how it is reached.
+        drawn: "draw" for the roundels, "why" for refused rings with their reasons too, empty for neither.
+        timeout_s: longest time that the camera may take.
+    """
+    key = Keys(arena).snapshot(camera) + (f"?{drawn}" if drawn else "")
     return _ask(session, key, b"", camera, timeout_s)
 
 

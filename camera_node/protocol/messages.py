@@ -151,8 +151,12 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
-        if len(self.found_ratios) > MAX_RATIOS or not all(0 < ratio < 1 for ratio in self.found_ratios):
-            raise MessageError("found_ratios are too many or not in (0, 1)")
+        _check_ratios(self.found_ratios)
+
+
+def _check_ratios(ratios: tuple[float, ...]) -> None:
+    if len(ratios) > MAX_RATIOS or not all(0 < ratio < 1 for ratio in ratios):
+        raise MessageError("found_ratios are too many or not in (0, 1)")
 
 
 class Preview(msgspec.Struct, frozen=True, kw_only=True):
@@ -187,6 +191,10 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     roundels: float  # mean number in each frame over the last second
     saturated: float  # share of pixels at the upper end of the grey levels, 0 to 1
     threshold: float | None = None  # theta of `--detector paper`, grey levels; None with other detectors
+    found_ratios: tuple[float, ...] = ()  # of the prints that recur, if the detector was given none
+    tone_exponent: float | None = (
+        None  # of the camera's tone curve; 1 if linear, None before roundels show it
+    )
     exposure_us: float | None = None
     gain: float | None = None
     # The server's time minus this machine's, and a bound of its error; None until a round trip succeeds.
@@ -200,9 +208,10 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     refused: int = 0  # refused requests for a snapshot or settings since the node started
 
     def check(self) -> None:
-        """Raise MessageError for a name that no camera can have."""
+        """Raise MessageError for a name that no camera can have, or impossible ratios."""
         if not is_name(self.camera):
             raise MessageError("an invalid camera name")
+        _check_ratios(self.found_ratios)
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -162,9 +162,9 @@ def encode_jpeg(image: Grey, quality: int) -> bytes:
     return data.tobytes()
 
 
-def parse_draw(parameters: zenoh.Parameters) -> bool:
-    """Whether a snapshot request asks for the roundels to be drawn: `draw` or `draw=1`."""
-    return "draw" in parameters and parameters.get("draw") not in ("0", "false")
+def parse_flag(parameters: zenoh.Parameters, name: str) -> bool:
+    """Whether a snapshot request has a flag such as `draw`: `draw` or `draw=1`."""
+    return name in parameters and parameters.get(name) not in ("0", "false")
 
 
 def parse_quality(parameters: zenoh.Parameters) -> int:

@@ -17,8 +17,8 @@ SLANT_DEG = (0.0, 30.0, 45.0, 60.0, 70.0)
 RELATIVE_BY_SLANT = (1.0, 1.0, 1.13, 1.6, 3.2)
 MAX_SLANT_DEG = 72.0
 # A roundel that moves by more than this share of its diameter during the exposure counts as moving. Of moving ones,
-# nine in ten are found in a first frame if they are as large as this and move by no more than one diameter.
-MOVING_SHARE, MOVING_PX, LONGEST_SHARE = 0.1, 20.0, 1.0
+# nine in ten are found in a first frame if they are as large as this and move by no more than this many diameters.
+MOVING_SHARE, MOVING_PX, LONGEST_SHARE = 0.1, 20.0, 0.75
 # Share of the diameter that the image's border may cut off; 14 px and more were found in all images.
 CUT_SHARE = 0.1
 MAX_DIAMETER_PX = 400.0  # the detector's default setting

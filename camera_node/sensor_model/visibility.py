@@ -108,8 +108,8 @@ def is_detected(
     """Predict which roundels our detector finds in a new image.
 
     At most a tenth of the disc's diameter is beyond the image's border, its printed side is visible, its axes are large
-    enough for its slant and the blur, and it moves by no more than its diameter during the exposure. Nothing occludes
-    it, and the ground around its card has no more contrast than the print.
+    enough for its slant and the blur, and it moves by no more than three quarters of its diameter during the exposure.
+    Nothing occludes it, and the ground around its card has no more contrast than the print.
 
     Args:
         lens: the camera.

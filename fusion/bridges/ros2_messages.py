@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.arrays import Array
 from camera_node.detection.relative import LocatedRoundels
-from camera_node.geometry.pose import wxyz_from_rotation
+from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from camera_node.protocol.relative import RelativePositions
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.protocol.messages import RobotPose
@@ -122,19 +122,10 @@ def _relative_pose(
 ) -> bytes:
     cdr = Cdr()
     _put_header(cdr, message, frame)
-    w, x, y, z = wxyz_from_rotation(_rotation_to(normal))
+    w, x, y, z = wxyz_from_rotation(rotation_with_z(normal))
     cdr.doubles(*position, x, y, z, w)
     cdr.array(covariance)
     return cdr.finish()
-
-
-def _rotation_to(normal: Array) -> Array:
-    """(3, 3) rotation with the unit normal (3,) as its third column and the first one nearly along the camera's x."""
-    y = np.cross(
-        normal, [1.0, 0.0, 0.0]
-    )  # a normal along x is of a disc that is seen edge-on, and so not seen
-    y /= max(float(np.linalg.norm(y)), 1e-9)
-    return np.column_stack([np.cross(y, normal), y, normal])
 
 
 def _roundel_covariance(seen: LocatedRoundels, k: int) -> Array:

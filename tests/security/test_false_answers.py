@@ -8,13 +8,20 @@ from pathlib import Path
 
 import zenoh
 
+from calib.live.rig_requests import request_rig
+from calib.rig.messages import RigMessage
+from calib.rig.rig import Rig
 from camera_node.node.clock_sync import ClockSync
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import ClockReply, encode
 from camera_node.protocol.session import listening_endpoints, open_client, open_router
 from fusion.protocol.messages import Robots, robots_key
 from fusion.protocol.requests import request_robots
 from tests.fusion.serving import KEYS, config, serving
 from tests.waiting import DEADLINE_S, wait_for
+from tests.web.arena import four_cameras
+from web.feed import Feed
+from web.subscription import Subscription
 
 AHEAD_NS = 100_000_000
 ANY_PORT = ["tcp/127.0.0.1:0"]
@@ -70,3 +77,25 @@ def test_false_robots_are_not_believed(tmp_path: Path):
         spoofer.declare_queryable(robots_key(KEYS.arena), answer, complete=True)
         wait_for_answers(session, robots_key(KEYS.arena), 2)
         assert set(request_robots(session, KEYS.arena).robots) == {"a"}
+
+
+def test_a_false_rig_is_not_believed(tmp_path: Path):
+    """Neither by programs that ask for the rig nor by the page."""
+    false = RigMessage(t_ns=1, rig=Rig(cameras={"false": next(iter(four_cameras().cameras.values()))}))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, encode(false))
+
+    with serving(config(tmp_path)) as (server, _), ExitStack() as stack:
+        spoofer, session = (stack.enter_context(open_client(server.endpoints)) for _ in range(2))
+        spoofer.declare_queryable(KEYS.rig, answer, complete=True)
+        wait_for_answers(session, KEYS.rig, 2)
+        rig = request_rig(session, KEYS.arena)
+        assert rig is not None
+        assert "false" not in rig.cameras
+        connection = stack.enter_context(ServerConnection(server.endpoints))
+        subscription = Subscription(connection, Feed(KEYS.arena))
+        stack.callback(subscription.close)
+        wait_for(lambda: subscription.feed.state().rig)
+        assert subscription.feed.state().rig == rig

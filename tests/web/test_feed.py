@@ -39,6 +39,7 @@ def test_invalid_bytes_are_counted(arena: LiveArena, feed: Feed, data: bytes):
         keys.fusion_status,
         keys.camera_status("north"),
         keys.detections("north"),
+        keys.relative("north"),
         keys.rig,
         progress_key("test"),
     ]

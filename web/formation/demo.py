@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 import zenoh
 
 from camera_node.errors import NetworkError
+from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from camera_node.service import stopped_by_signals
@@ -24,7 +25,7 @@ from fusion.client import Arena
 from web.errors import WebError
 from web.formation.formation import SETTLED_S, FormationScore, controllers, start_world
 from web.formation.live import LiveRobot, RobotDrive, RobotSource, WorldClock
-from web.formation.vision import FPS, RobotCamera, light, paint_background, roundel_matrix
+from web.formation.vision import FPS, RobotCamera, camera_matrix, light, paint_background, roundel_matrix
 from web.formation.world import RobotWorld
 from web.messages import DemoProgress, progress_key
 
@@ -88,7 +89,10 @@ class Progress:
         self.score.add(now_s, poses)
         text = self._describe(now_s)
         points = {name: (tuple(roundel_matrix(pose)[:3, 3].tolist()),) for name, pose in poses.items()}
-        progress = DemoProgress(t_ns=time.time_ns(), text=text, share=1.0, true_points=points)
+        cameras = {name: Pose.from_matrix(camera_matrix(pose)) for name, pose in poses.items()}
+        progress = DemoProgress(
+            t_ns=time.time_ns(), text=text, share=1.0, true_points=points, true_cameras=cameras
+        )
         self._session.put(progress_key(ARENA), encode(progress))
         if now_s - self._reported_s >= 1.0:
             n = sum(robot.drive.n_messages for robot in self.robots)

@@ -92,14 +92,16 @@ COMMANDS = {
             "roundel camera",
             "roundel camera --source 0 --connect tcp/server:7447",
             "roundel camera --source recording/north recording/east",
+            "roundel camera --source 0 --name scout --rig rig.yaml --diameter 0.09 --listen tcp/127.0.0.1:7447",
         ),
     ),
     "cameras": Command(
-        "list, rename and forget cameras",
+        "list, rename and forget cameras; show what one refuses, and why",
         _class_or_function("camera_node.commands.cameras:cameras"),
         (
             "roundel cameras list",
             "roundel cameras rename camera-1 north",
+            "roundel cameras why north refused.jpg",
         ),
     ),
     "settings": Command(

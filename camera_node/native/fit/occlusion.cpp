@@ -117,6 +117,11 @@ void SectorSums::add(int sector, double slope, double residual) {
     regression_[s] += slope * residual;
 }
 
+void SectorSums::append_mean_squares(std::vector<double>& to) const {
+    for (size_t s = 0; s < kSectors; ++s)
+        if (weight_[s] > 0) to.push_back(rr_[s] / weight_[s]);
+}
+
 Sectors SectorSums::exceeding(double noise, double slack) const {
     Sectors off = 0;
     for (size_t s = 0; s < kSectors; ++s) {
@@ -153,6 +158,15 @@ EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
     add_misfit(pixels, Model(local), SectorIndex(local), edges_);
+}
+
+double EdgeMisfit::median() const {
+    std::vector<double> squares;
+    for (const SectorSums& edge : edges_) edge.append_mean_squares(squares);
+    if (squares.empty()) return 0;
+    const auto middle = squares.begin() + ptrdiff_t(squares.size() / 2);
+    std::nth_element(squares.begin(), middle, squares.end());
+    return std::sqrt(*middle);
 }
 
 OcclusionMask EdgeMisfit::occlusion(double noise, double slack) const {

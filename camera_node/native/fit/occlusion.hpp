@@ -3,6 +3,7 @@
 #include <array>
 #include <bit>
 #include <cstdint>
+#include <vector>
 
 #include "fit/edge_pixels.hpp"
 #include "numeric/image.hpp"
@@ -49,6 +50,8 @@ class SectorSums {
     /// deviations.
     Sectors exceeding(double noise, double slack) const;
     Displacement displacement(double noise) const;
+    /// Appends the weighted mean square of each sector that has pixels.
+    void append_mean_squares(std::vector<double>& to) const;
 
   private:
     std::array<double, kSectors> rr_{}, weight_{}, squared_{}, regression_{};
@@ -61,6 +64,9 @@ class EdgeMisfit {
     /// The sectors in which the residuals of an edge exceed `noise` and `slack`, both in grey levels RMS, and
     /// adjacent ones that the blurred edge of the occluding object can reach.
     OcclusionMask occlusion(double noise, double slack) const;
+    /// The median residual of the sectors of both edges, grey levels RMS: an occlusion of less than half of
+    /// them hardly changes it.
+    double median() const;
     /// Displacements of the outer and of the inner edge. Ragged edges (drawn, printed, sharpened) scatter
     /// about the right position, so their means hardly differ from it.
     std::array<Displacement, 2> displacements(double noise) const;

@@ -59,7 +59,8 @@ class PhotometricFitter : GaussNewton<kCount> {
         : image_(image),
           occlusion_(guess.occlusion),
           resumed_(guess.model.has_value()),
-          shading_sigma_(guess.shading_sigma) {
+          shading_sigma_(guess.shading_sigma),
+          curvature_sigma_(guess.curvature_sigma) {
         pixels_.origin_x = int(std::lround(guess.outer.x));
         pixels_.origin_y = int(std::lround(guess.outer.y));
         p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
@@ -95,6 +96,7 @@ class PhotometricFitter : GaussNewton<kCount> {
   private:
     bool condition_on_print(const Print& print);
     Parameters covariance_with_ratio() const;
+    Parameters effect_of_curvature() const;
     PoseCovariance pose_covariance() const;
 
     bool select(EdgeBand band, int limit) {
@@ -201,7 +203,9 @@ class PhotometricFitter : GaussNewton<kCount> {
     double posterior_ratio_ = 0;         // given the print; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
     bool resumed_, clipped_ = false;
-    double shading_sigma_;
+    double shading_sigma_, curvature_sigma_;
+    Vector<kPoseCount>
+        curvature_effect_{};  // its outer product is what the tone curve adds to the covariance
     Shading shading_;
 };
 
@@ -211,13 +215,27 @@ Parameters PhotometricFitter::covariance_with_ratio() const {
     return factor_->solve(unit);
 }
 
-/// Conditions the Gaussian posterior on the print's ratio; false if that ratio is unlikely.
+/// The displacement of the estimate by one standard deviation of the curvature that is left in the camera's
+/// tone curve: both edges move into the ring.
+Parameters PhotometricFitter::effect_of_curvature() const {
+    const double shift = curvature_sigma_ * kEdgeShift * p_[kBlur];
+    const double radius = std::sqrt(p_[kAxx] * p_[kAyy] - square(p_[kAxy]));
+    Parameters effect{};
+    effect[kAxx] = effect[kAyy] = -shift, effect[kRatio] = shift * (1 + p_[kRatio]) / radius;
+    return effect;
+}
+
+/// Conditions the Gaussian posterior on the print's ratio; false if that ratio is unlikely. What is left of
+/// the tone curve is one more unknown, with a prior: the difference of the ratios shows it.
 bool PhotometricFitter::condition_on_print(const Print& print) {
-    const Parameters with = covariance_with_ratio();
+    Parameters with = covariance_with_ratio();
+    const Parameters bent = effect_of_curvature();
+    for (int i = 0; i < kCount; ++i) with[i] += bent[i] * bent[kRatio];
     const double off = print.ratio - p_[kRatio], variance = with[kRatio] + square(print.sigma);
     if (square(off) > square(kMaxPrintError) * variance) return false;
     for (int i = 0; i < kCount; ++i)
         if (i != kRatio) p_[i] += with[i] * off / variance;  // the measured ratio is kept for the tests
+    for (int i = 0; i < kPoseCount; ++i) curvature_effect_[i] = bent[kX + i] / noise_;
     for (int i = 0; i < kPoseCount; ++i) print_effect_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
     posterior_ratio_ = p_[kRatio] + with[kRatio] * off / variance;
     return true;
@@ -273,7 +291,8 @@ PoseCovariance PhotometricFitter::pose_covariance() const {
     auto inverse = factor_->inverse_tail<kPoseCount>();
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j)
-            inverse[i][j] += shading_effect_[i][j] - print_effect_[i] * print_effect_[j];
+            inverse[i][j] += shading_effect_[i][j] + curvature_effect_[i] * curvature_effect_[j] -
+                             print_effect_[i] * print_effect_[j];
     return scaled(inverse, square(noise_));
 }
 

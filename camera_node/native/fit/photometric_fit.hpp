@@ -12,6 +12,12 @@
 
 namespace roundel {
 
+/// The displacement in blurs of an edge in a picture whose tone curve brightens the levels s between ink and
+/// paper by curvature s (1 - s), for each unit of curvature (docs/detector_model.md, section 3a). With
+/// s = Phi(x), the least squares fit of a shift to s (1 - s): the integral of s (1 - s) ds, 1 / 6, over that
+/// of phi(x)^2 dx, 1 / (2 sqrt(pi)).
+constexpr double kEdgeShift = 0.5908179503;
+
 /// The initial guess of a fit: an ellipse within a pixel, the ratio of the diameters, and the grey levels.
 struct InitialGuess {
     Ellipse outer;
@@ -21,6 +27,7 @@ struct InitialGuess {
     std::optional<Parameters> model{};  // in the image's frame, within a third of a pixel, if known
     double noise = 0;                   // noise that the fit of `model` estimated
     double shading_sigma = 0;           // of the relative change of the light, per pixel; 0 for none
+    double curvature_sigma = 0;         // of the curvature that is left in the tone curve; 0 for none
 };
 
 /// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is

@@ -29,6 +29,7 @@ constexpr double kMinRagged = 16;          // pixels: smaller ragged rings may b
 constexpr double kSameLevel = 0.2;         // of the contrast: the ground is as bright as the card
 constexpr double kMinCard = 1.1;           // outer diameters: least diameter of a card whose edge shows
 constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
+constexpr double kMaxProcessing = 0.1;     // of the contrast: residuals that processing may make
 constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
 // Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
@@ -104,6 +105,15 @@ std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess&
     return fit && passes(image, *fit, smoothed, tolerance) ? fit : std::nullopt;
 }
 
+/// Residuals at the edges of this camera's roundels. Before any is known, those of most sectors of an
+/// accepted one: sharpening and compression change all of an edge, an occlusion a part of it.
+double likely_edge_noise(const AcceptanceContext& context, const EdgeMisfit& misfit, const RoundelFit& fit) {
+    const double processing = context.edge_noise > 0
+                                  ? context.edge_noise
+                                  : std::min(misfit.median(), kMaxProcessing * fit.contrast());
+    return std::max(context.noise, processing);
+}
+
 /// Widens the claim on the size by what the noise does not explain of the residuals: a displacement of the
 /// whole edge that processing makes (sharpening, denoising, compression) does not show in the scatter of the
 /// pixels. The edge of clipped paper is where light that the camera cannot show begins.
@@ -152,14 +162,16 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
     guess.prints = context.limits.prints, guess.shading_sigma = context.shading_sigma;
+    guess.curvature_sigma = context.curvature_sigma;
     auto fit = fit_photometric(image, guess);
     if (!fit) return std::nullopt;
-    const double at_edges = std::max(context.noise, context.edge_noise);
     std::optional<EdgeMisfit> misfit;
     if (!is_explained_by_noise(*fit, context.noise)) misfit.emplace(image, fit->p);
+    const double at_edges = std::max(context.noise, context.edge_noise);
     const bool elliptic = !misfit || has_elliptic_edges(*misfit, *fit, context.noise);
     const bool accepted = elliptic && passes(image, *fit, context, {kMisfit, kMaxGrowth});
-    fit->unoccluded = accepted && !(misfit && shows_occlusion(*misfit, *fit, context.noise));
+    fit->unoccluded =
+        accepted && !(misfit && shows_occlusion(*misfit, *fit, likely_edge_noise(context, *misfit, *fit)));
     claim_misfit(*fit, context.noise);
     if (fit->unoccluded || guess.model) return fit->unoccluded ? fit : std::nullopt;
     const auto rest = fit_occluded(image, {guess, *fit, misfit, at_edges, known || accepted});

@@ -36,9 +36,10 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 /// What the acceptance tests of a frame depend on, beside the fit.
 struct AcceptanceContext {
     const RoundelLimits& limits;
-    double noise;              // of the image, grey levels
-    double edge_noise = 0;     // residual at the edges of this camera's roundels, grey levels; 0 if unknown
-    double shading_sigma = 0;  // of this camera's light, relative, per pixel
+    double noise;                // of the image, grey levels
+    double edge_noise = 0;       // residual at the edges of this camera's roundels, grey levels; 0 if unknown
+    double shading_sigma = 0;    // of this camera's light, relative, per pixel
+    double curvature_sigma = 0;  // of what is left of this camera's tone curve
 };
 
 /// Fits a roundel and applies the acceptance tests that reject false positives. If the fit to the unmodified

@@ -27,6 +27,7 @@ constexpr double kFirstShading = 2e-4;  // per pixel: a tenth across half of a p
 constexpr double kLeastShading = 2e-5;
 constexpr double kMaxShadingSigma = 2e-3;  // of one measurement
 constexpr size_t kMaxMeasured = 8;         // roundels of a frame
+constexpr double kMedianSquare = 0.455;    // of a normal variable of variance 1
 constexpr double kMemory = 0.2;            // weight of a new frame
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
@@ -75,6 +76,7 @@ bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const Rou
     const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
     for (size_t k = 0; k < fits.size(); k += step)
         if (const auto estimate = measure(*fits[k], limits)) measured.push_back(*estimate);
+    if (knows_tone_) learn_curvature(fits, limits);
     return !measured.empty() && learn_tone(std::move(measured));
 }
 
@@ -115,6 +117,26 @@ void CameraResponse::learn_shading(const std::vector<const RoundelFit*>& fits) {
     shading_ += gain * (std::max(variance, square(kLeastShading)) - shading_), knows_shading_ = true;
 }
 
+/// The excess of the differences from the prints' ratios over their uncertainty, which counts twice so that
+/// chance alone does not widen the claims of a linear camera. A squared normal variable has the median 0.455.
+void CameraResponse::learn_curvature(const std::vector<const RoundelFit*>& fits,
+                                     const RoundelLimits& limits) {
+    std::vector<double> excess;
+    for (const RoundelFit* fit : fits) {
+        if (fit->outer.major < kMinDiameter || fit->clipped) continue;
+        const Print& print = nearest_print(limits.prints, fit->ratio);
+        const double by_curvature = ratio_by_curvature(*fit, print.ratio);
+        const double curvature = (fit->ratio - print.ratio) / by_curvature;
+        const double sigma = std::hypot(fit->ratio_sigma, print.sigma) / by_curvature;
+        if (std::abs(curvature) + sigma < kMaxCurvature)
+            excess.push_back(square(curvature) / kMedianSquare - 2 * square(sigma));
+    }
+    if (excess.empty()) return;
+    const double variance = median_by(excess, [](double value) { return value; });
+    curvature_ += (knows_curvature_ ? kMemory : 1) * (std::max(0.0, variance) - curvature_);
+    knows_curvature_ = true;
+}
+
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
 /// are as certain as the best roundel.
 bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
@@ -129,8 +151,8 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
     const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
     knows_tone_ |= sigma_ <= kMaxSigma;
     if (sigma_ > kMaxSigma || change < enough) return false;
-    edge_noise_ = 0;
-    if (change > kMaxLinear) sigma_ = 0;  // the next frame measures the rest: this one was not linear
+    // The next frame measures the rest: this one was not linear.
+    if (change > kMaxLinear) sigma_ = edge_noise_ = 0;
     set_exponent(std::abs(mean_) < kMinTone / 2 ? 0 : std::clamp(mean_, -kMaxLogExponent, kMaxLogExponent));
     return true;
 }

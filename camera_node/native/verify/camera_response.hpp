@@ -30,6 +30,9 @@ class CameraResponse {
     double edge_noise() const { return edge_noise_; }
     /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
     double shading_sigma() const { return std::sqrt(shading_); }
+    /// Standard deviation of the curvature, between ink and paper, that linearization leaves: no power law
+    /// describes an S-shaped tone curve, and uneven light changes the levels of ink and paper.
+    double curvature_sigma() const { return std::sqrt(curvature_); }
 
   private:
     /// The logarithm of an exponent and its standard deviation.
@@ -39,6 +42,7 @@ class CameraResponse {
     std::optional<ToneEstimate> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     void learn_shading(const std::vector<const RoundelFit*>& fits);
+    void learn_curvature(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
     bool learn_tone(std::vector<ToneEstimate> measured);
     void set_exponent(double log_exponent);
 
@@ -46,8 +50,9 @@ class CameraResponse {
     double mean_ = 0;          // of the measured ones
     double sigma_ = 0;         // of the mean; 0 before the first measurement
     double edge_noise_ = 0;
-    double shading_;  // variance
-    bool knows_shading_ = false, knows_tone_ = false;
+    double shading_;        // variance
+    double curvature_ = 0;  // variance
+    bool knows_shading_ = false, knows_tone_ = false, knows_curvature_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;
 };

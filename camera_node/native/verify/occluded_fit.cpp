@@ -148,7 +148,8 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
                  .bright = fit.bright,
                  .prints = guess.prints,
                  .occlusion = mask,
-                 .shading_sigma = guess.shading_sigma};
+                 .shading_sigma = guess.shading_sigma,
+                 .curvature_sigma = guess.curvature_sigma};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;
         fit = *rest, misfit.reset();

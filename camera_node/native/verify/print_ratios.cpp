@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <numbers>
 
 namespace roundel {
 
@@ -35,10 +34,6 @@ std::vector<Print> assumed_prints() {
 }
 
 }  // namespace
-
-// With s = Phi(x), the least squares fit of the shift of an edge to s (1 - s): the integral of s (1 - s) ds
-// over that of phi(x)^2 dx.
-const double kEdgeShift = (1 / 6.0) / (0.5 / std::sqrt(std::numbers::pi));
 
 double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
     const double radius = std::sqrt(fit.outer.major * fit.outer.minor) / 2;

@@ -8,10 +8,6 @@
 
 namespace roundel {
 
-/// The displacement in blurs of an edge in a picture whose tone curve brightens the levels s between ink and
-/// paper by curvature s (1 - s), for each unit of curvature (docs/detector_model.md, section 3a).
-extern const double kEdgeShift;
-
 /// How much a tone curve enlarges the measured ratio of a roundel with this print, for each unit of its
 /// curvature.
 double ratio_by_curvature(const RoundelFit& fit, double print_ratio);

@@ -156,6 +156,22 @@ def test_a_snapshot_is_a_picture(network, inbox, running, slow):
     ).max() > 100  # the ellipse and its number are in colour
 
 
+def test_a_snapshot_shows_why_a_ring_is_refused(network, inbox, running, slow):
+    """Another print is asked for: the ring is drawn amber instead of green. More than two a second are refused."""
+    router = network.router()
+    got = subscribe(router, KEYS.detections(), Detections, inbox)
+    running(slow)
+    assert got.until(lambda items: items and len(items[-1]) == 1)
+    assert ask(router, KEYS.settings("cam0"), encode(Settings(inner_ratios=(0.3,))))[0]
+    assert got.until(lambda items: len(items[-1]) == 0)
+    ok, data = ask(router, KEYS.snapshot("cam0") + "?why")
+    assert ok
+    drawn = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert drawn is not None
+    assert (drawn[..., 2].astype(int) - drawn[..., 0]).max() > 100
+    assert not all(ask(router, KEYS.snapshot("cam0") + "?why")[0] for _ in range(20))
+
+
 def test_settings_are_reported_and_changed(network, inbox, running, slow):
     """A mask hides the roundel; replies have the encoding of the request; invalid requests are refused and counted."""
     router, key = network.router(), KEYS.settings("cam0")
