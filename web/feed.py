@@ -109,7 +109,7 @@ class Feed:
         self._pending: dict[str, PendingMessage] = {}  # by key
         self._covered_s: dict[str, float] = {}  # when each camera's coverage was extended last
         keys = self.keys
-        self._deferred = {keys.markers, keys.detections()} | (
+        self._deferred = {keys.markers, keys.detections(), keys.relative()} | (
             {keys.robot_pose()} if on_pose is None else set()
         )
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
