@@ -109,7 +109,7 @@ class Feed:
         self._pending: dict[str, PendingMessage] = {}  # by key
         self._covered_s: dict[str, float] = {}  # when each camera's coverage was extended last
         keys = self.keys
-        self._deferred = {keys.markers, keys.detections()} | (
+        self._deferred = {keys.markers, keys.detections(), keys.relative()} | (
             {keys.robot_pose()} if on_pose is None else set()
         )
         self._kinds: dict[str, tuple[type[msgspec.Struct], Callable[[Any, str], None]]] = {
@@ -232,8 +232,9 @@ class Feed:
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
         state = self._state
-        if message.t_ns != state.rig_t_ns or not state.rigs:  # a query repeats the one in force
-            state.rigs = (*state.rigs, message)[-MAX_RIGS:]
+        if message.t_ns == state.rig_t_ns and message.rig == state.rig:  # a query repeats the one in force
+            return
+        state.rigs = (*state.rigs, message)[-MAX_RIGS:]
         state.rig, state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(

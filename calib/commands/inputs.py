@@ -56,6 +56,7 @@ class WandOptions:
 
     def read_recording(self, rig: Rig, wand: Body) -> list[Detections]:
         """The detections of the given recording; see `read_recording`."""
+        require_several_cameras(self.frames)
         return read_recording(rig, self.frames, self.observations, self.recording, wand, self.fps)
 
     def measured_distance(self, rig: Rig) -> Distance | None:
@@ -111,13 +112,22 @@ def read_recording(
     return read_observations(observations, sizes, fps)
 
 
+def require_several_cameras(frames: Path | None) -> None:
+    """Raise CalibrationError if a folder of frames has one camera only, before detection takes minutes."""
+    names = _camera_folders(frames) if frames is not None else []
+    if len(names) == 1:
+        raise CalibrationError(f"{frames} holds one camera, '{names[0]}'; triangulation needs two or more")
+
+
+def _camera_folders(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+
+
 def _check_folders(folder: Path, rig: Rig) -> None:
     """Raise CalibrationError for camera folders that can't be used, before detection takes minutes."""
-    names = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    names = _camera_folders(folder)
     if unknown := [name for name in names if name not in rig.cameras]:
         raise CalibrationError(
             f"camera '{unknown[0]}' of {folder} is not in the rig, which has {', '.join(sorted(rig.cameras))}; rename "
             f"the folder, or run roundel calibrate intrinsics --camera {unknown[0]}"
         )
-    if len(names) == 1:
-        raise CalibrationError(f"{folder} holds one camera, '{names[0]}'; triangulation needs two or more")

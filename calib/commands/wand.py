@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`calib wand`: calibrates camera poses from a wand that is waved in front of the cameras."""
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
+from calib.wand.bundle_adjustment.lens_prior import widen_lenses
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
@@ -66,6 +68,9 @@ class Wand(WandOptions):
     """Collect for this long; by default until more frames would not improve the result, at most three minutes."""
     only: str | None = None
     """Calibrate the pose of this camera only, from a short recording; the other cameras keep theirs."""
+    widen_lenses: float = 1.0
+    """Multiply the standard deviations of the lenses by this, 1 or more: for lenses that changed since they were
+    calibrated, or that are farther off than usual."""
     server: Server = field(default_factory=Connection)
 
     def execute(self) -> None:
@@ -73,6 +78,8 @@ class Wand(WandOptions):
         check_folder(self.out)
         self.require_recording(live=self.live)
         require_positive(self.seconds)
+        if not 1 <= self.widen_lenses < math.inf:
+            raise ConfigError(f"--widen-lenses is {self.widen_lenses:g}; it must be 1 or more")
         rig, wand = self._load_lenses(), load_wand(self.wand)
         if self.distance is not None and self.only is not None:
             raise ConfigError(
@@ -95,6 +102,8 @@ class Wand(WandOptions):
     def _calibrate(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> Rig:
+        if self.widen_lenses > 1:
+            rig = widen_lenses(rig, self.widen_lenses)
         placed = (
             self._calibrate_all(rig, wand, messages, distance)
             if self.only is None
@@ -183,6 +192,8 @@ class Wand(WandOptions):
         words = [
             word for name, value in options.items() if value is not None for word in (f"--{name}", value)
         ]
+        if self.widen_lenses > 1:
+            words += ["--widen-lenses", self.widen_lenses]
         if self.distance is not None:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
         return shlex.join(["python", "-m", "calib", "wand", *map(str, words), *flags])

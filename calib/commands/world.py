@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`calib world`: fixes the ground plane, the origin and the axes."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,16 +10,19 @@ import msgspec
 import numpy as np
 
 from calib.commands.connection import Connection, Server
-from calib.commands.inputs import read_recording, require_one, require_positive
+from calib.commands.inputs import read_recording, require_one, require_positive, require_several_cameras
 from calib.commands.output import check_folder, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
 from calib.world.alignment import align_to_roundels, name_markers
+from calib.world.landmarks import find_still_roundels
+from calib.world.resection import place_by_points
 from calib.world.survey import read_positions
-from calib.world.world_frame import align_cameras, is_collinear
+from calib.world.world_frame import align_cameras, check_above, is_collinear
 from camera_node.arrays import Array
 from camera_node.config import load_yaml
+from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.terminal import say
@@ -30,16 +34,20 @@ Landmarks = Mapping[str, Array]
 @dataclass(frozen=True, kw_only=True)
 class World:
     """Fix the world frame: by surveyed cameras, by roundels at surveyed points, by an L-shaped frame, or by the wand
-    standing upright on the floor. z is up, metres."""
+    standing upright on the floor. z is up, metres. With --camera, place cameras by the points that they see."""
 
     rig: Path
-    """A rig with poses."""
+    """A rig with poses; with --camera, the lenses suffice."""
     out: Path
     """The file for the moved rig; a previous file is saved as rig.1.yaml, ..."""
     positions: Path | None = None
     """CSV with camera,x,y,z: positions of three or more cameras, metres."""
     points: Path | None = None
     """CSV with name,x,y,z, or YAML of name: [x, y, z]: positions of three or more stationary roundels, metres."""
+    camera: tuple[str, ...] = ()
+    """Place these cameras, each by four or more of the --points that it sees; other cameras keep their poses."""
+    sigma: float = 0.002
+    """Standard deviation of a coordinate of --points, metres, for the covariance of --camera."""
     frame: Path | None = None
     """YAML with diameter_m and markers of an L-shaped frame with roundels: its axes become those of the world."""
     standing: Path | None = None
@@ -62,8 +70,11 @@ class World:
         surveys = {"--positions CSV": self.positions, "--points FILE": self.points}
         require_one({**surveys, "--frame YAML": self.frame, "--standing YAML": self.standing})
         rig = load_rig(self.rig)
-        rig.require_placed(self.rig)
-        moved, distances = self._move(rig)
+        if self.camera:
+            moved, distances = self._place_cameras(rig)
+        else:
+            rig.require_placed(self.rig)
+            moved, distances = self._move(rig)
         for name, distance in distances.items():
             say(f"{name}: {distance * 1e3:.1f} mm from its surveyed position")
         misses = {name: round(distance * 1e3, 2) for name, distance in distances.items()}
@@ -89,10 +100,36 @@ class World:
             )
         return change.rig, change.distances
 
+    def _place_cameras(self, rig: Rig) -> tuple[Rig, dict[str, float]]:
+        """The rig with the named cameras placed, and the distances of the points from their rays, metres."""
+        if self.points is None:
+            raise ConfigError("--camera needs --points FILE, the positions of the roundels that it sees")
+        if not 0 <= self.sigma < math.inf:
+            raise ConfigError(f"--sigma is {self.sigma:g}; it must be 0 or more, in metres")
+        if unknown := [name for name in self.camera if name not in rig.cameras]:
+            raise ConfigError(
+                f"{self.rig} has no camera '{unknown[0]}'; it has {', '.join(sorted(rig.cameras))}"
+            )
+        points = read_positions(self.points, "name")
+        roundels = find_still_roundels(self._read_roundels(rig, None))
+        cameras, distances = dict(rig.cameras), {}
+        for name in self.camera:
+            seen = [roundel for roundel in roundels if roundel.camera == name]
+            found = place_by_points(name, rig.cameras[name], seen, points, self.sigma)
+            sigma_mm = 1e3 * np.sqrt(np.trace(np.array(found.camera.covariance)[3:, 3:]))
+            say(f"{name}: placed by {len(found.misses_m)} points, +- {sigma_mm:.1f} mm")
+            cameras[name] = found.camera
+            distances |= {f"{name}, point {point}": miss for point, miss in found.misses_m.items()}
+        placed = msgspec.structs.replace(rig, cameras=cameras)
+        check_above(placed, points)
+        return placed, distances
+
     def _read_roundels(self, rig: Rig, body: Body | None) -> list[Detections]:
         files = {"--frames FOLDER": self.frames, "--observations CSV": self.observations}
         require_one({**files, "--live": self.live}, ", to detect the roundels")
         if not self.live:
+            if not self.camera:
+                require_several_cameras(self.frames)
             return read_recording(rig, self.frames, self.observations, body=body)
         require_positive(self.seconds)
         with self.server.open() as session:

@@ -10,7 +10,7 @@ from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
 from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
-from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize, optimize_robustly
 from calib.wand.bundle_adjustment.problem import (
     CRYSTAL_DRIFT,
     SLEWED_DRIFT,
@@ -21,12 +21,12 @@ from calib.wand.bundle_adjustment.problem import (
 )
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
 from calib.wand.quality.checks import check_agreement, check_clocks, check_lenses, check_sizes, check_spacing
-from calib.wand.quality.held_out import triangulated_residuals, validate
+from calib.wand.quality.held_out import triangulated_residuals
 from calib.wand.result import Validation
 from calib.wand.trajectory import acceleration_density
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Mask
 
-COARSE_SETS, FINE_SETS = 250, 800  # frame sets of either stage
+COARSE_SETS, FINE_SETS = 250, 1000  # frame sets of either stage
 MAX_MEASURED = 20_000  # detections whose residuals are stated
 RUN, PARTS = 8, 5  # of this many parts of a recording, runs of consecutive instants, one is held out
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
@@ -89,10 +89,10 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
         check_sizes(recording.wand, solution.adjusted, solution.observations)
         check_spacing(recording.wand, solution.adjusted, solution.observations)
     solution = replace(solution, adjusted=inflate_covariance(solution.adjusted))
-    return _validate(recording, rough, solution)
+    return _validate(recording, solution)
 
 
-def _validate(recording: LabeledRecording, rough: RoughRig, solution: Solution) -> Solution:
+def _validate(recording: LabeledRecording, solution: Solution) -> Solution:
     """Measure the residuals of all detections, and of detections that are held out.
 
     Of recordings with very many detections, those in the frame sets of the adjustment are measured.
@@ -102,32 +102,28 @@ def _validate(recording: LabeledRecording, rough: RoughRig, solution: Solution) 
     if len(measured) > MAX_MEASURED:
         measured = np.isin(np.arange(len(measured)), observations.row)
     corrected = recording.with_centres(observations.row, observations.uv).select(measured)
+    given = triangulated_residuals(corrected, adjusted.state)
     residuals = np.full(len(measured), np.nan)
-    residuals[measured] = np.linalg.norm(triangulated_residuals(corrected, adjusted.state)[0], axis=1)
+    residuals[measured] = np.linalg.norm(given.pixels, axis=1)
     run = np.unique(corrected.detections.t_s, return_inverse=True)[1] // RUN
-    last = run % PARTS == PARTS - 1
-    without = _adjust_part(corrected.select(~last), rough, adjusted) if last.any() else None
+    last = np.zeros(len(measured), bool)
+    last[measured] = run % PARTS == PARTS - 1
+    held_out = corrected.select(last[measured])
+    without = _adjust_without(solution, last) if last.any() else None
     return replace(
         solution,
-        given=validate(corrected, adjusted.state),
-        held_out=validate(corrected.select(last), without) if without is not None else None,
+        given=given.summary(),
+        held_out=triangulated_residuals(held_out, without).summary() if without is not None else None,
         rejected_px=residuals[observations.row[~adjusted.used]],
     )
 
 
-def _adjust_part(part: LabeledRecording, rough: RoughRig, whole: Adjusted) -> State | None:
-    """The state adjusted to a part of the recording, with the priors of the whole; None where it gives too few frame
-    sets."""
-    state = whole.state
-    lenses = [state.lens(k, lens) for k, lens in enumerate(part.lenses)]
-    near = replace(rough, cameras=state.cameras, offset_s=state.clocks[:, 0])
-    try:
-        start = _build(part.undistort_tracks(lenses), near, FINE_SETS)
-    except CalibrationError:
-        return None
-    problem = replace(whole.problem, knot_s=start.problem.knot_s, fixed_distance=start.problem.fixed_distance)
-    start_state = replace(state, motion=start.state.motion)
-    return adjust(problem, start.observations, start_state, rounds=1).state
+def _adjust_without(solution: Solution, held_out: Mask) -> State | None:
+    """The state adjusted without some detections (n,) of the recording, from the state with them; None where fewer than
+    two frame sets remain."""
+    whole = Estimate(solution.adjusted.problem, solution.adjusted.state, solution.observations)
+    part = whole.select(~held_out[solution.observations.row])
+    return None if part is None else optimize(part.problem, part.observations, part.state)
 
 
 def scale_rig(rough: RoughRig) -> RoughRig:

@@ -107,7 +107,7 @@ def _fit_half(recording: WandRecording, wand: Body) -> tuple[int, float]:
     except CalibrationError:
         return 0, np.inf
     rest = LabeledRecording.of(*_select(recording, wand, ~fitted), start.placed)
-    residuals = triangulated_residuals(rest, state)[0]
+    residuals = triangulated_residuals(rest, state).pixels
     norms = np.linalg.norm(residuals, axis=1)
     norms = norms[np.isfinite(norms)]
     return len(start.placed), float(np.median(norms)) if len(norms) else np.inf

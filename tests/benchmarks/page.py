@@ -96,8 +96,11 @@ def main() -> int:
         shares = {"no browser": cpu_share(process, SECONDS / 2)}
         with open_page(port) as reader:
             threading.Thread(target=read, args=(reader, received), daemon=True).start()
-            n_sent = len(sent)
+            n_sent, memory = len(sent), process.memory_info().rss
             shares["one browser"] = cpu_share(process, SECONDS)
+            print(
+                f"memory with one browser: {(process.memory_info().rss - memory) / 1e6:+.1f} MB in {SECONDS:.0f} s"
+            )
             print(f"frame sets/s that were sent (of {RATE_HZ:.0f}): {(len(sent) - n_sent) / SECONDS:.0f}")
             rate = len(received) / SECONDS
             with open_page(port):  # reads nothing

@@ -18,7 +18,7 @@ from tests.waiting import Inbox, wait_for
 CAMERAS = ("north", "south")
 SERVER_READS = ("clock", "rig", "robots")
 SERVER_CHANGES = ("rig/set", "rig/undo", "rig/redo", "robots/set")
-CAMERA_KEYS = ("detections", "status", "alive", "snapshot", "settings", "@preview")
+CAMERA_KEYS = ("detections", "relative", "status", "alive", "snapshot", "settings", "@preview")
 PUBLISHED = ("markers", "robot/a/pose", "fusion/status", "fusion/shard/2", "fusion/alive", "rig")
 ALL = frozenset(
     {f"camera/{camera}/{key}" for camera in CAMERAS for key in CAMERA_KEYS}
@@ -46,7 +46,7 @@ VIEWER = Rights(query={*SERVER_READS, *SNAPSHOTS}, receive={*ALL})
 OPERATOR = Rights(token={"calib/wand"}, query={*VIEWER.query, *SERVER_CHANGES, *SETTINGS}, receive={*ALL})
 RIGHTS = {
     "camera.north": Rights(
-        put={"camera/north/detections", "camera/north/status", "camera/north/@preview"},
+        put={f"camera/north/{key}" for key in ("detections", "relative", "status", "@preview")},
         token={"camera/north/alive"},
         query={"clock"},
         answer={"camera/north/snapshot", "camera/north/settings"},

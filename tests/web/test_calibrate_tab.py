@@ -20,6 +20,8 @@ from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import loopback
 from web.errors import WebError
+from web.feed import Feed
+from web.scene.cameras import CameraDrawing
 from web.subscription import Subscription
 from web.tabs.calibrate import describe_change, tabulate_rigs
 from web.tabs.rig_change import CalibrationFiles
@@ -94,6 +96,22 @@ def test_the_history_names_what_changed(arena: LiveArena, subscription: Subscrip
         ("the server", "4 cameras placed"),
     ]
     assert [row.level for row in rows] == ["ok", "wait"]
+
+
+def test_only_what_changed_is_drawn_again():
+    """A camera that moved keeps its node, which would lose its label otherwise; a removed one disappears."""
+    view, rig = View(Feed("test"), loopback()), four_cameras()
+    drawing = CameraDrawing(view.server.scene)
+    drawing.draw(rig)
+    before = dict(drawing._frustums)
+    drawing.draw(moved(rig, "north", 0.5))
+    assert drawing._frustums == before
+    assert before["north"].position[0] == pytest.approx(rig.cameras["north"].matrix()[0, 3] + 0.5)
+    drawing.draw(Rig(cameras={"north": rig.cameras["north"]}))
+    assert drawing._frustums == {"north": before["north"]}
+    drawing.draw(None)
+    assert not drawing._frustums
+    view.close()
 
 
 def test_changes_of_a_rig():

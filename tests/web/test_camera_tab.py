@@ -137,11 +137,11 @@ def test_a_camera_is_renamed(arena: LiveArena, view: View):
 
     queryable = arena.session.declare_queryable(change_key("test"), answer)
     with browsing(view) as page:
-        rename = page.get_by_role("button", name="Rename")
+        rename = page.get_by_role("button", name="Rename the camera")
         wait_for(rename.is_enabled, lambda: arena.camera("camera-1"))
         rename.click()
         page.get_by_text("'' can't name a camera").wait_for(timeout=20_000)
-        page.locator("xpath=//*[text()='New name']/following::input[1]").fill("north-2")
+        page.locator("xpath=//*[text()='Rename to']/following::input[1]").fill("north-2")
         wait_for(lambda: changes, rename.click)
         page.get_by_text("camera-1 is called north-2 from now on").wait_for(timeout=20_000)
     assert (changes[0].camera, changes[0].name) == ("camera-1", "north-2")

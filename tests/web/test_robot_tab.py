@@ -60,7 +60,9 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
         page.get_by_role("button", name="Turn the heading").click()
         page.get_by_text("turned by 90 degrees").wait_for()
         assert client.declared_robots().robots == {"a": turn_heading(TRIANGLE, 90.0)}
-        page.get_by_text("New name").locator("xpath=ancestor::*[.//input][1]").locator("input").fill("cart")
+        page.get_by_text("New name").locator("xpath=ancestor::*[.//input][1]").locator("input:visible").fill(
+            "cart"
+        )
         page.get_by_role("button", name="Rename").click()
         page.get_by_text("a is cart now").wait_for()
         choose(page, "cart")  # the field of the new name is empty again

@@ -92,6 +92,7 @@ COMMANDS = {
             "roundel camera",
             "roundel camera --source 0 --connect tcp/server:7447",
             "roundel camera --source recording/north recording/east",
+            "roundel camera --source 0 --name scout --rig rig.yaml --diameter 0.09 --listen tcp/127.0.0.1:7447",
         ),
     ),
     "cameras": Command(

@@ -61,11 +61,14 @@ class LivePictures:
             "Live pictures", True, hint="each camera sends a small picture about three times a second"
         )
         self._grid = server.gui.add_html("")
+        self._is_watched = False
 
     def update(self, state: ArenaState) -> None:
         """Show the recent pictures; those of a silent camera disappear."""
         is_watched = self._wanted.value and bool(self._server.get_clients())
-        self._subscription.watch_previews(is_watched)
+        if is_watched != self._is_watched:
+            self._is_watched = is_watched
+            self._subscription.watch_previews(is_watched)
         recent = {
             name: timed.message
             for name, timed in sorted(state.previews.items())
@@ -107,7 +110,7 @@ class CameraSettings:
         self._folder = gui.add_folder("One camera")
         with self._folder:
             self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
-            self._new_name = gui.add_text("New name", "", hint="in the rig, in files and on the network")
+            self._new_name = gui.add_text("Rename to", "", hint="in the rig, in files and on the network")
             self._exposure = gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0)
             self._gain = gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units")
             self._contrast = gui.add_number(
@@ -120,7 +123,7 @@ class CameraSettings:
             )
             answer = Answer(gui)
             self._buttons = (
-                ActionButton(gui, "Rename", self.rename, answer),
+                ActionButton(gui, "Rename the camera", self.rename, answer),
                 ActionButton(gui, "Read the settings", self.read, answer),
                 ActionButton(gui, "Apply", self.apply, answer, "zero leaves exposure or gain as it is"),
                 ActionButton(gui, "Take a snapshot", self._show_snapshot, answer),

@@ -11,9 +11,11 @@ the recording cannot show count in full. docs/wand_adjustment.md has the equatio
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
-from calib.rig.camera import LENS, Camera
+from calib.rig.camera import LENS, Camera, with_distortion
+from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import inverse_information
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import Problem
@@ -59,6 +61,24 @@ def calibrated_sigma(lens: Lens) -> Array | None:
     k1, *higher = distortion or [K1]
     higher = [*higher, 0.0, 0.0, 0.0, 0.0][:4]
     return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SIGMA)
+
+
+def coarse_sigma(lens: Lens) -> Array:
+    """(9,) prior standard deviations before the recording decides: the usual ones, or larger ones of the file."""
+    given = calibrated_sigma(lens)
+    return usual_sigma(lens) if given is None else np.maximum(usual_sigma(lens), given)
+
+
+def widen_lenses(rig: Rig, factor: float) -> Rig:
+    """The rig with the standard deviations of all lenses multiplied by `factor`; a lens whose file has none gets the
+    usual ones, multiplied."""
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        camera = with_distortion(camera)
+        sigma = camera.lens_sigma or parameter_sigma(camera, None, usual_sigma(camera))
+        widened = tuple(factor * value for value in sigma)
+        cameras[name] = msgspec.structs.replace(camera, lens_sigma=widened)
+    return msgspec.structs.replace(rig, cameras=cameras)
 
 
 def parameter_sigma(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:

@@ -68,12 +68,45 @@ def optimize_robustly(problem: Problem, observations: WandObservations, start: S
 def adjust(
     problem: Problem, observations: WandObservations, start: State, rounds: int = MAX_ROUNDS
 ) -> Adjusted:
-    """Optimize from a start that is nearly right, without outliers.
+    """Optimize from a start that is nearly right, without outliers, and prepare the covariance.
 
     Each round rejects observations, and interrupts the motion prior, by the statistics of the residuals, and optimizes;
     rounds end where these do not change.
     """
-    state, iterations = start, 0
+    optimum = _optimize_exactly(problem, observations, start, rounds)
+    state, inliers, weights = optimum.state, observations.select(optimum.used), optimum.weights
+    cameras = eliminate_motion(linearize(problem, inliers, state, weights))
+    return Adjusted(
+        problem=problem,
+        state=state,
+        used=optimum.used,
+        residuals=reprojection_errors(problem, observations, state),
+        scale=_noise_scale(problem, inliers, state, weights),
+        information=cameras.information,
+        scores=cameras.scores,
+        iterations=optimum.iterations,
+    )
+
+
+def optimize(problem: Problem, observations: WandObservations, start: State) -> State:
+    """Optimize from a start that is nearly right, without the observations that it rejects."""
+    return _optimize_exactly(problem, observations, start, rounds=1).state
+
+
+@dataclass(frozen=True, slots=True)
+class _Optimum:
+    """The optimal state, the observations (n,) that it is adjusted to, their weights, and the iterations it took."""
+
+    state: State
+    used: Mask
+    weights: Weights
+    iterations: int
+
+
+def _optimize_exactly(
+    problem: Problem, observations: WandObservations, state: State, rounds: int
+) -> _Optimum:
+    iterations = 0
     used, interrupted = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
     for _ in range(rounds):
         weights = find_weights(problem, observations, state)
@@ -88,11 +121,7 @@ def adjust(
         iterations += more
     else:
         weights = find_weights(problem, observations, state)
-    inliers, their_weights = observations.select(used), weights.select(used, interrupted)
-    cameras = eliminate_motion(linearize(problem, inliers, state, their_weights))
-    scale = _noise_scale(problem, inliers, state, their_weights)
-    residuals = reprojection_errors(problem, observations, state)
-    return Adjusted(problem, state, used, residuals, scale, cameras.information, cameras.scores, iterations)
+    return _Optimum(state, used, weights.select(used, interrupted), iterations)
 
 
 def _spread(norms: Array) -> float:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
 from calib.wand.trajectory import AffineWand
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
@@ -195,6 +195,22 @@ class Estimate:
     problem: Problem
     state: State
     observations: WandObservations
+
+    def select(self, rows: Mask) -> "Estimate | None":
+        """The estimate with some of its n observations, `rows` (n,), and with the knots where two cameras or more have
+        one of these; None where these are fewer than two."""
+        knot, count = self.observations.knot, len(self.problem.knot_s)
+        pairs = np.unique(np.column_stack([knot, self.observations.camera])[rows], axis=0)
+        known = np.bincount(pairs[:, 0], minlength=count) >= 2
+        if known.sum() < 2:
+            return None
+        rows = rows & known[knot]
+        observations = self.observations.select(rows)
+        return Estimate(
+            replace(self.problem, knot_s=self.problem.knot_s[known]),
+            replace(self.state, motion=self.state.motion[known]),
+            replace(observations, knot=(np.cumsum(known) - 1)[knot[rows]]),
+        )
 
 
 def gauge_directions(state: State, free: tuple[int, ...]) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_frames
 from calib.wand.bundle_adjustment.initial_motion import initial_positions
-from calib.wand.bundle_adjustment.lens_prior import usual_sigma
+from calib.wand.bundle_adjustment.lens_prior import coarse_sigma
 from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
 from calib.wand.detections import WandDetections, normalise
 from calib.wand.initialization.two_view import TwoViewGeometry
@@ -117,7 +117,7 @@ def build_problem(
     rows, knot = rows[known[knot]], renumbered[knot[known[knot]]]
     knot_s, basis = knot_s[known], basis[known]
     density = acceleration_density(knot_s, basis, gap_s)
-    lens_sigma = np.array([usual_sigma(lens) for lens in recording.lenses])
+    lens_sigma = np.array([coarse_sigma(lens) for lens in recording.lenses])
     problem = Problem(list(recording.lenses), wand, knot_s, gap_s, density, recording.middle_s, lens_sigma)
     motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
     return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))

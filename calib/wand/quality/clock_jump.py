@@ -121,17 +121,37 @@ def _confirm(
         estimated=problem.estimated and (*problem.estimated, after),
         drift_sigma=SLEWED_DRIFT,
     )
-    later = (observations.camera == camera) & (observations.t_s >= change.t_s)
-    observations = replace(observations, camera=np.where(later, after, observations.camera))
     start = State(state.cameras[split], clocks, state.lenses[split], state.motion)
-    start = optimize_robustly(two, observations, start)
-    jump, variance = _clock_difference(
-        inflate_covariance(adjust(two, observations, start)), camera, change.t_s
-    )
+    start = optimize_robustly(two, _split(observations, camera, change.t_s, after), start)
+    # The first time is found along a motion that is adjusted to both parts of the clock.
+    at_s = _find_boundary(two, observations, start, camera)
+    adjusted = inflate_covariance(adjust(two, _split(observations, camera, at_s, after), start))
+    jump, variance = _clock_difference(adjusted, camera, at_s)
     by_chance = chdtrc(1, jump**2 / variance) * len(observations)
     if by_chance > CHANCE or not 1 / AGREEMENT < -jump / change.by_s < AGREEMENT:
         return None
-    return ClockJump(names[camera], 1e3 * jump, 1e3 * variance**0.5, change.t_s)
+    return ClockJump(names[camera], 1e3 * jump, 1e3 * variance**0.5, at_s)
+
+
+def _split(observations: WandObservations, camera: int, at_s: float, new: int) -> WandObservations:
+    """The observations with those of a camera from stamp `at_s` on under the number of a `new` one."""
+    later = (observations.camera == camera) & (observations.t_s >= at_s)
+    return replace(observations, camera=np.where(later, new, observations.camera))
+
+
+def _find_boundary(problem: Problem, observations: WandObservations, state: State, camera: int) -> float:
+    """The stamp before which a camera's observations fit its own state, and after which they fit the last camera's."""
+    rows = observations.select(np.flatnonzero(observations.camera == camera))
+    rows = rows.select(np.argsort(rows.t_s, kind="stable"))
+    frames, first = np.unique(rows.t_s, return_index=True)
+    deviations = []
+    for of in (camera, len(problem.lenses) - 1):
+        as_camera = replace(rows, camera=np.full(len(rows), of))
+        errors = whitened_errors(problem, as_camera, state, find_weights(problem, as_camera, state))
+        deviations.append(np.minimum(np.linalg.norm(errors, axis=1), MAX_DEVIATION))
+    gain = np.cumsum(deviations[0] - deviations[1])
+    inner = slice(MIN_FRAMES, len(frames) - MIN_FRAMES)
+    return float(frames[inner][gain[first[inner] - 1].argmin()])
 
 
 def _clock_difference(adjusted: Adjusted, camera: int, at_s: float) -> tuple[float, float]:

@@ -4,6 +4,8 @@
 Detections that the rig was not adjusted to are held out: their residuals show how well it describes new ones.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from calib.wand.bundle_adjustment.problem import State
@@ -17,48 +19,55 @@ GROSS = 4.5  # standard deviations of the residuals: a larger one is a gross err
 RAYLEIGH_MEDIAN = 1.1774  # in standard deviations of one coordinate
 
 
-def validate(recording: LabeledRecording, state: State) -> Validation | None:
-    """Measure the residuals of a recording at a rig; None where no two cameras saw a marker at once.
+@dataclass(frozen=True, slots=True)
+class TriangulatedResiduals:
+    """Residuals of n detections; NaN where fewer than two cameras saw the marker.
+
+    Attributes:
+        pixels: (n, 2) observed minus predicted pixels.
+        range_m: (n,) distances of the markers from their cameras.
+        focal_px: (n,) focal lengths of the cameras.
+    """
+
+    pixels: Array
+    range_m: Array
+    focal_px: Array
+
+    def summary(self) -> Validation | None:
+        """The residuals of all, and of those without gross errors; None where no two cameras saw a marker at once."""
+        known = np.isfinite(self.pixels).all(axis=1)
+        if not known.any():
+            return None
+        norms, distance = np.linalg.norm(self.pixels[known], axis=1), self.range_m[known]
+        fine = norms <= GROSS * np.median(norms) / RAYLEIGH_MEDIAN
+        return Validation(
+            count=len(norms),
+            all_px=_rms(norms),
+            gross=float((~fine).mean()),
+            residual_px=_rms(norms[fine]),
+            error_m=_rms((norms / self.focal_px[known] * distance)[fine]),
+            range_m=float(np.median(distance)),
+        )
+
+
+def triangulated_residuals(recording: LabeledRecording, state: State) -> TriangulatedResiduals:
+    """Triangulate the marker of each detection, robustly, from it and from the other cameras' detections at its true
+    time, equal or interpolated.
 
     Args:
         recording: labeled detections of C cameras.
         state: poses, clocks and lenses of these cameras.
     """
-    residuals, points = triangulated_residuals(recording, state)
-    known = np.isfinite(residuals).all(axis=1)
-    if not known.any():
-        return None
-    norms, camera = np.linalg.norm(residuals[known], axis=1), recording.detections.camera[known]
-    fine = norms <= GROSS * np.median(norms) / RAYLEIGH_MEDIAN
-    distance = np.linalg.norm(points[known] - state.cameras[camera, :3, 3], axis=1)
-    focal = np.array([(lens.fx + lens.fy) / 2 for lens in _lenses(recording, state)])[camera]
-    return Validation(
-        count=len(norms),
-        all_px=_rms(norms),
-        gross=float((~fine).mean()),
-        residual_px=_rms(norms[fine]),
-        error_m=_rms((norms / focal * distance)[fine]),
-        range_m=float(np.median(distance)),
-    )
-
-
-def triangulated_residuals(recording: LabeledRecording, state: State) -> tuple[Array, Array]:
-    """Triangulate the marker of each detection, robustly, from it and from the other cameras' detections at its true
-    time, equal or interpolated.
-
-    Returns:
-        residuals: (n, 2) observed minus predicted pixels; NaN where fewer than two cameras saw the marker.
-        points: (n, 3) markers, world.
-    """
-    lenses = _lenses(recording, state)
-    recording = recording.undistort_tracks(lenses)
-    residuals, points = (np.full((len(recording.detections), width), np.nan) for width in (2, 3))
+    lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    recording, count = recording.undistort_tracks(lenses), len(recording.detections)
+    pixels, range_m, focal_px = np.full((count, 2), np.nan), np.full(count, np.nan), np.empty(count)
     for camera, lens in enumerate(lenses):
         rows, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
-        points[rows] = _triangulate_rows(recording, state, lens, camera, rows)
-        predicted = lens.project((points[rows] - T[:3, 3]) @ T[:3, :3])
-        residuals[rows] = recording.detections.uv[rows] - predicted
-    return residuals, points
+        points = _triangulate_rows(recording, state, lens, camera, rows)
+        pixels[rows] = recording.detections.uv[rows] - lens.project((points - T[:3, 3]) @ T[:3, :3])
+        range_m[rows] = np.linalg.norm(points - T[:3, 3], axis=1)
+        focal_px[rows] = (lens.fx + lens.fy) / 2
+    return TriangulatedResiduals(pixels, range_m, focal_px)
 
 
 def _triangulate_rows(
@@ -77,10 +86,6 @@ def _triangulate_rows(
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
     ray = np.einsum("cij,crj->cri", state.cameras[:, :3, :3], ray)
     return intersect(ray[:, None], state.cameras[:, :3, 3], np.isfinite(xy[:, None, :, 0]))[0][0]
-
-
-def _lenses(recording: LabeledRecording, state: State) -> list[Lens]:
-    return [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
 
 
 def _rms(values: Array) -> float:

@@ -172,6 +172,32 @@ def test_an_l_shaped_frame_fixes_the_world(tmp_path: Path):
     assert not (tmp_path / "none.yaml").exists()
 
 
+def test_one_camera_is_placed_by_points_on_the_floor(tmp_path: Path):
+    """From lenses without poses; the other cameras stay without."""
+    arena = ring()
+    save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
+    points = {**L_FRAME, "3": [-0.6, -0.4, 0.0], "4": [0.4, -0.7, 0.0]}
+    only = [m for m in detect_landmarks(arena, points, clutter=0) if m.camera == "cam1"]
+    write_observations(tmp_path / "floor.csv", only)
+    (tmp_path / "points.yaml").write_text("".join(f"'{name}': {at}\n" for name, at in points.items()))
+    options = [
+        "--rig",
+        tmp_path / "lenses.yaml",
+        "--observations",
+        tmp_path / "floor.csv",
+        "--camera",
+        "cam1",
+    ]
+    done = calib("world", *options, "--points", tmp_path / "points.yaml", "--out", tmp_path / "rig.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "cam1: placed by 5 points" in done.stdout
+    placed = load_rig(tmp_path / "rig.yaml").placed()
+    assert list(placed) == ["cam1"]
+    assert placed["cam1"].matrix() == pytest.approx(arena.truth.cameras["cam1"].matrix(), abs=5e-3)
+    done = calib("world", *options, "--out", tmp_path / "none.yaml")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+
+
 @pytest.mark.parametrize("word", ["undo", "--undo"])
 def test_undo_restores_the_previous_rig(tmp_path: Path, arena: Arena, word: str):
     before = (tmp_path / "rig.yaml", tmp_path / "rig.1.yaml")

@@ -36,17 +36,24 @@ def located(
 
 
 @pytest.mark.parametrize(("px", "tilts"), [(14, (0.0, 0.3)), (20, (0.1, 1.0)), (40, (0.0, 1.0))])
-def test_the_covariance_of_the_position_is_honest(px: float, tilts: tuple[float, float]):
+def test_the_claimed_errors_are_honest(px: float, tilts: tuple[float, float]):
     """Squared Mahalanobis distances have the mean 3 and the variance 6: five sigmas of the mean of 150 are 1.0.
 
     Errors of pictures with one pose share its sub-pixel errors, so that the spread is larger than that of independent
     ones; frontal discs and both normals are included.
     """
-    squares = []
+    squares, normals = [], []
     for sight, found in located(px, tilts, 150, seed=int(px)):
         e = found.position[0] - sight.position
         squares.append(e @ np.linalg.solve(found.cov[0], e))
+        k = int(np.argmax(found.normals[0] @ sight.normal))
+        error = np.arccos(np.clip(found.normals[0, k] @ sight.normal, -1, 1))
+        normals.append((error / found.normal_sigma[0, k]) ** 2)
     assert np.mean(squares) == pytest.approx(3, abs=1.0)
+    if tilts[0] > 0:  # a frontal disc has two minima, around the true normal
+        assert 1 < np.mean(normals) < 3, (
+            "two directions of a variance of at most 1 each, and a margin of 50 %"
+        )
 
 
 def test_the_probabilities_of_the_normals_are_calibrated():

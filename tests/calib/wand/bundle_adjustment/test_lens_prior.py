@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma
+from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma, usual_sigma, widen_lenses
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
@@ -113,3 +113,27 @@ def test_standard_deviations_of_a_lens_are_read_and_checked():
     assert calibrated_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
     with pytest.raises(ValueError, match="lens_sigma"):
         type(camera)(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, lens_sigma=(0.1,))
+
+
+def test_widened_priors_make_the_covariance_of_changed_lenses_right():
+    """Lenses 2.5 times as far off as their files say, which the recording does not show: covariances are too small
+    until the priors are 2.5 times as wide."""
+    focal, centre_px, k1 = (2.5 * value for value in CAREFUL)
+    narrow, wide, degrees = 0.0, 0.0, 0
+    for seed in SEEDS:
+        rig = widen_lenses(roughly(recorded(seed).intrinsics, (focal, centre_px, k1), True, seed), 1 / 2.5)
+        for factor in (1.0, 2.5):
+            result = calibrate(widen_lenses(rig, factor), WandScenario().wand, recorded(seed).messages)
+            squared, more = joint_error(result, recorded(seed).truth)
+            narrow, wide = (narrow + squared, wide) if factor == 1 else (narrow, wide + squared)
+        degrees += more
+    assert chi2.ppf(0.001, degrees) < wide < chi2.ppf(0.999, degrees) < narrow
+
+
+def test_lenses_without_standard_deviations_are_widened_from_the_usual_ones():
+    rig = widen_lenses(recorded(1).intrinsics, 3.0)
+    for camera in rig.cameras.values():
+        sigma = calibrated_sigma(camera)
+        assert sigma is not None
+        assert np.allclose(sigma[1:4], 3 * usual_sigma(camera)[1:4])
+        assert sigma[0] >= 3 * usual_sigma(camera)[0]
