@@ -31,7 +31,7 @@ from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_tim
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
 
-COMPARED_NS, CHECKED_NS = 45_000_000, 250_000_000  # between comparisons, and between searches for a drift
+COMPARED_NS, CHECKED_NS = 45_000_000, 400_000_000  # between comparisons, and between searches for a drift
 LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set
 JUMP_SIGMA_V, DRIFT_SIGMA_V = (
     0.5,

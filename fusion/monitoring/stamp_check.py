@@ -8,6 +8,7 @@ import numpy as np
 from camera_node.arrays import Array
 
 HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
+RENEWED = 8  # frames, after which the usual lags are computed again
 MIN_JUMP_NS = 4_000_000
 MIN_IRREGULAR = 0.1  # of the interval between frames
 MAX_SWAPPED = 3  # intervals by which a frame may overtake another
@@ -27,12 +28,13 @@ class StampCheck:
         self._usual_ns: float | None = None  # lag before the last jump
         self._lags: deque[int] = deque(maxlen=HISTORY)
         self._stamps: deque[int] = deque(maxlen=LEARNED)
+        self._quantiles, self._slope, self._age = np.zeros(4), 0.0, RENEWED
 
     def has_jumped(self, t_ns: int, received_ns: int) -> bool:
         """Whether the stamp `t_ns` of the next frame jumped; the frames before it are forgotten then."""
         lag, jumped = received_ns - t_ns, False
         if len(self._lags) >= LEARNED:
-            first, usual, late, last = np.percentile(self._expected_lags(), [0, 50, 95, 100])
+            first, usual, late, last = self._expected_lags()
             is_known = not first == last == lag
             is_early = lag < first - MIN_JUMP_NS and not self._is_next(t_ns)
             is_late = (lag > late + MIN_JUMP_NS or not is_known) and self._is_irregular(t_ns)
@@ -41,6 +43,7 @@ class StampCheck:
                 self._usual_ns = float(usual) if is_known else None
                 self._lags.clear()
                 self._stamps.clear()
+                self._age = RENEWED
         self._lags.append(lag)
         self._stamps.append(t_ns)
         return jumped
@@ -50,11 +53,16 @@ class StampCheck:
         return None if self._usual_ns is None else self._usual_ns - float(np.median(self._lags))
 
     def _expected_lags(self) -> Array:
-        """The lags so far, displaced to the next frame by their trend: those of a clock that drifts."""
-        lags = np.array(self._lags, float)
-        half = len(lags) // 2
-        slope = (np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
-        return lags + slope * np.arange(len(lags), 0, -1)
+        """(4,) quantiles 0, 0.5, 0.95 and 1 of the lag of the next frame: the lags so far follow their trend, as those
+        of a clock that drifts do."""
+        self._age += 1
+        if self._age > RENEWED:
+            lags = np.array(self._lags, float)
+            half = len(lags) // 2
+            self._slope = float(np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
+            lags += self._slope * np.arange(len(lags), 0, -1)
+            self._quantiles, self._age = np.percentile(lags, [0, 50, 95, 100]), 0
+        return self._quantiles + self._slope * self._age
 
     def _interval_ns(self) -> float:
         return max(1.0, float(np.median(np.diff(np.sort(self._stamps)))))
