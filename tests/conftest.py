@@ -2,6 +2,7 @@
 """Fixtures of several folders, and the order of the tests when `make test` runs them on all cores."""
 
 import fcntl
+import functools
 import os
 import random
 import re
@@ -11,7 +12,6 @@ import socket
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
 import pytest
 
@@ -31,7 +31,7 @@ LIVE_FILES = (
     "test_publish.py",
 )
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
-_locked_ports: list[IO[str]] = []
+_reserved_ports: set[int] = set()
 NICENESS = 10  # of tests that only compute
 
 # A shell that runs the tests in the background makes them, and the programs that they start, ignore SIGINT.
@@ -62,19 +62,26 @@ def free_port() -> int:
     """Return a TCP port that is reserved for this process until it ends.
 
     It is outside the ephemeral range, so the operating system does not assign it to an outgoing connection. A locked
-    file reserves it against the tests of other processes.
+    byte of a file reserves it against the tests of other processes.
     """
     for port in random.Random(os.urandom(8)).sample(PORTS, len(PORTS)):
-        file = (Path(tempfile.gettempdir()) / f"roundel-test-port-{os.getuid()}-{port}").open("w")
+        if port in _reserved_ports:  # a process's own locks do not stop it
+            continue
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.lockf(_port_locks(), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, port)
             socket.create_server(("127.0.0.1", port)).close()
         except OSError:
-            file.close()
             continue
-        _locked_ports.append(file)
+        _reserved_ports.add(port)
         return port
     raise RuntimeError(f"no free port in {PORTS}")
+
+
+@functools.cache
+def _port_locks() -> int:
+    """The open file whose bytes are locked; it stays open, because closing it would end all locks of this process."""
+    path = Path(tempfile.gettempdir()) / f"roundel-test-ports-{os.getuid()}"
+    return os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, 
 
     Args:
         cameras: placed cameras by name.
-        wand: its markers; the ends of a wand of two can't be told apart in one frame, so it is not located.
+        wand: its markers; in one frame the ends of a wand of two can't be distinguished, so it is not located.
         latest: the latest frame of each camera, by name.
 
     Returns:

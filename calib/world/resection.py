@@ -230,11 +230,11 @@ def _fit_from_all_starts(camera: Camera, pixels: Array, places: Array, sigma_m: 
         if not is_collinear(places[list(rows)])
         for T in _three_point_poses(rays[list(rows)], places[list(rows)])
     ]
-    kept: list[Array] = []
+    distinct: list[Array] = []
     for T in sorted(starts, key=lambda T: _Fit(camera, invert(T), pixels, places, sigma_m).chi2()):
-        if len(kept) < MAX_STARTS and all(_angle(T, other) > DISTINCT_RAD for other in kept):
-            kept.append(T)
-    for T in kept:
+        if len(distinct) < MAX_STARTS and all(_angle(T, other) > DISTINCT_RAD for other in distinct):
+            distinct.append(T)
+    for T in distinct:
         fit = _Fit(camera, invert(T), pixels, places, sigma_m)
         for _ in range(ITERATIONS):
             if not np.isfinite(fit.chi2()):

@@ -12,6 +12,7 @@ RENEWED = 8  # frames, after which the usual lags are computed again
 MIN_JUMP_NS = 4_000_000
 MIN_IRREGULAR = 0.1  # of the interval between frames
 MAX_SWAPPED = 3  # intervals by which a frame may overtake another
+MAX_RATE = 0.01  # of a clock that drifts; the lags of queued frames fall by their intervals
 MAX_GAP = 5  # intervals; a longer gap of a recording may be a jump
 
 
@@ -59,7 +60,8 @@ class StampCheck:
         if self._age > RENEWED:
             lags = np.array(self._lags, float)
             half = len(lags) // 2
-            self._slope = float(np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
+            slope = float(np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
+            self._slope = slope if abs(slope) < MAX_RATE * self._interval_ns() else 0.0
             lags += self._slope * np.arange(len(lags), 0, -1)
             self._quantiles, self._age = np.percentile(lags, [0, 50, 95, 100]), 0
         return self._quantiles + self._slope * self._age

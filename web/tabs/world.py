@@ -57,7 +57,7 @@ class WorldPanel:
         self._preview = WorldPreview(server.scene)
 
     def update(self, state: ArenaState) -> None:
-        """Enable the buttons that can act; a rig that changed meanwhile voids the measurement."""
+        """Enable the buttons that can act; a rig that changed since the measurement voids it."""
         if self._change is not None and state.rig is not None and state.rig is not self._before:
             self._forget()
         placed = state.rig is not None and bool(state.rig.placed())

@@ -88,7 +88,7 @@ class SceneCamera(Source):
         return self._time_ns(seq) + READOUT_NS + round(self.fault.delay_ms * 1e6)
 
     def next_after(self, seq: int, now_ns: int, delay_ms: float = 0.0) -> int:
-        """The number of the next frame; frames that nobody fetched in time are skipped."""
+        """The number of the next frame; frames that were not fetched in time are skipped."""
         elapsed_s = (now_ns - self._world.epoch_ns - READOUT_NS) * 1e-9 - delay_ms * 1e-3
         return max(seq + 1, math.floor(elapsed_s * self._world.load.hz - self._phase) + (seq < 0))
 

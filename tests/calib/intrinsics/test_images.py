@@ -61,6 +61,7 @@ def test_a_running_camera_sends_snapshots(endpoint: str):
 def test_a_missing_camera_is_named(endpoint: str, seconds: float, silent_s: float):
     """After either time limit."""
     with (
+        open_router([endpoint]),
         open_client([endpoint]) as client,
         pytest.raises(CameraError, match="camera 'north' sends no images"),
     ):
