@@ -8,15 +8,12 @@ Needs no GTSAM and no SciPy. A reader that is slower than the poses gets the new
             print(pose.t_ns, pose.position, pose.quaternion_wxyz)
 """
 
-import asyncio
-import contextlib
-import difflib
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import zenoh
 
@@ -31,152 +28,13 @@ from camera_node.protocol.messages import CameraStatus, Keys, MessageError, deco
 from camera_node.protocol.relative import RelativePositions
 from camera_node.protocol.requests import RETRY_S
 from camera_node.protocol.server_address import LOCAL
+from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, RobotsRequest
 from fusion.protocol.requests import change_robots, request_robots
 
-T = TypeVar("T")
 TIMEOUT_S = 10.0
 MAX_ROBOTS = 1024
-MAX_NAMED = 20  # robots in one error
-
-
-class Stream(Generic[T]):
-    """Messages of one kind, such as the poses of one robot.
-
-    Iterating blocks until the next message, at most `timeout_s` (None: for ever), and ends when the arena is closed.
-
-    Args:
-        content: the word for the messages in errors.
-        timeout_s: of iterating.
-
-    Raises, while iterating:
-        NetworkError: none arrived within `timeout_s`.
-    """
-
-    def __init__(self, content: str, timeout_s: float | None) -> None:
-        self.timeout_s = timeout_s
-        self._content = content
-        self._changed = threading.Condition()
-        self._latest: T | None = None
-        self._count = 0
-        self._closed = False
-        self._callbacks: list[Callable[[T], object]] = []
-
-    def latest(self) -> T | None:
-        """The newest message, or None before the first."""
-        return self._latest
-
-    def next(self, timeout_s: float | None = None) -> T:
-        """Block until a message arrives after this call; the stream's own timeout applies unless one is given."""
-        for message in self._follow(self.timeout_s if timeout_s is None else timeout_s):
-            return message
-        raise NetworkError(f"the arena was closed while waiting for {self._content}")
-
-    def on_message(self, callback: Callable[[T], object]) -> Callable[[], None]:
-        """Call `callback` with every message, on Zenoh's thread: it must be fast. Returns its removal.
-
-        An exception of the callback is logged; the other callbacks and later messages are not affected.
-        """
-        call = guarded(f"a callback for {self._content}", callback)
-        self._callbacks.append(call)
-
-        def remove() -> None:
-            with contextlib.suppress(ValueError):
-                self._callbacks.remove(call)
-
-        return remove
-
-    def __iter__(self) -> Iterator[T]:
-        return self._follow(self.timeout_s)
-
-    async def __aiter__(self) -> AsyncIterator[T]:
-        loop, arrived = asyncio.get_running_loop(), asyncio.Event()
-
-        def wake(_: T) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(arrived.set)
-
-        remove = self.on_message(wake)
-        try:
-            while not self._closed:
-                try:
-                    await asyncio.wait_for(arrived.wait(), self.timeout_s)
-                except TimeoutError:
-                    raise self._silence(self.timeout_s) from None
-                arrived.clear()
-                if self._latest is not None:
-                    yield self._latest
-        finally:
-            remove()
-
-    def _follow(self, timeout_s: float | None) -> Iterator[T]:
-        with self._changed:
-            seen = self._count
-        while True:
-            with self._changed:
-                has_changed = self._changed.wait_for(lambda: self._closed or self._count > seen, timeout_s)  # noqa: B023
-                if self._closed:
-                    return
-                if not has_changed:
-                    raise self._silence(timeout_s)
-                seen, message = self._count, self._latest
-            if message is not None:
-                yield message
-
-    def _silence(self, timeout_s: float | None) -> NetworkError:
-        return NetworkError(f"no {self._content} within {timeout_s:g} s; {self._cause()}")
-
-    def _cause(self) -> str:
-        """The likely cause of silence, with what to do."""
-        return "is roundel server running there?"
-
-    def _put(self, message: T) -> None:
-        with self._changed:
-            self._latest = message
-            self._count += 1
-            self._changed.notify_all()
-        for callback in tuple(self._callbacks):
-            callback(message)
-
-    def _close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-
-class RobotStream(Stream[RobotPose]):
-    """The poses of one robot.
-
-    Args:
-        name: the robot's.
-        origin: where its poses come from, for errors.
-        timeout_s: of iterating.
-        known: the names of all robots whose poses arrive; they grow.
-    """
-
-    def __init__(self, name: str, origin: str, timeout_s: float | None, known: Collection[str]) -> None:
-        super().__init__(f"pose of '{name}' {origin}", timeout_s)
-        self._name, self._known = name, known
-
-    def _cause(self) -> str:
-        known = sorted(self._known)
-        if not known or self._name in known:
-            return super()._cause()
-        similar = difflib.get_close_matches(self._name, known, 1)
-        hint = f"; did you mean {similar[0]}?" if similar else ""
-        return f"the arena has no such robot, but {', '.join(known[:MAX_NAMED])}{hint}"
-
-    def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
-        """Call `callback` with every pose, on Zenoh's thread: it must be fast. Returns its removal."""
-        return self.on_message(callback)
-
-
-class RelativeStream(Stream[RelativePositions]):
-    """What one camera locates by itself."""
-
-    def _cause(self) -> str:
-        return "does roundel camera --rig RIG --diameter METRES run there under this name?"
 
 
 class Arena:

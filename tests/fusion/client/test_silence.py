@@ -4,7 +4,7 @@
 import pytest
 
 from camera_node.errors import NetworkError
-from fusion.client.arena import RobotStream
+from fusion.client.streams import RobotStream
 
 
 @pytest.mark.parametrize(
