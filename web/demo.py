@@ -235,7 +235,9 @@ class Demo:
             print(flush=True)
         self._score = None
         results = score.results(usage.start_ns, time.time_ns())
-        faults = [fault for result in results for fault in result.faults()]
+        status = self.feed.state().status
+        reasons = status.message.not_acquired if status else {}
+        faults = [fault for result in results for fault in result.faults(reasons.get(result.robot))]
         for line in (*summarize(results, score.latencies_ms), *usage.summarize(self.scene.cameras)):
             print(line)
         text, code = conclude(faults, is_test=seconds is not None)

@@ -26,10 +26,14 @@ class RobotScore:
     gap_s: float  # longest time without a tracked pose
     normalized: float  # mean squared position error over the claimed variance, per coordinate: 1 is due
 
-    def faults(self) -> list[str]:
-        """Return the limits that the robot exceeds, as text."""
+    def faults(self, not_acquired: str | None = None) -> list[str]:
+        """Return the limits that the robot exceeds, as text.
+
+        Args:
+            not_acquired: why the server does not track it now, if it does not.
+        """
         if np.isnan(self.rms_mm):
-            return [f"{self.robot} was never tracked"]
+            return [f"{self.robot} was never tracked" + (f": {not_acquired}" if not_acquired else "")]
         faults = []
         if self.rms_mm > MAX_RMS_MM:
             faults.append(

@@ -43,6 +43,7 @@ from camera_node.sources.frame import Frame, Source
 log = logging.getLogger("camera_node")
 
 STATUS_S = 1.0
+CLOSE_S = 5.0  # for a thread to end; one that is still in Zenoh when Python exits aborts the process
 SNAPSHOTS_HZ = 10.0  # a snapshot costs as much as the detection of several frames
 EXPLANATIONS_HZ = 2.0  # a search for everything that is ring-like, while the detector waits
 CHANGES_HZ = 10.0  # of settings: one can build a new detector
@@ -210,7 +211,7 @@ class Node:
             target=self._publish_status, args=(watch, service), name="status", daemon=True
         )
         reporter.start()
-        stack.callback(reporter.join, STATUS_S)
+        stack.callback(reporter.join, CLOSE_S)
         stack.callback(self._closed.set)
         if self._source.is_recording:
             self._await_subscriber(publisher)

@@ -20,7 +20,7 @@ PERIOD_S = 0.3  # between two pictures
 SIDE_PX = 320  # of a picture, at most
 QUALITIES = (60, 30, 10)  # of the JPEG: the first that fits into `MAX_PREVIEW_BYTES`
 MAX_SHARE = 0.02  # of a core: a slow machine sends fewer pictures
-CLOSE_S = 1.0
+CLOSE_S = 5.0
 Content = tuple[Grey, Roundels, tuple]  # image, its roundels, the mask's polygons
 
 

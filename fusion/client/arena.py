@@ -74,7 +74,7 @@ class Arena:
 
     @classmethod
     def connect(cls, *endpoints: str, arena: str = "arena", zenoh_config: Path | None = None) -> "Arena":
-        """Connect to "tcp/host:7447"; returns at once, and retries in the background while no server is reachable.
+        """Connect to "tcp/host:7447"; returns within half a second, and retries while no server answers.
 
         Raises:
             NetworkError: an endpoint is invalid.

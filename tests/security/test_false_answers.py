@@ -55,11 +55,14 @@ def test_a_false_time_that_comes_first_does_not_move_a_camera_s_clock():
         server = stack.enter_context(open_router(ANY_PORT))
         endpoints = listening_endpoints(server, ANY_PORT)
         spoofer, camera = (stack.enter_context(open_client(endpoints)) for _ in range(2))
+        spoofer.declare_queryable(KEYS.clock, answer_falsely)
+        wait_for_answers(camera, KEYS.clock, 1)  # each request that reaches the server has a false answer
         server.declare_queryable(
             KEYS.clock, lambda query: threading.Thread(target=answer_late, args=[query]).start()
         )
-        spoofer.declare_queryable(KEYS.clock, answer_falsely)
         wait_for_answers(camera, KEYS.clock, 2)
+        while spoofed.acquire(blocking=False):  # of requests that did not reach the server
+            pass
         clock = ClockSync(camera, KEYS).start()
         stack.callback(clock.close)
         wait_for(clock.estimate)

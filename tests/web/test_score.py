@@ -78,6 +78,8 @@ def test_a_missing_robot_fails():
     score.add(pose_of("rover", SECOND, np.eye(4), "lost"))
     assert faults_of(score) == ["rover was never tracked", "puck was never tracked"]
     assert not score.all_tracked()
+    (rover, _) = score.results(0, 2 * SECOND)
+    assert rover.faults("ambiguous with cart") == ["rover was never tracked: ambiguous with cart"]
 
 
 def test_a_gap_fails():

@@ -18,6 +18,7 @@ from web.formation.control import BLIND_S, Controller
 from web.formation.vision import CAMERA, FPS, ROUNDEL, RobotCamera
 from web.formation.world import STANDSTILL, RobotWorld
 
+CLOSE_S = 20.0  # for a node to end, on a loaded machine
 WAKE_S = 0.2  # between looks at whether a camera that waits is to end
 
 
@@ -152,7 +153,7 @@ class LiveRobot:
     def close(self) -> None:
         self._remove()
         self._node.close()
-        self._thread.join(5.0)
+        self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
         try:

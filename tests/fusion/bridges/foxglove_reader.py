@@ -3,6 +3,7 @@
 
 import base64
 import json
+import re
 import struct
 import time
 from pathlib import Path
@@ -70,6 +71,11 @@ class FoxgloveClient:
         raise TimeoutError(f"no message on {topic}")
 
     def _advertise(self, message: dict) -> None:
+        # foxglove-sdk may advertise a channel that appears during a connection shortly before it accepts it.
+        if message["op"] == "status" and (
+            refused := re.search(r"(?i)unknown channel.*?(\d+)", message["message"])
+        ):
+            self._subscribe([self._channels[int(refused[1])]])
         if message["op"] != "advertise":
             return
         offered = [c for c in message["channels"] if c["topic"].startswith(self._only)]
@@ -77,6 +83,9 @@ class FoxgloveClient:
         for channel in channels:
             self._channels[channel["id"]] = channel
             self._decoder.add(channel["schemaName"], base64.b64decode(channel["schema"]))
+        self._subscribe(channels)
+
+    def _subscribe(self, channels: list[dict]) -> None:
         subscriptions = [{"id": c["id"], "channelId": c["id"]} for c in channels]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
