@@ -112,8 +112,8 @@ def dump_yaml(data: msgspec.Struct) -> str:
     )
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader sees either the old text or the new one.
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file so that a reader sees either the old content or the new one; text is encoded in UTF-8.
 
     Raises:
         ConfigError: the folder does not exist or is not writable.
@@ -121,8 +121,8 @@ def write_atomically(path: Path, text: str) -> None:
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
                 os.fsync(file.fileno())
             os.chmod(name, 0o644)

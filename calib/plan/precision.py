@@ -57,13 +57,12 @@ class CombinedViews:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedErrors:
-    """Expected errors of robots at N points.
+    """Expected errors of robots at N points, from one frame set; infinite where fewer than two cameras see a robot.
 
     Attributes:
-        position_mm: (N,) root mean square distance between a robot's position and the estimate, from one frame set;
-            infinite where fewer than two cameras see it.
-        worst_axis_mm: (N,) standard deviation along the worst axis, likewise.
-        orientation_deg: (N,) root mean square angle, likewise; NaN for robots with fewer than three markers.
+        position_mm: (N,) root mean square distance between a robot's position and the estimate.
+        worst_axis_mm: (N,) standard deviation of the position along its worst axis.
+        orientation_deg: (N,) root mean square angle; NaN for robots with fewer than three markers.
         cameras: (N,) number of cameras that detect the roundels.
     """
 

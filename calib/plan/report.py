@@ -3,8 +3,6 @@
 
 import base64
 import io
-import os
-import tempfile
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -143,20 +141,11 @@ def _write_pdf(report: PlanReport, path: Path, title: str) -> None:
     figure = require("matplotlib.figure", "plan", "the report").Figure(figsize=PAGE_INCH)
     text = "\n".join([title, "", *(line for full in describe(report) for line in _wrap(full))])
     figure.text(0.06, 0.96, text, va="top", family="monospace", fontsize=7)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-        try:
-            with backend.PdfPages(name) as pages:
-                for page in (figure, *(drawn for _, drawn in _figures(report))):
-                    pages.savefig(page)
-            os.chmod(name, 0o644)
-            os.replace(name, path)
-        except BaseException:
-            os.unlink(name)
-            raise
-    except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}") from None
+    data = io.BytesIO()
+    with backend.PdfPages(data) as pages:
+        for page in (figure, *(drawn for _, drawn in _figures(report))):
+            pages.savefig(page)
+    write_atomically(path, data.getvalue())
 
 
 def _wrap(line: str, columns: int = 110) -> list[str]:

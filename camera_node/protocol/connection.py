@@ -98,13 +98,15 @@ class ServerConnection:
 
     def wait_unless(self, stop: threading.Event) -> zenoh.Session | None:
         """As `wait`, but None as soon as `stop` is set."""
-        absence = _Absence(self.endpoints)
-        while (session := self._opened_within(WAIT_S)) is None:
+
+        def check() -> None:
             if stop.is_set():
-                return None
-            absence.report()
-        absence.end()
-        return session
+                raise _StopError
+
+        try:
+            return self.wait(check)
+        except _StopError:
+            return None
 
     def _opened_within(self, timeout_s: float) -> zenoh.Session | None:
         try:
@@ -132,6 +134,10 @@ class ServerConnection:
                 return taken
             self._future.set_result(session)
             return None
+
+
+class _StopError(Exception):
+    """Ends a wait."""
 
 
 class _Absence:
