@@ -24,8 +24,8 @@ class CameraExposures:
 class DiscColumns:
     """N discs, each in one frame and on one body."""
 
-    def __init__(self, frame: Index, body: Index, position: Array, radius: Array, /) -> None:
-        """Frame, body and radius (N,); position (3, N) in the frame of the body."""
+    def __init__(self, frame: Index, body: Index, position: Array, normal: Array, radius: Array, /) -> None:
+        """Frame, body and radius (N,); position and unit normal (3, N) in the frame of the body."""
 
 class FramePoses:
     """The poses of all bodies at the capture times of all frames."""
@@ -56,8 +56,10 @@ class DetectionColumns:
 class ExpectedMarkers:
     """M markers of tracked bodies, with the covariances of their positions."""
 
-    def __init__(self, R: Array, P: Array, body: Index, position: Array, radius: Array, /) -> None:
-        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,) and position (3, M) by marker."""
+    def __init__(
+        self, R: Array, P: Array, body: Index, position: Array, normal: Array, radius: Array, /
+    ) -> None:
+        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,), position and normal (3, M) by marker."""
 
     def covariances(self, tau: float, /) -> Array:
         """(M, 3, 3) covariances of world positions, tau seconds after the time of the states."""

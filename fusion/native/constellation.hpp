@@ -54,9 +54,8 @@ struct Mappings {
     bool complete = true;  // false: there are more, with as many markers as the limit allows or fewer
 };
 
-/// Finds all maximal mappings of three or more markers with all distances within tolerance: depth first,
-/// marker by marker, each among the neighbours of the first one. Of mappings with too many alternatives it
-/// returns none.
+/// Finds all maximal mappings of three or more markers with all distances within tolerance. Of mappings with
+/// too many alternatives it returns none.
 ///
 /// `distances` are those between the constellation's M markers, M x M; `usable` says which points may be
 /// markers.

@@ -181,7 +181,7 @@ def markers_message(
         camera_names=cameras.names,
         position=_column("<f8", states.p[owner] + arm, unlabeled.position),
         covariance=_column("<f4", covariance, unlabeled.covariance),
-        normal=_column("<f4", states.R[owner][:, :, 2], unlabeled.normal),
+        normal=_column("<f4", table.marker_normals(rows), unlabeled.normal),
         velocity=_column("<f4", states.v[owner] + by_rotation, unlabeled.velocity),
         robot=_column("<i4", owner, none),
         marker=_column("<i4", table.markers.number[rows], none),

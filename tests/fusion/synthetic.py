@@ -63,7 +63,8 @@ def circle(turn_s: float, radius_m: float, height_m: float = 0.2) -> Motion:
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
 
-    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers.
+    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. A print is
+    detected if the cosine of its slant is above `min_facing`.
     """
 
     robots: dict[str, Robot]
@@ -74,6 +75,7 @@ class Arena:
     distractors: int = 0
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
+    min_facing: float = 0.0
 
     def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
@@ -119,12 +121,14 @@ class Arena:
         R = np.array([pose[0] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
-        return self._roundels(cameras, centre, R[:, :, 2], marker_table.radius[seen], rng)
+        normal = np.einsum("nij,jn->ni", R, marker_table.normal[:, seen])
+        return self._roundels(cameras, centre, normal, marker_table.radius[seen], rng)
 
     def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
         """Outlines of discs. The centres come from sampled circles, independently of the model under test."""
         camera = cameras[cameras.names[0]]
-        facing = np.einsum("ni,ni->n", normal, cameras.centres[0] - centre) > 0.0
+        to = cameras.centres[0] - centre
+        facing = np.einsum("ni,ni->n", normal, to) > self.min_facing * np.linalg.norm(to, axis=1)
         centre, normal, radius = centre[facing], normal[facing], radius[facing]
         uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
         uv = uv.reshape(-1, 2)

@@ -10,7 +10,8 @@ import pytest
 from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
-from fusion.model.robots import distances, load_robots, require_distinct
+from fusion.model.likeness import distances
+from fusion.model.robots import load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import ROOT, free_port
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot, until
