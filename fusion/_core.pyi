@@ -82,20 +82,35 @@ class MarkerCloud:
     """N triangulated markers, among which constellations are searched for."""
 
     def __init__(
-        self, positions: Array, covariances: Array, slack_m: float, sigmas: float, reach_m: float, /
+        self,
+        positions: Array,
+        covariances: Array,
+        to_cameras: Array,
+        slack_m: float,
+        sigmas: float,
+        reach_m: float,
+        /,
     ) -> None:
-        """Positions (N, 3) and covariances (N, 3, 3).
+        """Positions (N, 3), covariances (N, 3, 3), vectors to the cameras that saw each (N, C, 3), NaN for others.
 
         A distance is known to `slack_m` + `sigmas` standard deviations; constellations extend over `reach_m`.
         """
 
     def mappings(
-        self, distances: Array, usable: NDArray[np.bool_], max_steps: int, max_mappings: int, /
+        self,
+        distances: Array,
+        angles: Array,
+        usable: NDArray[np.bool_],
+        max_steps: int,
+        max_mappings: int,
+        /,
     ) -> tuple[Index, bool]:
         """Maximal mappings (K, M) of three or more markers of a constellation to points, -1 for unseen markers.
 
-        `distances` (M, M) are the constellation's; `usable` (N,) says which points may be its markers. False if there
-        are more mappings, with as many markers as one limit allows or fewer; beyond `max_steps` there are none.
+        `distances` and `angles` (M, M) are the constellation's: between markers, and between the normal of the marker
+        of the row and the direction to that of the column, rad; `usable` (N,) says which points may be its markers.
+        False if there are more mappings, with as many markers as one limit allows or fewer; beyond `max_steps` there
+        are none.
         """
 
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:

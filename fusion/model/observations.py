@@ -127,12 +127,14 @@ class MarkerTable:
         position, normal = take_columns(rows, self.position, self.normal)
         return Discs(frame, self.robot[rows], rows, position, normal, self.radius[rows])
 
-    def expected(self, rows: Index, states: States) -> _core.ExpectedMarkers:
-        """The markers `rows` of robots in these states, with the covariances of their positions."""
+    def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
+        """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
+
+        Without `body`, the rows of the states are those of the robots.
+        """
+        body = self.robot[rows] if body is None else body
         position, normal = take_columns(rows, self.position, self.normal)
-        return _core.ExpectedMarkers(
-            states.R, states.P, self.robot[rows], position, normal, self.radius[rows]
-        )
+        return _core.ExpectedMarkers(states.R, states.P, body, position, normal, self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,33 +7,50 @@
 
 namespace roundel::fusion {
 
-MarkerCloud::MarkerCloud(std::vector<Vector> positions, std::vector<Matrix> covariances,
-                         DistanceTolerance tolerance, double reach_m)
-    : positions_(std::move(positions)),
-      covariances_(std::move(covariances)),
-      tolerance_(tolerance),
-      near_(positions_.size()) {
+namespace {
+
+double length(const Vector& v) { return std::sqrt(dot(v, v)); }
+
+}  // namespace
+
+ViewAngles ViewAngles::of(const CloudPoint& point, const Vector& direction) {
+    if (point.to_cameras.empty()) return {};
+    double smallest = 1, largest = -1;  // cosines
+    for (const Vector& to : point.to_cameras) {
+        const double cosine = dot(direction, to) / std::fmax(length(direction) * length(to), 1e-12);
+        smallest = std::fmin(smallest, cosine);
+        largest = std::fmax(largest, cosine);
+    }
+    return {std::acos(std::fmin(largest, 1)), std::acos(std::fmax(smallest, -1))};
+}
+
+MarkerCloud::MarkerCloud(std::vector<CloudPoint> points, DistanceTolerance tolerance, double reach_m)
+    : points_(std::move(points)), tolerance_(tolerance), near_(points_.size()) {
     for (size_t a = 0; a < size(); ++a) {
         for (size_t b = 0; b < a; ++b) {
             const Neighbour there = neighbour(a, b);
             if (!(there.distance - there.tolerance < reach_m)) continue;
             near_[a].push_back(there);
-            near_[b].push_back({a, there.distance, there.tolerance});
+            near_[b].push_back({a, there.distance, there.tolerance, there.there, there.here});
         }
     }
 }
 
 MarkerCloud::Neighbour MarkerCloud::neighbour(size_t a, size_t b) const {
-    const Vector between = positions_[a] - positions_[b];
-    const double distance = std::sqrt(dot(between, between));
+    const Vector between = points_[b].position - points_[a].position;
+    const double distance = length(between);
     const Vector unit = (1 / std::fmax(distance, 1e-9)) * between;
-    const double variance = dot(unit, (covariances_[a] + covariances_[b]) * unit);
-    return {b, distance, tolerance_.slack_m + tolerance_.sigmas * std::sqrt(variance)};
+    const double variance = dot(unit, (points_[a].covariance + points_[b].covariance) * unit);
+    return {b, distance, tolerance_.slack_m + tolerance_.sigmas * std::sqrt(variance),
+            ViewAngles::of(points_[a], between), ViewAngles::of(points_[b], -1 * between)};
 }
 
-bool MarkerCloud::allows(size_t a, size_t b, double distance_m) const {
-    const Neighbour there = neighbour(a, b);
-    return a != b && std::abs(there.distance - distance_m) < there.tolerance;
+const MarkerCloud::Neighbour* MarkerCloud::find(size_t a, size_t b) const {
+    const auto& near = near_[a];
+    const auto at = std::lower_bound(near.begin(), near.end(), b, [](const Neighbour& other, size_t point) {
+        return other.point < point;
+    });
+    return at != near.end() && at->point == b ? &*at : nullptr;
 }
 
 namespace {
@@ -49,15 +66,15 @@ struct Pair {
 /// seen takes one branch.
 class Search {
   public:
-    Search(const MarkerCloud& cloud, const double* distances, size_t markers, const bool* usable,
+    Search(const MarkerCloud& cloud, const Constellation& constellation, const bool* usable,
            const SearchLimits& limits)
         : cloud_(cloud),
-          distances_(distances),
-          n_(markers),
+          constellation_(constellation),
+          n_(constellation.size),
           usable_(usable),
           limits_(limits),
-          mapped_(markers, kUnseen),
-          found_(markers + 1) {}
+          mapped_(n_, kUnseen),
+          found_(n_ + 1) {}
 
     Mappings run() {
         for (size_t marker = 0; marker + kMinMarkers <= n_; ++marker)
@@ -91,11 +108,10 @@ class Search {
 
     /// Adds the pairs of a marker that agree with `first`.
     void add_candidates(const Pair& first, size_t marker, std::vector<Pair>& to) {
-        const double distance = distances_[first.marker * n_ + marker];
         const auto& near = cloud_.near(first.point);
         steps_ += near.size();
         for (const auto& there : near)
-            if (std::abs(there.distance - distance) < there.tolerance && usable_[there.point])
+            if (usable_[there.point] && constellation_.allows(first.marker, marker, there))
                 to.push_back({marker, there.point});
     }
 
@@ -111,7 +127,8 @@ class Search {
     }
 
     bool agree(const Pair& a, const Pair& b) const {
-        return a.marker != b.marker && cloud_.allows(a.point, b.point, distances_[a.marker * n_ + b.marker]);
+        const auto* there = a.marker != b.marker ? cloud_.find(a.point, b.point) : nullptr;
+        return there && constellation_.allows(a.marker, b.marker, *there);
     }
 
     /// Extends the `count` mapped markers by later pairs (`rows`) that agree with all of them.
@@ -171,7 +188,7 @@ class Search {
     }
 
     const MarkerCloud& cloud_;
-    const double* distances_;
+    const Constellation& constellation_;
     const size_t n_;
     const bool* usable_;
     const SearchLimits limits_;
@@ -185,9 +202,9 @@ class Search {
 
 }  // namespace
 
-Mappings find_mappings(const MarkerCloud& cloud, const double* distances, size_t markers, const bool* usable,
+Mappings find_mappings(const MarkerCloud& cloud, const Constellation& constellation, const bool* usable,
                        const SearchLimits& limits) {
-    return Search(cloud, distances, markers, usable, limits).run();
+    return Search(cloud, constellation, usable, limits).run();
 }
 
 }  // namespace roundel::fusion

@@ -34,6 +34,7 @@ from fusion.tracking.identity.single_markers import (
     history_chi2,
     is_local,
 )
+from fusion.tracking.identity.verification import explained_shares
 from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
@@ -269,6 +270,7 @@ class Acquisition:
             np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
             mean_by_body(d2, body, n),
             is_expected,
+            explained_shares(self._cameras, table.markers, detections, starts.robot, states),
             starts.assignments.with_residuals(residuals),
             body,
         )

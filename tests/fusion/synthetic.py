@@ -122,18 +122,23 @@ class Arena:
         p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
         normal = np.einsum("nij,jn->ni", R, marker_table.normal[:, seen])
-        return self._roundels(cameras, centre, normal, marker_table.radius[seen], rng)
+        number = np.array(seen, np.int32)
+        return self._roundels(cameras, number, (centre, normal, marker_table.radius[seen]), rng)
 
-    def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
-        """Outlines of discs. The centres come from sampled circles, independently of the model under test."""
-        camera = cameras[cameras.names[0]]
+    def _roundels(self, cameras: CameraArray, number, discs, rng: np.random.Generator) -> Roundels:
+        """Outlines of discs; `id` is the row of the marker table, -1 for distractors.
+
+        The centres come from sampled circles, independently of the model under test.
+        """
+        camera, (centre, normal, radius) = cameras[cameras.names[0]], discs
         to = cameras.centres[0] - centre
         facing = np.einsum("ni,ni->n", normal, to) > self.min_facing * np.linalg.norm(to, axis=1)
-        centre, normal, radius = centre[facing], normal[facing], radius[facing]
+        number, centre, normal, radius = number[facing], centre[facing], normal[facing], radius[facing]
         uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, centre, normal, radius = uv[inside], centre[inside], normal[inside], radius[inside]
+        number, uv, centre = number[inside], uv[inside], centre[inside]
+        normal, radius = normal[inside], radius[inside]
         shape = self._outlines(camera, centre, normal, radius)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
         axes = 2 * np.sqrt(values[:, ::-1])
@@ -147,7 +152,8 @@ class Arena:
         n, order = len(uv), rng.permutation(len(uv))
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
-        return Roundels(uv, cov, axes, angle, level, 200 * level, none, none).select(order)
+        number = np.concatenate([number, np.full(extra, -1, np.int32)])
+        return Roundels(uv, cov, axes, angle, level, 200 * level, number, none).select(order)
 
     def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
         """(N, 2, 2) shape matrices."""

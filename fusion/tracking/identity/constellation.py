@@ -120,14 +120,25 @@ def search(robots: dict[int, Robot], scene: TriangulatedMarkers) -> Candidates:
     if len(scene) < MIN_MARKERS or not robots:
         return Candidates({}, frozenset())
     reach_m = max(float(distances(robot.points).max()) for robot in robots.values())
-    cloud = _core.MarkerCloud(scene.position, scene.covariance, SLACK_M, SIGMAS, reach_m)
+    flat = not any(robot.normals for robot in robots.values())
+    to_cameras = scene.to_cameras[:, :0] if flat else scene.to_cameras  # `fit` compares these too
+    views = np.ascontiguousarray(to_cameras)
+    cloud = _core.MarkerCloud(scene.position, scene.covariance, views, SLACK_M, SIGMAS, reach_m)
     tables, crowded = {}, set()
     for row, robot in robots.items():
         usable = scene.with_diameter(robot.diameter_m)
-        tables[row], complete = cloud.mappings(distances(robot.points), usable, MAX_STEPS, MAX_MAPPINGS)
+        shape = distances(robot.points), _angles(robot)
+        tables[row], complete = cloud.mappings(*shape, usable, MAX_STEPS, MAX_MAPPINGS)
         if not complete:
             crowded.add(row)
     return Candidates(tables, frozenset(crowded))
+
+
+def _angles(robot: Robot) -> Array:
+    """(M, M) angles between the normal of each marker (row) and the directions to the others (column), rad."""
+    between = robot.points - robot.points[:, None]
+    along = np.einsum("mki,mi->mk", between, robot.unit_normals)
+    return np.arccos(np.clip(along / np.maximum(np.linalg.norm(between, axis=2), 1e-9), -1, 1))
 
 
 def fit(mappings: Mappings, robots: dict[int, Robot], scene: TriangulatedMarkers) -> Fits:
