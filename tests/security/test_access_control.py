@@ -241,4 +241,4 @@ def test_a_certificate_without_a_rule_gives_no_rights(lab: Lab):
     late, viewer = lab.bare_session("viewer.late", "client"), lab.session("viewer")
     assert late.info.routers_zid() == viewer.info.routers_zid(), "both are connected"
     wait_for(lambda: ask(viewer, "clock"))
-    assert [ask(late, key) for key in SERVER_READS] == [[], [], []]
+    assert not any(ask(late, key) for key in SERVER_READS)
