@@ -83,7 +83,7 @@ class TrackingPipeline:
         Raises:
             FusionError, ConfigError, CalibrationError: it can't be used or saved; the old one stays in force.
         """
-        self._use(rig, lambda: self.active_rig.save(rig))
+        self._use(rig, lambda: self.active_rig.save(rig, now_ns, source))
         self.active_rig.use(rig, now_ns, source)
 
     def undo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
