@@ -73,7 +73,7 @@ class ObservationSummary:
         return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean))
 
 
-def _ratio(sums: Array, count: Index) -> Array:
+def _ratio(sums: NDArray, count: Index) -> Array:
     """Means; NaN without a summand."""
     return sums / np.where(count, count, np.nan)
 
