@@ -140,7 +140,7 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
         assert done.stdout == expected
         assert client.rig(DEADLINE_S) == GIVEN
         assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.extrinsics.pinned == {"cam1"}
+        assert server.pipeline.tracker.monitors.extrinsics.pinned == {"cam1"}
         done = run_program("fusion", "redo", *where)
         assert done.stdout == "the undone rig is in force on the server; changed cameras: cam1\n"
         done = run_program("fusion", "redo", *where)
