@@ -147,7 +147,7 @@ def _in_body(markers: StationaryMarkers) -> tuple[Rows, Rows]:
     if not off.any():
         return ((0.0, 0.0, 0.0),) * len(centred), ()  # one marker; `Robot` refuses several in one place
     x = flat[np.argmax(off)] / np.linalg.norm(flat[np.argmax(off)])
-    R_world_body = np.column_stack([x, np.cross(z, x), z])
+    R_world_body = np.asarray(np.column_stack([x, np.cross(z, x), z]), float)
     return _rows(centred @ R_world_body), () if normals is None else _rows(normals @ R_world_body)
 
 

@@ -183,7 +183,7 @@ def plane_axes(normal: Array) -> tuple[Array, Array]:
     beside = np.where(np.abs(normal[0]) < 0.7, x[:, None], y[:, None])
     second = np.cross(normal, beside, axis=0)
     second /= np.linalg.norm(second, axis=0)
-    return np.cross(second, normal, axis=0), second
+    return np.asarray(np.cross(second, normal, axis=0), float), second
 
 
 def reweigh(

@@ -25,10 +25,14 @@ WIDE = Robot(diameter_m=0.12, markers=((-0.13, 0.07, 0.0), (-0.08, -0.18, 0.0), 
 SINGLE = Robot(diameter_m=0.12)
 
 
-def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0)) -> dict[str, Camera]:
-    """`n` cameras around the arena at a height of 3 m, directed at its centre."""
+def ring(
+    n: int = 4,
+    distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0),
+    height_m: float = 3.0,
+) -> dict[str, Camera]:
+    """`n` cameras around the arena, directed at its centre."""
     angles = 0.3 + 2 * np.pi * np.arange(n) / n
-    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), 3.0], [0.0, 0.0, 0.2]) for a in angles]
+    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), height_m], [0.0, 0.0, 0.2]) for a in angles]
     lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
     return {
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
