@@ -23,9 +23,9 @@ FLAT = Robot(diameter_m=CUBE.diameter_m, markers=TRIANGLE.markers)
 UNKNOWN = np.full((3, 3), np.nan)
 
 
-def markers_of(arena: Arena, n: int = 30, known: Robot = TRIANGLE) -> list[Markers]:
+def markers_of(arena: Arena, n: int = 30, declared: Robot = TRIANGLE) -> list[Markers]:
     """The markers of a tracker that knows only another robot, which is not there."""
-    known = Arena({"a": known}, {"a": line((0, 0, 0))}, arena.cameras)
+    known = Arena({"a": declared}, {"a": line((0, 0, 0))}, arena.cameras)
     return [fused.markers for fused in track(known, arena.frames(n))]
 
 
@@ -74,8 +74,8 @@ def test_only_markers_that_are_stationary_and_seen_often_are_measured():
 
 
 def test_a_measured_cube_has_the_normals_of_its_sides_and_is_tracked():
-    """Five sides are visible to eight cameras around it, each to three or more, all exposed at once. Planes of three markers within 1 mm of noise over 80 mm are within 2
-    degrees. z is out of the uppermost side."""
+    """Five sides are visible to eight cameras around it, each to three or more, all exposed at once. Planes of three
+    markers within 1 mm of noise over 80 mm are within 2 degrees. z is out of the uppermost side."""
     R, p = rotation_from_vector([0.15, 0.1, 0.3]), np.array([0.0, 0.0, 0.6])
     cameras = {f"low{k}": camera for k, camera in enumerate(ring(8, height_m=1.6).values())}
     arena = Arena({"c": CUBE}, {"c": lambda t: (R, p)}, cameras, (0.0,) * 8, sigma_px=0.1, min_facing=0.2)
