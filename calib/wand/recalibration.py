@@ -143,7 +143,7 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
     covariance, T = camera_covariance(adjusted), adjusted.state.cameras[this]
     cov = covariance.of(POSE)[this, :, this]
     offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted.state, covariance, OFFSET, 1e3))
-    camera = adjusted_camera(before, adjusted.state, covariance, this, float(offset_ms))
+    camera = adjusted_camera(before, adjusted, covariance, this, float(offset_ms))
     used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
     return Recalibration(

@@ -74,6 +74,8 @@ class ChangeSettings:
     """Exposure time, microseconds; turns automatic exposure off."""
     gain: float | None = None
     """In the driver's units."""
+    readout_us: float | None = None
+    """Time in which a rolling shutter reads all rows, microseconds; negative from the last row to the first."""
     min_contrast: float | None = None
     """Least contrast of a roundel, grey levels."""
     mask_detected: bool = False
@@ -93,6 +95,7 @@ class ChangeSettings:
             wanted = Settings(
                 exposure_us=self.exposure_us,
                 gain=self.gain,
+                readout_us=self.readout_us,
                 min_contrast=self.min_contrast,
                 mask=self._changed_mask(session, used, drawn),
             )
