@@ -49,6 +49,7 @@ class Discs:
         marker: (N,) row of the marker table; identifies the marker.
         position: (3, N) centre, body frame.
         radius: (N,) of the black disc, metres.
+        delay: (N,) time from the frame to the capture of the disc's row by a rolling shutter, seconds; None for 0.
     """
 
     frame: Index
@@ -56,6 +57,7 @@ class Discs:
     marker: Index
     position: Array
     radius: Array
+    delay: Array | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -63,11 +65,13 @@ class Discs:
     @property
     def columns(self) -> _core.DiscColumns:
         """The arrays for the native core."""
-        return _core.DiscColumns(self.frame, self.body, self.position, self.radius)
+        delay = np.zeros(len(self)) if self.delay is None else self.delay
+        return _core.DiscColumns(self.frame, self.body, self.position, self.radius, delay)
 
     def select(self, rows: NDArray) -> "Discs":
         """The columns of a mask or an index array."""
-        return Discs(*take_columns(rows, *(getattr(self, name) for name in self.__slots__)))
+        columns = [column for name in self.__slots__ if (column := getattr(self, name)) is not None]
+        return Discs(*take_columns(rows, *columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,16 +27,16 @@ DiscDerivatives differentiate(const DiscView& view, double radius, double wx, do
 void write(double* to, const Vector& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 
 /// Writes the row of one equation. The derivatives by the velocities are tau times those by the pose.
-void write_row(const DiscDerivatives& by, const BodyInCamera& body, const Exposure& exposure,
+void write_row(const DiscDerivatives& by, const BodyInCamera& body, const Matrix& R_cam_world, double tau,
                const Vector& position, double* row) {
     const Vector h = by.centre * body.R_cam, k = by.normal * body.R_cam, &m = position;
     // h (w x m) = (m x h) w; the normal is the z axis of the body.
     const Vector theta{m.y * h.z - m.z * h.y - k.y, m.z * h.x - m.x * h.z + k.x, m.x * h.y - m.y * h.x};
-    const Vector by_position = by.centre * exposure.R_cam_world;
+    const Vector by_position = by.centre * R_cam_world;
     write(row, theta);
     write(row + 3, by_position);
-    write(row + 6, exposure.tau * (body.R_world * theta));
-    write(row + 9, exposure.tau * by_position);
+    write(row + 6, tau * (body.R_world * theta));
+    write(row + 9, tau * by_position);
 }
 
 /// Writes the two equations of a shear, by difference quotients over rotations about the axes x and y.
@@ -53,7 +53,7 @@ void write_shears(const Shear (&at)[3], double sigma, Equations& to) {
 void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
+        const BodyInCamera body = poses.at(discs, k);
         const Vector position = discs.position.vector(k);
         const DiscView expected = view_disc(body, position, discs.radius[k]);
         const double x = observed.xy.at(0, k) - expected.x, y = observed.xy.at(1, k) - expected.y;
@@ -63,7 +63,7 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
             const double wx = observed.whiten.at(2 * a, k), wy = observed.whiten.at(2 * a + 1, k);
             double* row = to[k].A[a];
             write_row(differentiate(expected, discs.radius[k], wx, wy), body,
-                      poses.exposures()[discs.frame[k]], position, row);
+                      poses.exposures()[discs.frame[k]].R_cam_world, poses.tau(discs, k), position, row);
             if (observed.single[discs.body[k]]) write(row + 6, {0, 0, 0});
             row[kErrors] = wx * x + wy * y;
         }
@@ -73,7 +73,7 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
 void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
+        const BodyInCamera body = poses.at(discs, k);
         const DiscView expected = view_disc(body, discs.position.vector(k), discs.radius[k]);
         to[k] = {};
         const Shape measured =

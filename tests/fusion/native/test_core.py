@@ -212,9 +212,9 @@ def test_indices_and_lengths_are_checked():
     position, radius = seen.discs.position, seen.discs.radius
     for wrong in (body + BODIES, body - BODIES):
         with pytest.raises(IndexError):
-            poses.views(_core.DiscColumns(frame, wrong, position, radius))
+            poses.views(_core.DiscColumns(frame, wrong, position, radius, 0 * radius))
     with pytest.raises(ValueError, match="lengths"):
-        _core.DiscColumns(frame, body, position[:, 1:].copy(), radius)
+        _core.DiscColumns(frame, body, position[:, 1:].copy(), radius, 0 * radius)
     with pytest.raises(IndexError):
         _core.residuals(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
 
@@ -229,7 +229,7 @@ def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
     ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
     exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     poses = _core.FramePoses(_core.BodyStates(R, ahead, still, still), exposures)
-    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04))
+    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04), np.zeros(n))
     scale = np.tile(800 * np.eye(2)[..., None], n)
     axes = np.tile([[30.0], [10.0]], n)
     rows = poses.linearize_outlines(discs, axes, np.zeros(n), scale, np.full(n, 0.1))
