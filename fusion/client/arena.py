@@ -17,8 +17,8 @@ from typing import Any
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, set_rig, undo_rig
-from calib.rig.messages import RigMessage
+from calib.live.rig_requests import redo_rig, request_rig_history, set_rig, undo_rig
+from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
 from camera_node.config import require_name
 from camera_node.errors import NetworkError
@@ -162,6 +162,10 @@ class Arena:
     def redo_rig(self) -> RigMessage:
         """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
         return redo_rig(self.session, self.keys.arena, "fusion.client")
+
+    def rig_history(self) -> RigHistory:
+        """All versions of the server's rig, oldest first; raises as `set_rig`."""
+        return request_rig_history(self.session, self.keys.arena)
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every frame set."""

@@ -16,7 +16,7 @@ from tests.security.lab import ARENA, KEYS, Lab, certificates
 from tests.waiting import Inbox, wait_for
 
 CAMERAS = ("north", "south")
-SERVER_READS = ("clock", "rig", "robots")
+SERVER_READS = ("clock", "rig", "rig/history", "robots")
 SERVER_CHANGES = ("rig/set", "rig/undo", "rig/redo", "robots/set")
 CAMERA_KEYS = ("detections", "relative", "status", "alive", "snapshot", "settings", "@preview")
 PUBLISHED = ("markers", "robot/a/pose", "fusion/status", "fusion/shard/2", "fusion/alive", "rig")
