@@ -50,7 +50,9 @@ class FramePoses:
 class DetectionColumns:
     """N detections sorted by frame."""
 
-    def __init__(self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, delay: Array, /) -> None:
+    def __init__(
+        self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, delay: Array, /
+    ) -> None:
         """Frame, major and delay (N,), s after the frame; xy (2, N), scale and cov (2, 2, N)."""
 
 class ExpectedMarkers:

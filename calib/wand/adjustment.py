@@ -7,7 +7,12 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, POSE
-from calib.wand.bundle_adjustment.clock_model import ClockModel, choose_clocks, clock_candidates
+from calib.wand.bundle_adjustment.clock_model import (
+    ClockModel,
+    choose_clocks,
+    clock_candidates,
+    with_readout_times,
+)
 from calib.wand.bundle_adjustment.covariance import inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
@@ -162,7 +167,7 @@ def adjust_coarsely(recording: LabeledRecording, rough: RoughRig, budget: int = 
     density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
-    return adjust(problem, observations, state)
+    return with_readout_times(adjust(problem, observations, state), observations, recording.timing)
 
 
 def _prepare_fine(

@@ -27,16 +27,18 @@ class Exposures:
         camera: (F,) index of the camera.
         tau: (F,) capture time minus the time of the states, seconds.
         tau_sigma: (F,) its standard deviation by the clock, seconds.
+        line_s: (F,) time from one row to the next of a rolling shutter, seconds.
     """
 
     camera: Index
     tau: Array
     tau_sigma: Array
+    line_s: Array
 
     @classmethod
     def exact(cls, camera: Index, tau: Array) -> "Exposures":
         """Frames of exactly known time."""
-        return cls(camera, tau, np.zeros(len(tau)))
+        return cls(camera, tau, *np.zeros((2, len(tau))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

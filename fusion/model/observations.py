@@ -53,9 +53,7 @@ class DetectionTable:
     @property
     def columns(self) -> _core.DetectionColumns:
         """The arrays for the native core."""
-        return _core.DetectionColumns(
-            self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay
-        )
+        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay)
 
     def select(self, rows: NDArray) -> "DetectionTable":
         """The columns of a mask or an index array."""
@@ -70,6 +68,7 @@ class DetectionTable:
             np.array([cameras.index[frame.camera] for frame in frames], np.intp),
             np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
             np.array([frame.clock_sigma_s for frame in frames]),
+            np.array([frame.readout_s / cameras[frame.camera].height for frame in frames]),
         )
         row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
         cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))

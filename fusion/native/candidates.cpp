@@ -74,8 +74,8 @@ class FrameDetections {
         for (size_t k = first; k < last; ++k) {
             const Covariance2 noise = noise_of(detections, k);
             if (!std::isfinite(detections.xy.at(0, k) + noise.xx + noise.yy)) continue;
-            sorted_.push_back({detections.xy.at(0, k), detections.xy.at(1, k), detections.delay[k], noise,
-                               int64_t(k)});
+            sorted_.push_back(
+                {detections.xy.at(0, k), detections.xy.at(1, k), detections.delay[k], noise, int64_t(k)});
             max_xx_ = std::max(max_xx_, noise.xx);
             max_yy_ = std::max(max_yy_, noise.yy);
             max_delay_ = std::max(max_delay_, std::abs(detections.delay[k]));

@@ -39,8 +39,7 @@ BodyInCamera FramePoses::at(const Discs& discs, size_t k) const {
 void view_discs(const FramePoses& poses, const Discs& discs, double* to) {
     const size_t n = discs.size();
     for (size_t k = 0; k < n; ++k) {
-        const DiscView seen =
-            view_disc(poses.at(discs, k), discs.position.vector(k), discs.radius[k]);
+        const DiscView seen = view_disc(poses.at(discs, k), discs.position.vector(k), discs.radius[k]);
         double* row = to + k;
         for (const Vector& v : {seen.centre, seen.normal, seen.q})
             for (const double value : {v.x, v.y, v.z}) *row = value, row += n;

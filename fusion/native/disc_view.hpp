@@ -68,8 +68,8 @@ class FramePoses {
     std::vector<BodyInCamera> poses_;
 };
 
-/// N discs, each in one frame and on one body. `position` is in the frame of the body; `delay` is the time from
-/// the frame to the capture of the disc's row by a rolling shutter, seconds.
+/// N discs, each in one frame and on one body. `position` is in the frame of the body; `delay` is the time
+/// from the frame to the capture of the disc's row by a rolling shutter, seconds.
 struct Discs {
     const int64_t *frame, *body;
     Columns<3> position;

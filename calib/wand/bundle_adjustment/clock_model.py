@@ -5,18 +5,19 @@ A parameter that the recording does not show costs accuracy where the cameras sh
 shutters. docs/wand_adjustment.md, section 8, has the equations.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.rig.camera import DRIFT, OFFSET, READOUT
-from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import CRYSTAL_DRIFT, SLEWED_DRIFT, Problem
+from calib.wand.bundle_adjustment.covariance import camera_covariance, inflation_factor, inverse_information
+from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, with_information
+from calib.wand.bundle_adjustment.problem import CRYSTAL_DRIFT, SLEWED_DRIFT, Problem, WandObservations
 from calib.wand.timing import Timing
 from camera_node.arrays import Array
 
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
+POSSIBLE = 3.0  # standard deviations by which a readout time may exceed the time between two frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,69 +30,71 @@ class ClockModel:
 
 
 def clock_candidates(timing: Timing, problem: Problem) -> tuple[tuple[int, ...], ...]:
-    """The clock parameters that a recording may show."""
+    """The clock parameters that a recording may show; readout times are added by `with_readout_times`."""
     if timing.synchronous:
         return ()
-    slow = (DRIFT,) if np.ptp(problem.knot_s) > MIN_DRIFT_S else ()
-    return (OFFSET, *slow, READOUT)
+    return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
 
 
 def choose_clocks(adjusted: Adjusted) -> ClockModel:
     """Which of the free clock parameters the recording shows. With an offset, the drift is free too: a clock that runs
     on its own drifts, though a short recording may not show it."""
-    times = _Estimates.of(adjusted)
-    rolling = times.shows(READOUT)
-    if not rolling:
-        times = times.without_readout()
     candidates = tuple(group for group in (OFFSET, DRIFT) if group[0] in adjusted.problem.free)
-    shown = tuple(group for group in candidates if times.shows(group))
+    shown = tuple(group for group in candidates if _differ(adjusted, group))
     free = candidates if OFFSET in shown else shown
-    clocks = np.where([OFFSET in shown, DRIFT in shown, rolling], times.values, 0.0)
-    drift_sigma = SLEWED_DRIFT if DRIFT in shown else CRYSTAL_DRIFT
-    return ClockModel((*free, READOUT) if rolling else free, clocks, drift_sigma)
+    clocks = np.where([OFFSET in shown, DRIFT in shown, True], adjusted.state.clocks, 0.0)
+    rolling = (READOUT,) if READOUT[0] in adjusted.problem.free else ()
+    return ClockModel((*free, *rolling), clocks, SLEWED_DRIFT if DRIFT in shown else CRYSTAL_DRIFT)
 
 
-@dataclass(frozen=True, slots=True)
-class _Estimates:
-    """Clock parameters of C cameras.
+def _differ(adjusted: Adjusted, group: tuple[int, ...]) -> bool:
+    """Whether the clocks differ in a parameter, beside what they all share, which is the gauge."""
+    values = adjusted.state.clocks[:, group[0] - OFFSET[0]]
+    cov = camera_covariance(adjusted).of(group)[:, 0, :, 0]
+    return _is_significant(values - values.mean(), cov, len(values) - 1, adjusted)
 
-    Attributes:
-        values: (C, 3) as in `State`.
-        covariance: (C, 3, C, 3) of these, inflated.
-        independent: number of independent coordinates that were observed.
+
+def _is_significant(values: Array, covariance: Array, degrees: int, adjusted: Adjusted) -> bool:
+    """Whether values (C,) are not 0, by Schwarz's criterion (BIC) with the inflated covariance and the number of
+    independent observations that it implies."""
+    squared = values @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ values
+    return bool(squared > degrees * np.log(2 * adjusted.used.sum() / adjusted.inflation))
+
+
+def with_readout_times(adjusted: Adjusted, observations: WandObservations, timing: Timing) -> Adjusted:
+    """The adjustment with the readout times of rolling shutters free, if the recording shows these.
+
+    They are predicted to first order, and adjusted where that prediction is significant. No camera takes longer to read
+    an image than from one to the next: larger values explain something else, such as a clock that jumps.
     """
-
-    values: Array
-    covariance: Array
-    independent: float
-
-    @classmethod
-    def of(cls, adjusted: Adjusted) -> "_Estimates":
-        """The clock parameters of an adjustment; those that are not free are known to be 0."""
-        covariance = camera_covariance(adjusted).of((*OFFSET, *DRIFT, *READOUT))
-        return cls(adjusted.state.clocks, covariance, 2 * adjusted.used.sum() / adjusted.inflation)
-
-    def shows(self, group: tuple[int, ...]) -> bool:
-        """Whether the cameras differ in an offset or a drift, or have a readout time, by Schwarz's criterion (BIC)."""
-        k = group[0] - OFFSET[0]
-        values, degrees = self.values[:, k], len(self.values)
-        if group != READOUT:  # what all clocks share is the gauge
-            values, degrees = values - values.mean(), degrees - 1
-        squared = values @ _inverse(self.covariance[:, k, :, k]) @ values
-        return bool(squared > degrees * np.log(self.independent))
-
-    def without_readout(self) -> "_Estimates":
-        """The estimates given that all readout times are 0: of a Gaussian distribution, the conditional one."""
-        count = len(self.values)
-        of, by = np.arange(3 * count).reshape(count, 3)[:, :2].ravel(), np.arange(2, 3 * count, 3)
-        joint, values = self.covariance.reshape(3 * count, 3 * count), self.values.ravel().copy()
-        gain = joint[np.ix_(of, by)] @ _inverse(joint[np.ix_(by, by)])
-        rest = np.zeros_like(joint)
-        rest[np.ix_(of, of)] = joint[np.ix_(of, of)] - gain @ joint[np.ix_(by, of)]
-        values[of] -= gain @ values[by]
-        values[by] = 0.0
-        return _Estimates(values.reshape(count, 3), rest.reshape(self.covariance.shape), self.independent)
+    if timing.synchronous:
+        return adjusted
+    adjusted = replace(adjusted, inflation=inflation_factor(adjusted))
+    cameras = list(adjusted.problem.estimated_cameras())
+    problem = adjusted.problem.with_free(adjusted.problem.free, READOUT)
+    predicted = with_information(adjusted, problem, observations)
+    readout_s = _predict_readout(predicted)
+    if not _has_readout(readout_s, predicted, timing):
+        return adjusted
+    clocks = adjusted.state.clocks.copy()
+    clocks[cameras, 2] = readout_s
+    found = adjust(problem, observations, replace(adjusted.state, clocks=clocks))
+    found = replace(found, inflation=inflation_factor(found))
+    return found if _has_readout(found.state.clocks[cameras, 2], found, timing) else adjusted
 
 
-def _inverse(covariance: Array) -> Array:
-    return np.asarray(np.linalg.pinv(covariance, rcond=1e-9, hermitian=True), float)
+def _predict_readout(adjusted: Adjusted) -> Array:
+    """(S,) readout times of the estimated cameras after one Gauss-Newton step from a state without any."""
+    d, at = len(adjusted.problem.free), adjusted.problem.free.index(READOUT[0])
+    gradient = np.zeros_like(adjusted.scores[0])
+    gradient[at::d] = adjusted.scores.sum(axis=0)[at::d]  # those of the other parameters are 0
+    return (inverse_information(adjusted) @ gradient)[at::d]
+
+
+def _has_readout(readout_s: Array, adjusted: Adjusted, timing: Timing) -> bool:
+    """Whether readout times (S,) of the estimated cameras are significant and possible."""
+    cameras = list(adjusted.problem.estimated_cameras())
+    cov = camera_covariance(adjusted).of(READOUT)[:, 0, :, 0][np.ix_(cameras, cameras)]
+    total = np.abs(adjusted.problem.readout_s[cameras] + readout_s)
+    possible = not timing.period_s or bool((total < timing.period_s + POSSIBLE * np.sqrt(np.diag(cov))).all())
+    return possible and _is_significant(readout_s, cov, len(cameras), adjusted)

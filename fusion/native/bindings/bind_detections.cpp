@@ -20,13 +20,12 @@ struct DetectionColumns {
     DetectionColumns(const Index& frames, const Pairs& xys, const Matrices2& scales, const Matrices2& covs,
                      const Numbers& majors, const Numbers& delays)
         : frame(frames), xy(xys), scale(scales), cov(covs), major(majors), delay(delays) {
-        require_equal(frame.size(),
-                      {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), delay.size()});
+        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), delay.size()});
     }
 
     Detections view() const {
         const size_t n = frame.size();
-        return {frame.data(),         columns<2>(xy, n), columns<4>(scale, n),
+        return {frame.data(),       columns<2>(xy, n), columns<4>(scale, n),
                 columns<4>(cov, n), major.data(),      delay.data()};
     }
 };

@@ -106,6 +106,25 @@ def test_equations_of_outlines_equal_difference_quotients():
     assert_near(found, rows, atol=1e-6)
 
 
+def test_rows_of_a_rolling_shutter_are_frames_of_their_own():
+    """Discs that are captured some time after their frames have the views and equations of frames at that time."""
+    states, seen = scene()
+    exposures, n = seen.detections.exposures, len(seen)
+    delay = np.random.default_rng(4).uniform(-0.02, 0.02, n)
+    rows = replace(exposures, **{k: getattr(exposures, k)[seen.discs.frame] for k in exposures.__slots__})
+    rows = replace(rows, tau=rows.tau + delay)
+    discs = replace(seen.discs, delay=delay), replace(seen.discs, frame=np.arange(n), delay=None)
+    poses = ARRAY.frame_poses(states, exposures), ARRAY.frame_poses(states, rows)
+    given = seen.detections.xy, seen.whiten, np.zeros(BODIES, bool)
+    outlines = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, np.full(n, 0.1)
+    for call in (
+        lambda p, d: p.views(d.columns),
+        lambda p, d: p.linearize_centres(d.columns, *given),
+        lambda p, d: p.linearize_outlines(d.columns, *outlines),
+    ):
+        assert_near(call(poses[0], discs[0]), call(poses[1], discs[1]))
+
+
 def test_sums_and_weights_equal_reweighted_least_squares():
     random = np.random.default_rng(8)
     rows, body = random.normal(size=(200, 2, 13)), random.integers(0, 5, 200)
