@@ -150,7 +150,9 @@ class Arena:
         speed = (camera.project_world(later[0]) - camera.project_world(discs[0])) / STEP_S
         return self._roundels(camera, *discs, speed * self.readout_s / camera.height, rng)
 
-    def _discs(self, markers: MarkerTable, rows: list[int], t_s: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _discs(
+        self, markers: MarkerTable, rows: list[int], t_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres (N, 3), normals (N, 3) and radii (N,) of markers, each at its own time (N,)."""
         robots = list(self.robots)
         poses = [self.motions[robots[markers.robot[k]]](t) for k, t in zip(rows, t_s, strict=True)]
