@@ -49,7 +49,7 @@ class Discs:
         frame: (N,) row of the exposures.
         body: (N,) row of the states.
         marker: (N,) row of the marker table; identifies the marker.
-        position: (3, N) centre, body frame.
+        position, normal: (3, N) centre, and unit normal out of the print; body frame.
         radius: (N,) of the black disc, metres.
         delay: (N,) time from the frame to the capture of the disc's row by a rolling shutter, seconds; None for 0.
     """
@@ -58,6 +58,7 @@ class Discs:
     body: Index
     marker: Index
     position: Array
+    normal: Array
     radius: Array
     delay: Array | None = None
 
@@ -68,7 +69,7 @@ class Discs:
     def columns(self) -> _core.DiscColumns:
         """The arrays for the native core."""
         delay = np.zeros(len(self)) if self.delay is None else self.delay
-        return _core.DiscColumns(self.frame, self.body, self.position, self.radius, delay)
+        return _core.DiscColumns(self.frame, self.body, self.position, self.normal, self.radius, delay)
 
     def select(self, rows: NDArray) -> "Discs":
         """The columns of a mask or an index array."""

@@ -11,6 +11,7 @@ from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
+from fusion.model.states import States
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +112,7 @@ class MarkerTable:
     Attributes:
         robot: (K,) row of the robot.
         number: (K,) index in the robot.
-        position: (3, K) centre, body frame.
+        position, normal: (3, K) centre, and unit normal out of the print; body frame.
         radius: (K,) of the black disc, metres.
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
@@ -119,6 +120,7 @@ class MarkerTable:
     robot: Index
     number: Index
     position: Array
+    normal: Array
     radius: Array
     first: Index
 
@@ -130,6 +132,7 @@ class MarkerTable:
             np.repeat(np.arange(len(robots)), counts),
             np.concatenate([np.empty(0, np.intp), *(np.arange(n) for n in counts)]).astype(np.intp),
             np.concatenate([np.empty((3, 0)), *(robot.points.T for robot in robots)], axis=1),
+            np.concatenate([np.empty((3, 0)), *(robot.unit_normals.T for robot in robots)], axis=1),
             np.repeat([robot.diameter_m / 2 for robot in robots], counts),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
@@ -139,7 +142,17 @@ class MarkerTable:
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
-        return Discs(frame, self.robot[rows], rows, self.position.take(rows, 1), self.radius[rows])
+        position, normal = take_columns(rows, self.position, self.normal)
+        return Discs(frame, self.robot[rows], rows, position, normal, self.radius[rows])
+
+    def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
+        """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
+
+        Without `body`, the rows of the states are those of the robots.
+        """
+        body = self.robot[rows] if body is None else body
+        position, normal = take_columns(rows, self.position, self.normal)
+        return _core.ExpectedMarkers(states.R, states.P, body, position, normal, self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

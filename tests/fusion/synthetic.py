@@ -25,10 +25,14 @@ WIDE = Robot(diameter_m=0.12, markers=((-0.13, 0.07, 0.0), (-0.08, -0.18, 0.0), 
 SINGLE = Robot(diameter_m=0.12)
 
 
-def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0)) -> dict[str, Camera]:
-    """`n` cameras around the arena at a height of 3 m, directed at its centre."""
+def ring(
+    n: int = 4,
+    distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0),
+    height_m: float = 3.0,
+) -> dict[str, Camera]:
+    """`n` cameras around the arena, directed at its centre."""
     angles = 0.3 + 2 * np.pi * np.arange(n) / n
-    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), 3.0], [0.0, 0.0, 0.2]) for a in angles]
+    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), height_m], [0.0, 0.0, 0.2]) for a in angles]
     lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
     return {
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
@@ -76,8 +80,9 @@ def drive(radius_m: float, speed_m_s: float) -> Motion:
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
 
-    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. Cameras read all
-    rows in `readout_s`; each marker is seen when its row is read.
+    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. A print is
+    detected if the cosine of its slant is above `min_facing`. Cameras read all rows in `readout_s`; each marker is seen
+    when its row is read.
     """
 
     robots: dict[str, Robot]
@@ -89,6 +94,7 @@ class Arena:
     distractors: int = 0
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
+    min_facing: float = 0.0
 
     def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
@@ -137,43 +143,49 @@ class Arena:
         """What a camera detects in a frame whose middle is read at t seconds."""
         camera = self.cameras[name]
         marker_table = MarkerTable.of(list(self.robots.values()))
-        seen = [
-            k
-            for k, (r, m) in enumerate(zip(marker_table.robot, marker_table.number, strict=True))
-            if not self.hidden(list(self.robots)[r], int(m), t)
-        ]
+        robots = list(self.robots)
+        owners = zip(marker_table.robot, marker_table.number, strict=True)
+        hidden = [self.hidden(robots[r], int(m), t) for r, m in owners]
+        seen = np.flatnonzero(~np.array(hidden, bool)).astype(np.int32)
         t_s = np.full(len(seen), t)
         for _ in range(ROW_STEPS if self.readout_s else 0):
-            uv = camera.project_world(self._discs(marker_table, seen, t_s)[0])
+            uv = camera.project_world(self._place(marker_table, seen, t_s)[0])
             t_s = t + self.readout_s * np.nan_to_num(camera.image_row(uv)).clip(-0.5, 0.5)
-        discs, later = (self._discs(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S))
-        speed = (camera.project_world(later[0]) - camera.project_world(discs[0])) / STEP_S
-        return self._roundels(camera, *discs, speed * self.readout_s / camera.height, rng)
+        (centre, normal), (later, _) = (self._place(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S))
+        speed = (camera.project_world(later) - camera.project_world(centre)) / STEP_S
+        shear = speed * self.readout_s / camera.height
+        return self._roundels(camera, (seen, centre, normal, marker_table.radius[seen], shear), rng)
 
-    def _discs(
-        self, markers: MarkerTable, rows: list[int], t_s: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centres (N, 3), normals (N, 3) and radii (N,) of markers, each at its own time (N,)."""
+    def _place(
+        self, markers: MarkerTable, rows: np.ndarray, t_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Centres and normals (N, 3) of markers, each at its own time (N,)."""
         robots = list(self.robots)
         poses = [self.motions[robots[markers.robot[k]]](t) for k, t in zip(rows, t_s, strict=True)]
         R = np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses]).reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, markers.position[:, rows])
-        return centre, R[:, :, 2], markers.radius[rows]
+        return centre, np.einsum("nij,jn->ni", R, markers.normal[:, rows])
 
-    def _roundels(
-        self, camera: Camera, centre, normal, radius, shear: np.ndarray, rng: np.random.Generator
-    ) -> Roundels:
-        """Outlines of discs that move by `shear` (N, 2) pixels from one row to the next. The centres come from sampled
-        circles, independently of the model under test."""
-        facing = np.einsum("ni,ni->n", normal, camera.matrix()[:3, 3] - centre) > 0.0
-        centre, normal, radius, shear = centre[facing], normal[facing], radius[facing], shear[facing]
-        uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
+    def _roundels(self, camera: Camera, discs: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:
+        """Outlines of discs; `id` is the row of the marker table, -1 for distractors.
+
+        The centres come from sampled circles, independently of the model under test.
+
+        Args:
+            camera: that sees them.
+            discs: rows of the marker table (N,), centres and normals (N, 3), radii (N,), and the motion of the image
+                from one row to the next (N, 2), pixels.
+            rng: of noise, distractors and order.
+        """
+        to = camera.matrix()[:3, 3] - discs[1]
+        facing = np.einsum("ni,ni->n", discs[2], to) > self.min_facing * np.linalg.norm(to, axis=1)
+        discs = tuple(column[facing] for column in discs)
+        uv = np.array([outline_centre(camera, *disc) for disc in zip(*discs[1:4], strict=True)])
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, centre, normal, radius = uv[inside], centre[inside], normal[inside], radius[inside]
-        straight = np.eye(2) - shear[inside][:, :, None] * [0.0, 1.0]
-        S = np.linalg.inv(straight)
+        uv, (number, centre, normal, radius, shear) = uv[inside], (column[inside] for column in discs)
+        S = np.linalg.inv(np.eye(2) - shear[:, :, None] * [0.0, 1.0])
         shape = S @ self._outlines(camera, centre, normal, radius) @ S.transpose(0, 2, 1)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
         axes = 2 * np.sqrt(values[:, ::-1])
@@ -187,7 +199,8 @@ class Arena:
         n, order = len(uv), rng.permutation(len(uv))
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
-        return Roundels(uv, cov, axes, angle, level, 200 * level, none, none).select(order)
+        number = np.concatenate([number, np.full(extra, -1, np.int32)])
+        return Roundels(uv, cov, axes, angle, level, 200 * level, number, none).select(order)
 
     def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
         """(N, 2, 2) shape matrices."""
