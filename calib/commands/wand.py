@@ -163,6 +163,7 @@ class Wand(WandOptions):
             seconds=self.seconds or MAX_SECONDS,
             trials=trials,
             stops_itself=trials and self.seconds is None,
+            stops_without_wand=self.seconds is None,
         )
         with Live(console=progress_console(), transient=True) as live:
             return run_wand_session(

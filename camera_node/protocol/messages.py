@@ -75,6 +75,11 @@ class Keys:
     def robot_pose(self, robot: str = "*") -> str:
         return f"{self.arena}/robot/{robot}/pose"
 
+    @property
+    def poses(self) -> str:
+        """All robots in one message. The part with @ is in no wildcard: a recorder of all keys gets each pose once."""
+        return f"{self.arena}/@poses"
+
 
 class MessageError(ValueError):
     """Invalid bytes in place of a message. Receivers count them and continue."""

@@ -2,6 +2,7 @@
 """The server's messages over Zenoh, in the encoding of `camera_node.protocol.messages`."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -70,6 +71,29 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     def covariance_matrix(self) -> Array:
         """(12, 12) covariance: rotation, position, angular velocity, velocity."""
         return np.frombuffer(self.covariance, "<f4").reshape(12, 12).astype(float)
+
+
+class RobotPoses(msgspec.Struct, frozen=True, kw_only=True):
+    """The poses that the server publishes at the same moment, of many robots.
+
+    A reader of all robots decodes this one message in place of each robot's. The robots that were tracked before come
+    first; those that were acquired or are lost follow in another message of the same frame set.
+    """
+
+    version: int = VERSION
+    poses: tuple[RobotPose, ...]
+
+    @staticmethod
+    def join(encoded: Sequence[bytes]) -> bytes:
+        """The message of poses that are encoded already."""
+        return msgspec.msgpack.encode({"version": VERSION, "poses": [msgspec.Raw(pose) for pose in encoded]})
+
+    def check(self) -> None:
+        """Raise MessageError unless each pose is valid, and none has another version."""
+        for pose in self.poses:
+            if pose.version != VERSION:
+                raise MessageError(f"a pose of version {pose.version}; this program supports {VERSION}")
+            pose.check()
 
 
 class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):

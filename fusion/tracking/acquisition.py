@@ -5,41 +5,33 @@ Constellations are identified by the distances between their markers and by thei
 single marker, by size and reach. A marker that fits two robots equally well stays unlabeled.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from camera_node.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
+from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
     ANY_DIAMETERS,
     MAX_CHI2,
-    POSITION_GATE,
-    START_S,
-    START_SIGMAS,
-    START_SIGMAS_SINGLE,
     mean_by_body,
-    misfit,
 )
-from fusion.tracking.identity.constellation import MIN_MARKERS, Fits, TriangulatedMarkers, search
+from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
     Histories,
     MarkerChoice,
     choose_markers,
-    history_chi2,
-    is_local,
 )
+from fusion.tracking.identity.trial_updates import Starts, refine
 from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
-SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
-FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
 MAX_PAIRS = 200_000
@@ -69,16 +61,6 @@ class Acquired:
     markers: list[Marker]
     reasons: dict[int, str]
     crowded: Index
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Starts:
-    """K robots (rows) at rest, the assignments that support them, and the start of each assignment."""
-
-    robot: Index
-    states: States
-    assignments: Assignments
-    body: Index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +172,7 @@ class Acquisition:
         question = Question(robots, scene, search(robots, scene))
         identified = identify(
             question,
-            lambda fits: self._refine(table, _starts_of(fits, markers, table), detections),
+            lambda fits: self._refine(table, Starts.of(fits, markers, table.markers), detections),
             _usual_misfit(table, detections, assignments),
             turn,
         )
@@ -211,11 +193,8 @@ class Acquisition:
             start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)[0]
             for robot, marker in pairs
         ]
-        p = np.array([marker.position for _, marker in pairs]).reshape(-1, 3)
-        states = States.at_rest(np.array(R).reshape(-1, 3, 3), p, START_SIGMAS_SINGLE)
-        robot = np.array([robot for robot, _ in pairs], np.intp)
-        assignments, body = _assigned([marker for _, marker in pairs], table.markers.first[robot])
-        refined = self._refine(table, _Starts(robot, states, assignments, body), detections)
+        starts = Starts.of_singles([robot for robot, _ in pairs], [m for _, m in pairs], R, table.markers)
+        refined = self._refine(table, starts, detections)
         return refined.select(refined.misfit < MAX_CHI2)
 
     def _find_markers(
@@ -249,44 +228,8 @@ class Acquisition:
             for fits in weak
         ]
 
-    def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
-        """Update each start independently with its detections."""
-        n, body = len(starts.robot), starts.body
-        observations = MatchedObservations.of(starts.assignments, detections, table.markers)
-        observations = replace(observations, discs=replace(observations.discs, body=body))
-        estimator = self._estimator.select(starts.robot)
-        prediction = estimator.predict(starts.states, np.full(n, START_S))
-        states, residuals = estimator.update(prediction, observations, SMALL)
-        d2 = misfit(observations, residuals)
-        rows = starts.robot.tolist()
-        history = np.array(
-            [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
-        )
-        is_expected = (history < POSITION_GATE) & np.array([is_local(table, k) for k in rows], bool)
-        return RefinedFits(
-            starts.robot,
-            states,
-            np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
-            mean_by_body(d2, body, n),
-            is_expected,
-            starts.assignments.with_residuals(residuals),
-            body,
-        )
-
-
-def _starts_of(fits: Fits, markers: list[Marker], table: TrackTable) -> _Starts:
-    mappings = fits.mappings
-    rows = table.markers.first[mappings.robot][:, None] + mappings.numbers
-    assignments, of = _assigned([markers[p] for p in mappings.points.ravel().tolist()], rows.ravel())
-    body = np.repeat(np.arange(len(fits)), mappings.points.shape[1])[of]
-    return _Starts(mappings.robot, States.at_rest(fits.R, fits.t, START_SIGMAS), assignments, body)
-
-
-def _assigned(markers: list[Marker], rows: Index) -> tuple[Assignments, Index]:
-    """The detections of triangulated markers, assigned to `rows` of the marker table; and the marker of each."""
-    detections = [np.empty(0, np.intp), *(marker.detections for marker in markers)]
-    of = np.repeat(np.arange(len(markers)), [len(marker.detections) for marker in markers])
-    return Assignments.of(np.concatenate(detections), rows[of]), of
+    def _refine(self, table: TrackTable, starts: Starts, detections: DetectionTable) -> RefinedFits:
+        return refine(self._estimator, table, starts, detections)
 
 
 def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
