@@ -178,11 +178,11 @@ class LiveSource(Source):
         return True
 
     def _report_loss(self, error: CameraError) -> None:
-        self._release()
         if not self._is_lost and not self._closed.is_set():
             text = "%s delivers no frames (%s); reopening it every %g s"
             log.warning(text, self.name, error, self._reopen_s)
         self._is_lost = True
+        self._release()
 
     def _release(self) -> None:
         with self._changing:

@@ -18,6 +18,7 @@ from camera_node.sources.genicam.pixels import PixelFormat, parse_pixel_format
 WRITABLE = (1, 2)  # ARV_GC_ACCESS_MODE_WO, _RW
 PREFERRED = ("Mono8", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8")
 PACKET_SIZE = "GevSCPSPacketSize"
+STANDARD = (PACKET_SIZE, "GevSCPD")  # Aravis knows them where the camera's file does not list them
 AUTO_OFF = 0  # ARV_AUTO_OFF
 # Bootstrap registers of GigE Vision: ticks a second, latch the time stamp, the latched time stamp.
 TICKS, LATCH, LATCHED = 0x093C, 0x0944, 0x0948
@@ -164,7 +165,7 @@ class GenicamCamera:
 
     def controls(self) -> dict[str, Control]:
         """All features that can be set, by name."""
-        found = {name: self._describe(name) for name in self._names("Root")}
+        found = {name: self._describe(name) for name in (*self._names("Root"), *STANDARD)}
         return {name: control for name, control in found.items() if control is not None}
 
     def set_controls(self, controls: Mapping[str, ControlValue]) -> None:

@@ -77,8 +77,9 @@ class GenicamStream:
         handle, self._handle = self._handle, 0
         if not handle:
             return
-        with contextlib.suppress(AravisError):
-            self._aravis.call("arv_camera_stop_acquisition", self._camera.handle)
+        if self._camera.is_controlled():  # otherwise each request takes seconds until it fails
+            with contextlib.suppress(AravisError):
+                self._aravis.call("arv_camera_stop_acquisition", self._camera.handle)
         self._aravis.release(handle)
 
     def _convert(self, buffer: int) -> StampedImage | None:
