@@ -178,7 +178,7 @@ class Tracker:
         assignments = self._update_states(associated.prediction, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
-        self.geometry.note(summary.residual_px)
+        self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(
