@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A GenICam camera without its stream: how it is found, its settings, features and clock."""
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from ctypes import byref, c_double, c_int, c_int64, c_ubyte
@@ -114,6 +115,8 @@ class GenicamCamera:
             self._aravis.call("arv_camera_set_region", self.handle, -1, -1, *size)
         if settings.fps is not None:
             self._aravis.call("arv_camera_set_frame_rate", self.handle, settings.fps)
+            with contextlib.suppress(AravisError):  # Aravis leaves the selector at the last kind of trigger
+                self._set("TriggerSelector", "enumeration", "FrameStart")
         self.set_exposure(settings.exposure_us, settings.gain)
         if self.is_network and PACKET_SIZE not in controls:
             self._aravis.call("arv_camera_gv_auto_packet_size", self.handle)

@@ -32,9 +32,12 @@ int64_t fake_clock_ns(void) {
     return atoll(getenv("FAKE_OFFSET_NS")) + ns + (int64_t)(drift * (double)ns);
 }
 
+static void *aravis(const char *name) {
+    return dlsym(dlopen("libaravis-0.8.so.0", RTLD_LAZY | RTLD_NOLOAD), name);
+}
+
 int arv_fake_camera_write_register(void *camera, uint32_t address, uint32_t value) {
-    void *aravis = dlopen("libaravis-0.8.so.0", RTLD_LAZY | RTLD_NOLOAD);
-    write_register set = (write_register)dlsym(aravis, "arv_fake_camera_write_register");
+    write_register set = (write_register)aravis("arv_fake_camera_write_register");
     if (address == LATCH && value & LATCH_NOW) {
         int64_t ns = fake_clock_ns();
         set(camera, LATCHED_HIGH, (uint32_t)(ns >> 32));
