@@ -11,7 +11,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.model.robots import MotionModel, Robot
@@ -20,21 +20,34 @@ from fusion.protocol.messages import Markers
 SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
 STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position
 MIN_SEEN = 0.5  # share of the messages that contain a marker that counts
+MAX_SIZE_ERROR = (
+    0.1  # between the given diameter and the one that is seen; beyond 0.2 a robot is never acquired
+)
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
 
 
 @dataclass(frozen=True)
 class StationaryMarkers:
-    """Stationary unlabeled markers: median positions (K, 3), mean normals (K, 3), NaN where unknown; world, metres."""
+    """Stationary unlabeled markers.
+
+    Attributes:
+        position, normal: (K, 3) medians, world, metres, and mean unit vectors, NaN where unknown.
+        diameter_m: (K,) median of the discs as they appear, NaN where unknown.
+    """
 
     position: Array
     normal: Array
+    diameter_m: Array
+
+    def select(self, rows: Index | Mask) -> "StationaryMarkers":
+        """The markers of a mask or an index array."""
+        return StationaryMarkers(self.position[rows], self.normal[rows], self.diameter_m[rows])
 
     def within(self, centre: ArrayLike, radius_m: float) -> "StationaryMarkers":
         """The markers within `radius_m` of a point (3,)."""
         near = np.linalg.norm(self.position - np.asarray(centre, float), axis=1) <= radius_m
-        return StationaryMarkers(self.position[near], self.normal[near])
+        return self.select(near)
 
 
 def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
@@ -66,19 +79,22 @@ def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[
 def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
     """The unlabeled markers that half of the messages or more contain, at one place."""
     unlabeled = [_unlabeled(message) for message in messages]
-    reference = max(unlabeled, key=len, default=np.empty((0, 6)))
-    seen = np.full((len(unlabeled), len(reference), 6), np.nan)  # messages x markers x (position, normal)
+    reference = max(unlabeled, key=len, default=np.empty((0, 7)))
+    seen = np.full(
+        (len(unlabeled), len(reference), 7), np.nan
+    )  # messages x markers x (position, normal, size)
     for row, markers in zip(seen, unlabeled, strict=True):
         ours, theirs = _mutual_nearest(reference[:, :3], markers[:, :3])
         row[ours] = markers[theirs]
     seen = seen[:, np.isfinite(seen[:, :, 0]).sum(0) >= max(1, MIN_SEEN * len(seen))]
     if not seen.size:
-        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
+        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     position = np.nanmedian(seen[..., :3], 0)
     spread = np.nanmedian(np.linalg.norm(seen[..., :3] - position, axis=2), 0)
     seen, position = seen[:, spread < STATIONARY_M], position[spread < STATIONARY_M]
-    normals = [_mean_direction(seen[:, k, 3:]) for k in range(len(position))]
-    return StationaryMarkers(position, np.array(normals).reshape(-1, 3))
+    normals = [_mean_direction(seen[:, k, 3:6]) for k in range(len(position))]
+    sizes = [_median_known(seen[:, k, 6]) for k in range(len(position))]
+    return StationaryMarkers(position, np.array(normals).reshape(-1, 3), np.array(sizes))
 
 
 def robot_from_markers(
@@ -89,12 +105,18 @@ def robot_from_markers(
     """A robot with these markers: its origin is their mean, z is out of the prints, x towards the first marker.
 
     Raises:
-        FusionError: there are no markers, or no robot can have them.
+        FusionError: there are no markers, they have another diameter, or no robot can have them.
     """
     if not len(markers.position):
         raise FusionError(
             "no stationary unlabeled marker found there; hold the robot still, with all markers up, in view of two "
             "cameras"
+        )
+    seen_m = _median_known(markers.diameter_m)
+    if abs(diameter_m / seen_m - 1) > MAX_SIZE_ERROR:
+        raise FusionError(
+            f"the black discs measure about {1e3 * seen_m:.0f} mm, not {1e3 * diameter_m:.0f} mm; give their diameter, "
+            "or correct the lengths in wand.yaml and calibrate again if a ruler confirms it"
         )
     try:
         return Robot(diameter_m=diameter_m, markers=_in_body(markers), motion=motion)
@@ -103,8 +125,9 @@ def robot_from_markers(
 
 
 def _unlabeled(message: Markers) -> Array:
-    """(K, 6) positions and normals of unlabeled markers that more than one camera sees."""
-    rows = np.hstack([message.positions(), message.normals().astype(float)])[message.unlabeled()]
+    """(K, 7) positions, normals and diameters of unlabeled markers that more than one camera sees."""
+    columns = message.positions(), message.normals(), message.diameters()[:, None]
+    rows = np.hstack(columns).astype(float)[message.unlabeled()]
     return rows[np.isfinite(rows[:, :3]).all(1)]
 
 
@@ -116,6 +139,12 @@ def _mutual_nearest(a: Array, b: Array) -> tuple[Index, Index]:
     nearest, rows = distance.argmin(1), np.arange(len(a))
     rows = rows[(distance.argmin(0)[nearest] == rows) & (distance[rows, nearest] < SAME_M)]
     return rows, nearest[rows]
+
+
+def _median_known(values: Array) -> float:
+    """The median of the values (N,) that are not NaN; NaN if none is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
 
 
 def _mean_direction(normals: Array) -> Array:

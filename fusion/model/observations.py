@@ -58,6 +58,20 @@ class DetectionTable:
         arrays = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
         return DetectionTable(self.exposures, *take_columns(rows, *arrays))
 
+    def conics(self) -> Array:
+        """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); NaN where the axes are unknown.
+
+        The lens is taken as affine over an outline.
+        """
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        axes = np.array([[c, -s], [s, c]]) * self.axes_px / 2  # half axes, pixels
+        half = np.linalg.solve(self.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
+        dual = np.empty((len(self), 3, 3))
+        m = np.column_stack([*self.xy, np.ones(len(self))])
+        dual[:] = m[:, :, None] * m[:, None]
+        dual[:, :2, :2] -= half @ half.transpose(0, 2, 1)
+        return -np.asarray(np.linalg.inv(dual), float)
+
     @classmethod
     def of(cls, frame_set: FrameSet, cameras: CameraArray, floor_px: float) -> "DetectionTable":
         """The detections of a frame set; `floor_px` is added in quadrature to the noise that detectors report."""

@@ -191,6 +191,9 @@ def markers_message(
         covariance=_column("<f4", covariance, unlabeled.covariance),
         normal=_column("<f4", states.R[owner][:, :, 2], unlabeled.normal),
         velocity=_column("<f4", states.v[owner] + by_rotation, unlabeled.velocity),
+        diameter=_column(
+            "<f4", np.full(len(rows), np.nan), np.array([m.diameter_m for m in unlabeled.markers])
+        ),
         robot=_column("<i4", owner, none),
         marker=_column("<i4", table.markers.number[rows], none),
         candidates=_column("<f4", no_candidates, unlabeled.candidates),

@@ -4,6 +4,7 @@
 import subprocess
 import sys
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line
 from tests.fusion.tracks import track
 
 UNKNOWN = np.full((3, 3), np.nan)
+NO_SIZE = np.full(3, np.nan)
 
 
 def markers_of(arena: Arena, n: int = 30) -> list[Markers]:
@@ -74,7 +76,7 @@ def test_only_markers_that_are_stationary_and_seen_often_are_measured():
 def test_z_is_up_where_no_normal_is_known(turn: float):
     """Planar markers without normals, in both orders around the plane's normal."""
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1 * turn, 0.1], [-0.1, -0.1 * turn, 0.1]])
-    robot = robot_from_markers(StationaryMarkers(points, UNKNOWN), 0.1)
+    robot = robot_from_markers(StationaryMarkers(points, UNKNOWN, NO_SIZE), 0.1)
     centred = points - points.mean(0)
     assert np.allclose(robot.points @ [1, 0, 0], centred[:, 0], atol=1e-4), "x along the first marker"
     assert np.allclose(robot.points @ [0, 1, 0], centred[:, 1], atol=1e-4), (
@@ -85,18 +87,35 @@ def test_z_is_up_where_no_normal_is_known(turn: float):
 def test_z_is_the_mean_normal_of_markers_that_are_not_planar():
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
     normal = np.array([0.1, 0.0, 1.0]) / np.linalg.norm([0.1, 0.0, 1.0])
-    robot = robot_from_markers(StationaryMarkers(points, np.tile(normal, (4, 1))), 0.1)
+    robot = robot_from_markers(StationaryMarkers(points, np.tile(normal, (4, 1)), np.full(4, np.nan)), 0.1)
     height = (points - points.mean(0)) @ normal
     assert np.allclose(robot.points[:, 2], height, atol=1e-4)
 
 
 def test_markers_that_make_no_robot_are_refused():
-    nothing = StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
+    nothing = StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     with pytest.raises(FusionError, match="no stationary unlabeled marker found there; hold the robot still"):
         robot_from_markers(nothing, 0.1)
     with pytest.raises(FusionError, match=r"make no robot: .*one line"):
-        robot_from_markers(StationaryMarkers(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN), 0.1)
+        robot_from_markers(
+            StationaryMarkers(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN, NO_SIZE), 0.1
+        )
     assert len(find_stationary_markers([]).position) == 0
+
+
+def test_a_diameter_that_differs_from_the_discs_is_refused():
+    """The server would never find such a robot: it looks for discs of the declared size. Discs of any size are seen."""
+    for diameter_m in (0.06, 0.12, 0.3):
+        robot = msgspec.structs.replace(
+            WIDE, diameter_m=diameter_m, markers=tuple((2 * WIDE.points).tolist())
+        )
+        arena = Arena({"b": robot}, {"b": WIDE_MOTION}, sigma_px=0.05)
+        markers = find_stationary_markers(markers_of(arena))
+        assert markers.diameter_m == pytest.approx([diameter_m] * 3, rel=0.07)
+        assert len(robot_from_markers(markers, diameter_m).markers) == 3
+        for wrong in (0.8, 1.25):
+            with pytest.raises(FusionError, match=r"measure about \d+ mm, not"):
+                robot_from_markers(markers, wrong * diameter_m)
 
 
 def command(endpoint: str, *words: str) -> list[str]:
