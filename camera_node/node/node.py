@@ -245,15 +245,15 @@ class Node:
 
     def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
-        announced = False
+        n_full = 0  # statuses since the first frame
         while not self._closed.wait(STATUS_S):
             try:
                 if not self._options.is_alone:
                     watch.report_absence()
                 status = self._summarize()
                 publisher.put(encode(status))
-                if status.fps > 0 and not announced:
-                    announced = True
+                n_full += status.fps > 0 or n_full > 0
+                if n_full == 2:  # the first one counts the frames of a part of its second
                     self._announce(status)
                 service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
             except Exception:  # the next status is another
