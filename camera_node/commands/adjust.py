@@ -77,6 +77,8 @@ class ChangeSettings:
     """In the driver's units."""
     controls: tuple[str, ...] = ()
     """Further controls of the camera as NAME=VALUE, such as focus_absolute=30; an unknown name lists the known ones."""
+    readout_us: float | None = None
+    """Time in which a rolling shutter reads all rows, microseconds; negative from the last row to the first."""
     min_contrast: float | None = None
     """Least contrast of a roundel, grey levels."""
     mask_detected: bool = False
@@ -97,6 +99,7 @@ class ChangeSettings:
                 exposure_us=self.exposure_us,
                 gain=self.gain,
                 controls=parse_controls(self.controls) or None,
+                readout_us=self.readout_us,
                 min_contrast=self.min_contrast,
                 mask=self._changed_mask(session, used, drawn),
             )

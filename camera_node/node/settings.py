@@ -6,10 +6,15 @@ from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import Source
 
 
-def read_settings(source: Source, detector: Detector) -> Settings:
+def read_settings(source: Source, detector: Detector, readout_us: float | None = None) -> Settings:
     """The settings in use."""
-    controls = dict(source.controls) or None
-    return Settings(exposure_us=source.exposure_us, gain=source.gain, controls=controls, **detector.settings)
+    return Settings(
+        exposure_us=source.exposure_us,
+        gain=source.gain,
+        controls=dict(source.controls) or None,
+        readout_us=readout_us,
+        **detector.settings,
+    )
 
 
 def apply_settings(wanted: Settings, source: Source, detector: Detector) -> Detector:

@@ -17,6 +17,7 @@ MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_RATIOS = 16  # kinds of prints of one camera
 MAX_PREVIEW_BYTES, MAX_PREVIEW_SIDE = 1 << 16, 1024  # of a small picture; its side in pixels
 MAX_CONTROLS, MAX_CONTROL = 64, 64  # controls of one camera; characters of a name or of a text
+MAX_READOUT_US = 1e6  # a frame takes no longer
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
 COLUMNS = {  # of detections: type and number of values in each row
@@ -88,6 +89,10 @@ class MessageError(ValueError):
 class Detections(msgspec.Struct, frozen=True, kw_only=True):
     """All roundels of one frame. `t_ns` is the middle of the exposure in the server's time (Unix, nanoseconds).
 
+    A rolling shutter exposes the rows one after another, during `readout_us`: `t_ns` is that of the middle of the
+    image, and a row at height h (`Lens.image_row`) is captured h readout times later. Where the last row is read
+    first, it is negative.
+
     Columns with one row for each roundel: `uv` (N, 2) <f8 raw pixels; `cov` (N, 3) <f4 uu, uv, vv, square pixels;
     `axes_px` (N, 2) <f4 full major and minor axis; `angle_rad`, `ratio`, `contrast` (N,) <f4;
     `id` and `track` (N,) <i4, -1 for none. Unknown values are NaN.
@@ -98,6 +103,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     seq: int
     t_ns: int
     exposure_us: float = 0.0
+    readout_us: float = 0.0  # of all rows, see above; 0 of a global shutter or if unknown
     detect_us: float = 0.0  # duration of detection
     sent_ns: int = 0  # time of publication, server's time
     clock_error_us: float = 0.0  # bound of the clock error in `t_ns`; NaN before the server's first answer
@@ -156,6 +162,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("an invalid camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
+        if not abs(self.readout_us) <= MAX_READOUT_US:
+            raise MessageError("an impossible readout_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
         _check_ratios(self.found_ratios)
@@ -227,15 +235,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Settings that can be changed while a camera runs.
 
     None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us`, `gain` and
-    `controls` belong to the camera, the other settings to `Detector`. `controls` maps names of the driver's controls to
-    values; those that it does not name are unchanged. `mask` lists polygons of three or more [u, v], raw pixels, in
-    which roundels are ignored.
+    `controls` belong to the camera, `readout_us` says how its shutter works (`Detections`), the rest belongs to
+    `Detector`. `controls` maps names of the driver's controls to values; those that it does not name are unchanged.
+    `mask` lists polygons of three or more [u, v], raw pixels, in which roundels are ignored.
     """
 
     version: int = VERSION
     exposure_us: float | None = None
     gain: float | None = None
     controls: dict[str, ControlValue] | None = None
+    readout_us: float | None = None
     mask: tuple[tuple[tuple[float, float], ...], ...] | None = None
     inner_ratios: tuple[float, ...] | None = None
     ratio_tolerance: float | None = None
@@ -248,6 +257,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """Raise MessageError where no camera can have these settings."""
         if not all(x is None or math.isfinite(x) for x in (self.exposure_us, self.gain)):
             raise MessageError("exposure and gain must be finite")
+        if self.readout_us is not None and not abs(self.readout_us) <= MAX_READOUT_US:
+            raise MessageError(f"readout_us is {self.readout_us}; give a number within {MAX_READOUT_US:g}")
         if self.exposure_us is not None and not 0 < self.exposure_us <= 1e7:
             raise MessageError(f"exposure_us is {self.exposure_us}; give a number in (0, 1e7]")
         _check_controls(self.controls or {})

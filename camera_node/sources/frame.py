@@ -17,6 +17,7 @@ class Frame:
     """One image: grey (h, w) uint8; `t_ns` is the middle of its exposure in this machine's Unix time.
 
     `error_us` bounds the varying error of `t_ns`; a constant one is the camera's time offset, which is calibrated.
+    A rolling shutter reads all rows in `readout_us` (`Detections`); `t_ns` is then that of the middle of the image.
     """
 
     image: Grey
