@@ -16,6 +16,7 @@ MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_RATIOS = 16  # kinds of prints of one camera
 MAX_PREVIEW_BYTES, MAX_PREVIEW_SIDE = 1 << 16, 1024  # of a small picture; its side in pixels
+MAX_CONTROLS, MAX_CONTROL = 64, 64  # controls of one camera; characters of a name or of a text
 MAX_READOUT_US = 1e6  # a frame takes no longer
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
@@ -30,6 +31,7 @@ COLUMNS = {  # of detections: type and number of values in each row
     "track": (I4, 1),
 }
 T = TypeVar("T", bound=msgspec.Struct)
+ControlValue = bool | int | float | str  # of a camera's control, such as focus_absolute or TriggerMode
 
 
 class Keys:
@@ -200,6 +202,8 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     fps: float
     frames: int  # since the node started
     dropped: int  # frames skipped since the start because a newer one was available
+    incomplete: int = 0  # frames since the start that were discarded because parts of them did not arrive
+    lost_packets: int = 0  # packets of the camera's network connection since the start that never arrived
     detect_ms: float  # mean over the last second
     roundels: float  # mean number in each frame over the last second
     saturated: float  # share of pixels at the upper end of the grey levels, 0 to 1
@@ -230,14 +234,16 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that can be changed while a camera runs.
 
-    None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us` and `gain` belong
-    to the camera, `readout_us` says how its shutter works (`Detections`), the other settings belong to `Detector`;
+    None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us`, `gain` and
+    `controls` belong to the camera, `readout_us` says how its shutter works (`Detections`), the rest belongs to
+    `Detector`. `controls` maps names of the driver's controls to values; those that it does not name are unchanged.
     `mask` lists polygons of three or more [u, v], raw pixels, in which roundels are ignored.
     """
 
     version: int = VERSION
     exposure_us: float | None = None
     gain: float | None = None
+    controls: dict[str, ControlValue] | None = None
     readout_us: float | None = None
     mask: tuple[tuple[tuple[float, float], ...], ...] | None = None
     inner_ratios: tuple[float, ...] | None = None
@@ -255,6 +261,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise MessageError(f"readout_us is {self.readout_us}; give a number within {MAX_READOUT_US:g}")
         if self.exposure_us is not None and not 0 < self.exposure_us <= 1e7:
             raise MessageError(f"exposure_us is {self.exposure_us}; give a number in (0, 1e7]")
+        _check_controls(self.controls or {})
+
+
+def _check_controls(controls: dict[str, ControlValue]) -> None:
+    texts = [*controls, *(value for value in controls.values() if isinstance(value, str))]
+    if len(controls) > MAX_CONTROLS or any(len(text) > MAX_CONTROL for text in texts):
+        raise MessageError(f"more than {MAX_CONTROLS} controls, or a name or text of more than {MAX_CONTROL}")
+    numbers = [value for value in controls.values() if not isinstance(value, str)]
+    if not all(math.isfinite(value) and abs(value) < 2**63 for value in numbers):
+        raise MessageError("values of controls must be finite and below 2^63")
 
 
 class ClockReply(msgspec.Struct, frozen=True):
