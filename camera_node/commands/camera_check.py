@@ -25,7 +25,7 @@ MAX_MISSING = 0.01  # share of the frames
 FEW = 10  # frames below which nothing is said about stamps
 
 
-class CameraReport(msgspec.Struct, frozen=True):
+class SourceReport(msgspec.Struct, frozen=True):
     """What was found; times in milliseconds, None where frames or roundels are too few.
 
     Attributes:
@@ -95,7 +95,7 @@ def check_cameras(
 
 def check_camera(
     text: str, settings: SourceSettings, seconds: float, stop: threading.Event | None = None
-) -> CameraReport:
+) -> SourceReport:
     """Read a camera for some seconds; raises CameraError or ConfigError where it does not open."""
     name = without_credentials(text)
     with contextlib.closing(open_source(text, settings)) as source, progress_bar(f"reading {name}") as show:
@@ -124,7 +124,7 @@ def _read(source: Source, seconds: float, stop: threading.Event, show) -> _Readi
     return readings
 
 
-def _report(name: str, readings: _Readings, seconds: float, counts: dict[str, int]) -> CameraReport:
+def _report(name: str, readings: _Readings, seconds: float, counts: dict[str, int]) -> SourceReport:
     last = readings.last
     assert last is not None
     stamps, arrivals = np.array(readings.stamps) * 1e-6, np.array(readings.arrivals) * 1e-6
@@ -132,7 +132,7 @@ def _report(name: str, readings: _Readings, seconds: float, counts: dict[str, in
     blur_px = edge_blur_px(last.image, roundels)
     light = advise(last.image, roundels.uv)
     period_ms, missing, jitter_ms = _regularity(stamps)
-    report = CameraReport(
+    report = SourceReport(
         source=name,
         frames=len(stamps),
         seconds=seconds,
@@ -168,7 +168,7 @@ def _regularity(stamps: Array) -> tuple[float | None, int, float | None]:
     return period, int((periods - 1).sum()), jitter
 
 
-def _faults(report: CameraReport, light: str) -> list[str]:
+def _faults(report: SourceReport, light: str) -> list[str]:
     lost = report.missing + report.incomplete
     faults = [
         (report.frames < FEW, f"only {report.frames} frames: is the exposure too long, or a trigger on?"),
@@ -190,7 +190,7 @@ def _faults(report: CameraReport, light: str) -> list[str]:
     return [text for is_fault, text in faults if is_fault]
 
 
-def _text(report: CameraReport) -> str:
+def _text(report: SourceReport) -> str:
     """Some lines for people."""
     rate = f"{report.fps:.2f} frames/s" if report.fps else "too few frames for a rate"
     jitter = "-" if report.jitter_ms is None else f"{report.jitter_ms:.3f} ms"
