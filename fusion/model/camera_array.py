@@ -47,7 +47,7 @@ class Discs:
         frame: (N,) row of the exposures.
         body: (N,) row of the states.
         marker: (N,) row of the marker table; identifies the marker.
-        position: (3, N) centre, body frame.
+        position, normal: (3, N) centre, and unit normal out of the print; body frame.
         radius: (N,) of the black disc, metres.
     """
 
@@ -55,6 +55,7 @@ class Discs:
     body: Index
     marker: Index
     position: Array
+    normal: Array
     radius: Array
 
     def __len__(self) -> int:
@@ -63,7 +64,7 @@ class Discs:
     @property
     def columns(self) -> _core.DiscColumns:
         """The arrays for the native core."""
-        return _core.DiscColumns(self.frame, self.body, self.position, self.radius)
+        return _core.DiscColumns(self.frame, self.body, self.position, self.normal, self.radius)
 
     def select(self, rows: NDArray) -> "Discs":
         """The columns of a mask or an index array."""

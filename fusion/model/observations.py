@@ -11,6 +11,7 @@ from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
+from fusion.model.states import States
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +59,20 @@ class DetectionTable:
         arrays = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
         return DetectionTable(self.exposures, *take_columns(rows, *arrays))
 
+    def conics(self) -> Array:
+        """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); NaN where the axes are unknown.
+
+        The lens is taken as affine over an outline.
+        """
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        axes = np.array([[c, -s], [s, c]]) * self.axes_px / 2  # half axes, pixels
+        half = np.linalg.solve(self.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
+        dual = np.empty((len(self), 3, 3))
+        m = np.column_stack([*self.xy, np.ones(len(self))])
+        dual[:] = m[:, :, None] * m[:, None]
+        dual[:, :2, :2] -= half @ half.transpose(0, 2, 1)
+        return -np.asarray(np.linalg.inv(dual), float)
+
     @classmethod
     def of(cls, frame_set: FrameSet, cameras: CameraArray, floor_px: float) -> "DetectionTable":
         """The detections of a frame set; `floor_px` is added in quadrature to the noise that detectors report."""
@@ -93,7 +108,7 @@ class MarkerTable:
     Attributes:
         robot: (K,) row of the robot.
         number: (K,) index in the robot.
-        position: (3, K) centre, body frame.
+        position, normal: (3, K) centre, and unit normal out of the print; body frame.
         radius: (K,) of the black disc, metres.
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
@@ -101,6 +116,7 @@ class MarkerTable:
     robot: Index
     number: Index
     position: Array
+    normal: Array
     radius: Array
     first: Index
 
@@ -112,6 +128,7 @@ class MarkerTable:
             np.repeat(np.arange(len(robots)), counts),
             np.concatenate([np.empty(0, np.intp), *(np.arange(n) for n in counts)]).astype(np.intp),
             np.concatenate([np.empty((3, 0)), *(robot.points.T for robot in robots)], axis=1),
+            np.concatenate([np.empty((3, 0)), *(robot.unit_normals.T for robot in robots)], axis=1),
             np.repeat([robot.diameter_m / 2 for robot in robots], counts),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
@@ -121,7 +138,17 @@ class MarkerTable:
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
-        return Discs(frame, self.robot[rows], rows, self.position.take(rows, 1), self.radius[rows])
+        position, normal = take_columns(rows, self.position, self.normal)
+        return Discs(frame, self.robot[rows], rows, position, normal, self.radius[rows])
+
+    def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
+        """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
+
+        Without `body`, the rows of the states are those of the robots.
+        """
+        body = self.robot[rows] if body is None else body
+        position, normal = take_columns(rows, self.position, self.normal)
+        return _core.ExpectedMarkers(states.R, states.P, body, position, normal, self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ not, or not with robots that stand still. See docs/time_offsets.md.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -132,9 +132,7 @@ def _trajectories(
     body = np.repeat(np.arange(len(history)) * n_robots, len(rows)) + discs.body
     camera = cameras.index[name]
     exposures = Exposures.exact(np.array([camera]), np.zeros(1))
-    views = cameras.views(
-        joined, exposures, type(discs)(discs.frame, body, discs.marker, discs.position, discs.radius)
-    )
+    views = cameras.views(joined, exposures, replace(discs, body=body))
     lens, shape = cameras[name], (len(history), len(rows))
     uv = lens.project(views.q.T).reshape(*shape, 2)
     tracked = np.array([snapshot.tracked for snapshot in history])[:, markers.robot[rows]]

@@ -98,7 +98,7 @@ struct ExpectedView {
 };
 
 ExpectedView expect(const ExpectedMarker& marker, const BodyInCamera& body, const Exposure& exposure) {
-    const DiscView at = view_disc(body, marker.position, marker.radius);
+    const DiscView at = view_disc(body, marker.disc);
     const Matrix C = marker.covariance(exposure.tau), &R = exposure.R_cam_world;
     const Vector gx = (1 / at.centre.z) * (R.r0 - at.x * R.r2), gy = (1 / at.centre.z) * (R.r1 - at.y * R.r2);
     const double depth_variance = dot(R.r2 * C, R.r2) / square(at.centre.z);
@@ -107,7 +107,7 @@ ExpectedView expect(const ExpectedMarker& marker, const BodyInCamera& body, cons
         exposure.tau_sigma / at.centre.z;  // the image of the motion in one standard deviation
     const double sx = shift * (velocity.x - at.x * velocity.z), sy = shift * (velocity.y - at.y * velocity.z);
     return {at,
-            marker.radius,
+            marker.disc.radius,
             {dot(gx * C, gx) + sx * sx, dot(gx * C, gy) + sx * sy, dot(gy * C, gy) + sy * sy},
             square(kSizeSigma) + depth_variance};
 }
@@ -135,17 +135,12 @@ double cost(const ExpectedView& expected, const Detection& detection, const Dete
 
 }  // namespace
 
-ExpectedMarker ExpectedMarker::of(int64_t body, const Vector& position, double radius, const Matrix& R,
-                                  const double* P) {
+ExpectedMarker ExpectedMarker::of(int64_t body, const DiscOnBody& disc, const Matrix& R, const double* P) {
     constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
-    const Displacement by_pose{R * minus_skew(position), kTheta, kPosition};
-    const Displacement by_rates{minus_skew(R * position), kOmega, kVelocity};
+    const Displacement by_pose{R * minus_skew(disc.position), kTheta, kPosition};
+    const Displacement by_rates{minus_skew(R * disc.position), kOmega, kVelocity};
     const Matrix both = cross_covariance(P, by_pose, by_rates);
-    return {body,
-            position,
-            radius,
-            cross_covariance(P, by_pose, by_pose),
-            both + transposed(both),
+    return {body, disc, cross_covariance(P, by_pose, by_pose), both + transposed(both),
             cross_covariance(P, by_rates, by_rates)};
 }
 

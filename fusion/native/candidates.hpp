@@ -10,13 +10,11 @@ constexpr double kSlackPx = 0.7;  // calibration error, added to the noise of de
 /// the states is at + tau rate + tau^2 drift.
 struct ExpectedMarker {
     int64_t body;
-    Vector position;  // body frame
-    double radius;
+    DiscOnBody disc;
     Matrix at, rate, drift;
 
     /// From the rotation R and the state covariance P (12 x 12) of its body.
-    static ExpectedMarker of(int64_t body, const Vector& position, double radius, const Matrix& R,
-                             const double* P);
+    static ExpectedMarker of(int64_t body, const DiscOnBody& disc, const Matrix& R, const double* P);
     Matrix covariance(double tau) const { return at + tau * rate + (tau * tau) * drift; }
 };
 

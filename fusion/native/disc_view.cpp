@@ -10,9 +10,9 @@ BodyInCamera transform(const Body& body, const Exposure& exposure) {
     return {R * R_world, R_world, R * from_camera, R * body.omega, R * body.v};
 }
 
-DiscView view_disc(const BodyInCamera& body, const Vector& position, double radius) {
-    const Vector c = body.t_cam + body.R_cam * position, n = body.R_cam.column2();
-    const double size = radius * radius / c.z;
+DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc) {
+    const Vector c = body.t_cam + body.R_cam * disc.position, n = body.R_cam * disc.normal;
+    const double size = disc.radius * disc.radius / c.z;
     const Vector q = c + (size * n.z) * n - Vector{0, 0, size};
     const double z = c.z > kNearM ? q.z : std::numeric_limits<double>::quiet_NaN();
     return {c, n, q, q.x / z, q.y / z};
@@ -28,8 +28,7 @@ FramePoses::FramePoses(const std::vector<Body>& bodies, const std::vector<Exposu
 void view_discs(const FramePoses& poses, const Discs& discs, double* to) {
     const size_t n = discs.size();
     for (size_t k = 0; k < n; ++k) {
-        const DiscView seen =
-            view_disc(poses.at(discs.frame[k], discs.body[k]), discs.position.vector(k), discs.radius[k]);
+        const DiscView seen = view_disc(poses.at(discs.frame[k], discs.body[k]), discs.at(k));
         double* row = to + k;
         for (const Vector& v : {seen.centre, seen.normal, seen.q})
             for (const double value : {v.x, v.y, v.z}) *row = value, row += n;

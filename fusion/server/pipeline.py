@@ -231,3 +231,7 @@ class TrackingPipeline:
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""
         return self.tracker.geometry.misfits() if self.tracker else {}
+
+    def measured_diameters_m(self) -> dict[str, float]:
+        """Measured diameters of the discs of robots that declare another one."""
+        return self.tracker.sizes.misfits() if self.tracker else {}

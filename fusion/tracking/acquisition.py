@@ -13,10 +13,12 @@ from camera_node.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable
+from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
     ANY_DIAMETERS,
+    DIAMETER_TOLERANCE,
     MAX_CHI2,
     mean_by_body,
 )
@@ -36,6 +38,9 @@ from fusion.tracking.track_table import TrackTable
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
 MAX_PAIRS = 200_000
+# The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
+# defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
+MAX_OTHER_PAIRS = 20_000
 CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
 MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
@@ -215,7 +220,30 @@ class Acquisition:
         limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
         portion = Portion(limit, self._frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
-        return find_markers(self._cameras, detections, rows, diameters), crowded
+        markers = find_markers(self._cameras, detections, rows, diameters)
+        if self._leads and len(table.names):
+            markers += self._find_other_sizes(detections, rows, markers, diameters)
+        return markers, crowded
+
+    def _find_other_sizes(
+        self, detections: DetectionTable, rows: Index, markers: list[Marker], diameters: Array
+    ) -> list[Marker]:
+        """Triangulate markers that no robot declares: a new robot may have another diameter.
+
+        Args:
+            detections: of a frame set.
+            rows: that were searched.
+            markers: that were found, of the declared `diameters`.
+        """
+        rest = np.setdiff1d(rows, np.concatenate([rows[:0], *(marker.detections for marker in markers)]))
+        rest = rest[np.isfinite(detections.axes_px[0, rest])]
+        count = np.bincount(detections.frame[rest])
+        if not 0 < (count.sum() ** 2 - (count**2).sum()) // 2 <= MAX_OTHER_PAIRS:
+            return []
+        others = find_markers(self._cameras, detections, rest, np.array(ANY_DIAMETERS))
+        size = np.array([marker.diameter_m for marker in others])
+        is_other = np.all(np.abs(size[:, None] / diameters - 1) > DIAMETER_TOLERANCE, axis=1)
+        return [others[k] for k in np.flatnonzero(is_other)]
 
     def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
         """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""
@@ -250,6 +278,15 @@ def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:
     return [marker for marker in markers if taken.isdisjoint(marker.detections.tolist())]
 
 
+def _too_few(robot: Robot, scene: TriangulatedMarkers) -> str:
+    """Why a constellation has too few markers: they are not seen, or there are as many of another size."""
+    others = scene.diameter_m[~scene.with_diameter(robot.diameter_m)]
+    if len(others) < MIN_MARKERS:
+        return f"fewer than {MIN_MARKERS} of its {len(robot.markers)} markers are seen by two cameras"
+    declared_mm, seen_mm = 1e3 * robot.diameter_m, 1e3 * float(np.median(others))
+    return f"declared with discs of {declared_mm:.0f} mm, but unlabeled ones measure {seen_mm:.0f} mm"
+
+
 def _reason(table: TrackTable, k: int, question: Question, identified: Identified) -> str:
     """Why constellation k was not acquired."""
     n, found = len(table.robots[k].markers), question.candidates
@@ -261,5 +298,5 @@ def _reason(table: TrackTable, k: int, question: Question, identified: Identifie
         rival = identified.rivals[k]
         return "its markers fit in several places" if rival == k else f"ambiguous with {table.names[rival]}"
     if k not in found.tables or not len(found.tables[k]):
-        return f"fewer than {MIN_MARKERS} of its {n} markers are seen by two cameras"
+        return _too_few(table.robots[k], question.scene)
     return f"no {MIN_MARKERS} of its {n} markers fit well anywhere"

@@ -16,7 +16,7 @@ from fusion.model.robots import Robot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, TrackedScene
 from fusion.monitoring.frame_consistency import AssignedFrames
-from fusion.monitoring.geometry_check import GeometryCheck
+from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.monitoring.time_search import Snapshot
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
@@ -115,6 +115,8 @@ class Tracker:
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
         self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
+        diameters = np.array([robot.diameter_m for robot in robots.values()])
+        self.sizes = SizeCheck(self.table.names, diameters)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
 
@@ -179,6 +181,7 @@ class Tracker:
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         self.geometry.note(summary.mean_px2)
+        self._check_sizes(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(
@@ -239,6 +242,16 @@ class Tracker:
             return detections, assignments
         frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
         return association.collect(FrameSet(frame_set.t_ns, frames))
+
+    def _check_sizes(self, detections: DetectionTable, assignments: Assignments) -> None:
+        """Compare some assigned detections with the declared diameters."""
+        rows = self.sizes.sample(len(assignments))
+        marker, seen = assignments.marker[rows], detections.select(assignments.detection[rows])
+        owner = self.table.markers.robot[marker]
+        arms = np.einsum(
+            "nij,jn->ni", self.table.states.R[owner], self.table.markers.position.take(marker, 1)
+        )
+        self.sizes.note(self.cameras, seen, owner, self.table.states.p[owner] + arms)
 
     def _is_current(self, association: Association, t_ns: int) -> bool:
         """Whether an association is of this frame set, and of the present robots and camera poses."""

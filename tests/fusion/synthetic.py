@@ -25,10 +25,14 @@ WIDE = Robot(diameter_m=0.12, markers=((-0.13, 0.07, 0.0), (-0.08, -0.18, 0.0), 
 SINGLE = Robot(diameter_m=0.12)
 
 
-def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0)) -> dict[str, Camera]:
-    """`n` cameras around the arena at a height of 3 m, directed at its centre."""
+def ring(
+    n: int = 4,
+    distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0),
+    height_m: float = 3.0,
+) -> dict[str, Camera]:
+    """`n` cameras around the arena, directed at its centre."""
     angles = 0.3 + 2 * np.pi * np.arange(n) / n
-    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), 3.0], [0.0, 0.0, 0.2]) for a in angles]
+    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), height_m], [0.0, 0.0, 0.2]) for a in angles]
     lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
     return {
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
@@ -63,7 +67,8 @@ def circle(turn_s: float, radius_m: float, height_m: float = 0.2) -> Motion:
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
 
-    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers.
+    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. A print is
+    detected if the cosine of its slant is above `min_facing`.
     """
 
     robots: dict[str, Robot]
@@ -74,6 +79,7 @@ class Arena:
     distractors: int = 0
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
+    min_facing: float = 0.0
 
     def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
@@ -119,17 +125,24 @@ class Arena:
         R = np.array([pose[0] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
-        return self._roundels(cameras, centre, R[:, :, 2], marker_table.radius[seen], rng)
+        normal = np.einsum("nij,jn->ni", R, marker_table.normal[:, seen])
+        number = np.array(seen, np.int32)
+        return self._roundels(cameras, number, (centre, normal, marker_table.radius[seen]), rng)
 
-    def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
-        """Outlines of discs. The centres come from sampled circles, independently of the model under test."""
-        camera = cameras[cameras.names[0]]
-        facing = np.einsum("ni,ni->n", normal, cameras.centres[0] - centre) > 0.0
-        centre, normal, radius = centre[facing], normal[facing], radius[facing]
+    def _roundels(self, cameras: CameraArray, number, discs, rng: np.random.Generator) -> Roundels:
+        """Outlines of discs; `id` is the row of the marker table, -1 for distractors.
+
+        The centres come from sampled circles, independently of the model under test.
+        """
+        camera, (centre, normal, radius) = cameras[cameras.names[0]], discs
+        to = cameras.centres[0] - centre
+        facing = np.einsum("ni,ni->n", normal, to) > self.min_facing * np.linalg.norm(to, axis=1)
+        number, centre, normal, radius = number[facing], centre[facing], normal[facing], radius[facing]
         uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, centre, normal, radius = uv[inside], centre[inside], normal[inside], radius[inside]
+        number, uv, centre = number[inside], uv[inside], centre[inside]
+        normal, radius = normal[inside], radius[inside]
         shape = self._outlines(camera, centre, normal, radius)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
         axes = 2 * np.sqrt(values[:, ::-1])
@@ -143,7 +156,8 @@ class Arena:
         n, order = len(uv), rng.permutation(len(uv))
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
-        return Roundels(uv, cov, axes, angle, level, 200 * level, none, none).select(order)
+        number = np.concatenate([number, np.full(extra, -1, np.int32)])
+        return Roundels(uv, cov, axes, angle, level, 200 * level, number, none).select(order)
 
     def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
         """(N, 2, 2) shape matrices."""

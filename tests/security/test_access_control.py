@@ -49,8 +49,9 @@ RIGHTS = {
     "camera.north": Rights(
         put={f"camera/north/{key}" for key in ("detections", "relative", "status", "@preview")},
         token={"camera/north/alive"},
-        query={"clock"},
+        query={"clock", "rig"},
         answer={"camera/north/snapshot", "camera/north/settings"},
+        receive={"rig"},
     ),
     "viewer": VIEWER,
     "viewer.logger": VIEWER,
@@ -185,13 +186,13 @@ def test_a_client_answers_its_own_requests_only(lab: Lab, observer: Observer, na
 
 @each_client
 def test_a_client_receives_what_its_role_may_receive(lab: Lab, observer: Observer, name: str, mode: str):
-    """A shard publishes on every key. A query to the client, or a publication, follows."""
+    """A shard publishes on every key; the client subscribes to each, and to all. A query to the client follows."""
     session, received = open_session(lab, name, mode), Inbox()
     subscribers = [
         session.declare_subscriber(
             key, lambda sample: received.put(str(sample.key_expr).removeprefix(f"{ARENA}/"))
         )
-        for key in (f"{ARENA}/**", *IN_NO_WILDCARD)
+        for key in (f"{ARENA}/**", *IN_NO_WILDCARD, *(f"{ARENA}/{key}" for key in sorted(ALL)))
     ]
     queryable = session.declare_queryable(
         KEYS.settings("north"), lambda query: received.put("end") or query.drop()
@@ -223,7 +224,7 @@ def test_a_client_sees_who_is_there(lab: Lab, observer: Observer, name: str, mod
         replies = session.liveliness().get(f"{ARENA}/**", timeout=ANSWER_S)
         return {str(reply.ok.key_expr).removeprefix(f"{ARENA}/") for reply in replies if reply.ok}
 
-    if RIGHTS[name].receive:
+    if RIGHTS[name].receive == ALL:
         wait_for(lambda: {"fusion/alive", key} <= present())
     else:
         changes = Inbox()

@@ -29,17 +29,17 @@ struct DetectionColumns {
     }
 };
 
-/// R and P are by body; `body`, `position` and `radius` are by marker.
+/// R and P are by body; `body`, `position`, `normal` and `radius` are by marker.
 void make_expected(Markers* self, const Rotations& R, const Covariances& P, const Index& body,
-                   const Vectors& position, const Numbers& radius) {
+                   const Vectors& position, const Vectors& normal, const Numbers& radius) {
     const size_t n = body.size();
     require_equal(R.shape(0), {P.shape(0)});
     require_equal(n, {radius.size()});
     below(R.shape(0), body);
-    const auto positions = columns<3>(position, n);
+    const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
     Markers markers;
     for (size_t k = 0; k < n; ++k)
-        markers.push_back(ExpectedMarker::of(body(k), positions.vector(k), radius(k),
+        markers.push_back(ExpectedMarker::of(body(k), {positions.vector(k), normals.vector(k), radius(k)},
                                              matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
     new (self) Markers(std::move(markers));
 }
