@@ -11,7 +11,7 @@ import tyro
 
 from camera_node.config import dump_yaml, example_file, load_yaml, write_atomically
 from camera_node.errors import ConfigError
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, Wand
 from camera_node.printing.drawing import Page, write_pages
 from camera_node.printing.sheets import Card, board_page, body_page, card_pages, cards_for_page
 from camera_node.terminal import say
@@ -97,7 +97,7 @@ class Sheet:
         """The name and the body that the file describes."""
         path = self.file or example_file(EXAMPLES[self.what])
         if self.what != "robot":
-            body = load_yaml(path, Body)
+            body = load_yaml(path, Wand if self.what == "wand" else Body)
             return self.what, self._resized(body)
         robots = load_yaml(path, _Robots).robots
         name = self.name or next(iter(robots), "")
