@@ -73,7 +73,7 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         msgspec.structs.force_setattr(self, "normals", () if set(normals) <= {UP} else normals)
 
 
-class Wand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class PrintedWand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A wand for calibration, with roundels on one side, or back to back on both sides.
 
     Attributes:
@@ -102,7 +102,7 @@ class Wand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_def
 
 def thickness_of(wand: Body) -> float:
     """The distance between the two printed sides of a wand, metres; 0 with one side."""
-    return wand.thickness_m if isinstance(wand, Wand) else 0.0
+    return wand.thickness_m if isinstance(wand, PrintedWand) else 0.0
 
 
 def _unit(v: Vector) -> Vector:

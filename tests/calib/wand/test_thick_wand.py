@@ -7,10 +7,10 @@ import msgspec
 import pytest
 
 from calib.wand.calibrate import calibrate
-from camera_node.geometry.body import Wand
+from camera_node.geometry.body import PrintedWand
 from tests.calib.synthetic import WAND, assert_near, errors, record, ring
 
-BOARD = Wand(diameter_m=WAND.diameter_m, markers=WAND.markers, thickness_m=0.02)
+BOARD = PrintedWand(diameter_m=WAND.diameter_m, markers=WAND.markers, thickness_m=0.02)
 
 
 def test_a_thick_wand_is_as_exact_as_one_without_thickness():
@@ -34,4 +34,4 @@ def test_a_thick_wand_is_as_exact_as_one_without_thickness():
 )
 def test_impossible_wands_are_refused(fields: dict, reason: str):
     with pytest.raises(ValueError, match=re.escape(reason)):
-        Wand(**{"diameter_m": 0.1, "markers": WAND.markers} | fields)
+        PrintedWand(**{"diameter_m": 0.1, "markers": WAND.markers} | fields)
