@@ -5,6 +5,21 @@ from numpy.typing import NDArray
 
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 
+class Lens:
+    """Intrinsics: fx, fy, cx, cy and up to 12 distortion numbers in OpenCV's order, or 4 of a fisheye."""
+
+    def __init__(self, is_fisheye: bool, numbers: NDArray[np.float64]) -> None: ...
+    def constrain(
+        self,
+        lens_sigma: float,
+        uv: NDArray[np.float64],
+        axes_px: NDArray[np.float64],
+        angle_rad: NDArray[np.float64],
+        offset_px: NDArray[np.float64],
+        pose_cov: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """(N, 9): u, v, major, minor, angle, the covariance uu, uv, vv, and chi-square (NaN if unchanged)."""
+
 class RoundelLimits:
     """The limits within which a ring counts as a roundel. Without `inner_ratios` the detector finds the prints."""
 

@@ -18,14 +18,14 @@ from calib.rig.rig import load_rig
 from camera_node.commands.camera import JoinArena
 from tests.calib.stick import LENGTH_M, write_stick
 from tests.conftest import ROOT
+from tests.pages import commands, page
 from tests.waiting import wait_for
 from tests.web.roundel.programs import Program, roundel, roundel_command
 
-SHELL = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
-
-
 # The tests that run the commands of a page which are not in the README.
 TESTED = {
+    "recordings.md": "tests/fusion/recordings/test_recordings_page.py",
+    "clients.md": "tests/examples/test_clients.py",
     "bridges.md": "tests/fusion/bridges/test_bridges_page.py",
     "security.md": "tests/security/test_security_page.py",
     "relative.md": "tests/fusion/client/test_relative.py",
@@ -36,16 +36,8 @@ TESTED = {
 }
 # They change the machine, or need a container engine; tests/test_lab.py checks the services.
 NOT_RUN = ("useradd ", "cp configs/systemd", "systemctl ", "pipx run cibuildwheel", "podman ")
+BUILD = ("cargo ", "cmake ", "build/")  # of the example clients
 PIP = ("python3 -m venv ", "/opt/roundel/bin/pip ", "pip wheel ")  # tests/test_packaging.py
-
-
-def commands(text: str) -> list[str]:
-    return [line for block in SHELL.findall(text) for line in block.splitlines()]
-
-
-def page(name: str) -> list[str]:
-    """The commands of a page."""
-    return commands((ROOT / "docs" / name).read_text())
 
 
 def test_every_command_of_every_page_is_tested():
@@ -53,7 +45,7 @@ def test_every_command_of_every_page_is_tested():
     readme = commands((ROOT / "README.md").read_text())
     own = {path.name: set(page(path.name)) - set(readme) for path in (ROOT / "docs").glob("*.md")}
     assert {name for name, lines in own.items() if lines} == set(TESTED)
-    shell = (*NOT_RUN, *PIP, "sh configs/", "cp configs/", "sed -i ")
+    shell = (*NOT_RUN, *PIP, *BUILD, "sh configs/", "cp configs/", "sed -i ")
     odd = [line for lines in own.values() for line in lines if not line.startswith(("roundel ", *shell))]
     assert odd == []
     assert all((ROOT / test).exists() for test in TESTED.values())

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from calib.rig.messages import RigMessage
+from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
 from camera_node.protocol.relative import RelativePositions
@@ -25,7 +25,6 @@ log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
 REMOVED_S = 1.5  # a robot without poses for so long, which the server's status does not list, was removed
 REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
-MAX_RIGS = 20  # in the history
 MAX_PENDING = 1024  # keys whose latest message is not decoded yet
 COVERAGE_S = 0.1  # shortest time between two frames of a camera that extend its coverage
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
@@ -56,7 +55,7 @@ class ArenaState:
     progress: TimedMessage | None = None  # of the demo
     rig: Rig | None = None
     rig_t_ns: int | None = None  # since when it is in force, server's time
-    rigs: tuple[RigMessage, ...] = ()  # that were in force since the feed was created, newest last
+    history: RigHistory | None = None  # the versions of the server's rig
     server_alive: bool = False
     message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
@@ -171,6 +170,11 @@ class Feed:
         with self._lock:
             self._state.server_alive = alive
 
+    def store_history(self, history: RigHistory) -> None:
+        """Store the versions of the rig, which the server sends on request."""
+        with self._lock:
+            self._state.history = history
+
     def clear(self) -> None:
         """Discard all messages; fault counts and the server's presence remain."""
         with self._lock:
@@ -234,7 +238,6 @@ class Feed:
         state = self._state
         if message.t_ns == state.rig_t_ns and message.rig == state.rig:  # a query repeats the one in force
             return
-        state.rigs = (*state.rigs, message)[-MAX_RIGS:]
         state.rig, state.rig_t_ns = message.rig, message.t_ns
 
     def _store_named(

@@ -9,7 +9,7 @@ from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.scene.coverage import CoverageVolume
 from web.subscription import Subscription
-from web.tabs.calibrate import RigHistory
+from web.tabs.calibrate import RigHistoryPanel
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
@@ -58,7 +58,7 @@ def add_live_page(
             view.add(panel, is_live=True)
             closing.callback(panel.close)
             view.add(WorldPanel(view.server, subscription, files), is_live=True)
-        view.add(RigHistory(gui, subscription), is_live=True)
+        view.add(RigHistoryPanel(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))
         view.add(RobotEditor(gui, subscription, folder), is_live=True)

@@ -9,7 +9,8 @@ from typing import Any
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, request_rig_message, undo_rig
+from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
+from camera_node.errors import RoundelError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
@@ -147,8 +148,13 @@ class Subscription:
     def _request_new_rig(self, session: zenoh.Session, sample: zenoh.Sample) -> None:
         with contextlib.suppress(MessageError):
             t_ns = decode(sample.payload.to_bytes(), FusionStatus).rig_t_ns
-            if t_ns is not None and t_ns != self.feed.state().rig_t_ns:
+            if t_ns is not None and self._is_new_rig(t_ns):
                 self._request_rig(session)
+
+    def _is_new_rig(self, t_ns: int) -> bool:
+        """Whether the feed lacks the rig in force since `t_ns`, or its history."""
+        state = self.feed.state()
+        return t_ns != state.rig_t_ns or state.history is None or state.history.rig_t_ns != t_ns
 
     def _request_rig(self, session: zenoh.Session) -> None:
         key = self.feed.keys.rig
@@ -158,6 +164,8 @@ class Subscription:
         def request(arena: str) -> None:
             if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
                 self.feed.receive(key, key, data)
+                with contextlib.suppress(RoundelError):  # the next status asks again
+                    self.feed.store_history(request_rig_history(session, arena, RIG_TIMEOUT_S))
 
         # In a thread: Zenoh's thread, which calls this method, must not wait for replies.
         request_rig = guarded("a request for the rig", request)

@@ -66,6 +66,8 @@ def _robot_note(state: ArenaState, name: str) -> str:
     notes = [status.not_acquired.get(name, "")]
     if misfit_px := status.geometry_residuals_px.get(name):
         notes.append(f"the markers differ from their definition by {misfit_px:.1f} px: measure them again")
+    if diameter_m := status.measured_diameters_m.get(name):
+        notes.append(f"its discs measure {1e3 * diameter_m:.0f} mm, not as declared: define it again")
     if name in status.unsaved_robots:
         notes.append("not saved: a restart of the server loses it")
     return "; ".join(filter(None, notes))

@@ -8,16 +8,20 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+import numpy as np
 import zenoh
 from rich.progress import BarColumn, Progress, TextColumn
 
 from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
+from camera_node.arrays import Array
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.terminal import progress_console
 
 INSPECT_EVERY_S = 0.2
 SILENT_S = 2.0  # without a frame: the camera counts as silent
+COMPARED_NS = 500_000_000  # between two frames that show whether a roundel moves
+MOVED_PX = 10.0  # in that time; a wand that is held still moves as far
 
 
 @dataclass(slots=True)
@@ -29,6 +33,7 @@ class CollectedFrames:
         frames: number of frames with roundels, by camera.
         coverage: where in the image roundels were detected, by camera.
         last_seen_s: time of the last message, by camera.
+        moved_s: when a roundel was last seen to move; None before.
         invalid: number of messages that could not be decoded.
     """
 
@@ -36,7 +41,9 @@ class CollectedFrames:
     frames: Counter[str] = field(default_factory=Counter)
     coverage: dict[str, Coverage] = field(default_factory=dict)
     last_seen_s: dict[str, float] = field(default_factory=dict)
+    moved_s: float | None = None
     invalid: int = 0
+    _compared: dict[str, tuple[int, Array]] = field(default_factory=dict)  # time and centres of a frame
 
     def silent_cameras(self, now_s: float) -> list[str]:
         """Cameras that stopped sending: a running camera sends a message every frame, even without roundels."""
@@ -54,9 +61,21 @@ class CollectedFrames:
         if not len(message):
             return
         self.frames[message.camera] += 1
-        new = Coverage.of(message.unpack().uv, message.width, message.height)
+        uv = message.unpack().uv
+        self._note_motion(message.camera, message.t_ns, uv, now_s)
+        new = Coverage.of(uv, message.width, message.height)
         before = self.coverage.get(message.camera)
         self.coverage[message.camera] = before + new if before else new
+
+    def _note_motion(self, camera: str, t_ns: int, uv: Array, now_s: float) -> None:
+        """Compare frames of a camera, half a second apart: roundels that are not where one was have moved."""
+        then_ns, places = self._compared.get(camera, (t_ns - COMPARED_NS, uv))
+        if 0 <= t_ns - then_ns < COMPARED_NS:
+            return
+        self._compared[camera] = t_ns, uv
+        moved_px = np.linalg.norm(uv[:, None] - places, axis=2).min(axis=1)
+        if moved_px.max() > MOVED_PX:
+            self.moved_s = now_s
 
 
 def collect_frames(

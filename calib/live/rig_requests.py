@@ -4,10 +4,12 @@
 import zenoh
 
 from calib.rig.messages import (
+    RigHistory,
     RigMessage,
     RigRequest,
     RigStepRequest,
     redo_rig_key,
+    rig_history_key,
     set_rig_key,
     undo_rig_key,
 )
@@ -16,6 +18,8 @@ from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import ANSWER_S, REQUEST_S, RequestSource, send_request
 from camera_node.protocol.session import reply_of_server
+
+OTHER_VERSION = "is it of this version of Roundel?"
 
 
 def set_rig(
@@ -52,6 +56,20 @@ def redo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float 
     return _read(send_request(session, redo_rig_key(arena), request, timeout_s, ANSWER_S))
 
 
+def request_rig_history(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> RigHistory:
+    """All versions of the server's rig.
+
+    Raises:
+        RequestError: the server can't read them.
+        NetworkError: no server answers in time, or with something else.
+    """
+    data = send_request(session, rig_history_key(arena), timeout_s=timeout_s)
+    try:
+        return decode(data, RigHistory)
+    except MessageError as error:
+        raise NetworkError(f"the server's reply is no history: {error}; {OTHER_VERSION}") from None
+
+
 def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig | None:
     """The rig in force; None if the server has none, or does not answer in time."""
     data = request_rig_message(session, arena, timeout_s)
@@ -69,6 +87,4 @@ def _read(data: bytes) -> RigMessage:
     try:
         return decode(data, RigMessage)
     except MessageError as error:
-        raise NetworkError(
-            f"the server's reply is no rig: {error}; is it of this version of Roundel?"
-        ) from None
+        raise NetworkError(f"the server's reply is no rig: {error}; {OTHER_VERSION}") from None

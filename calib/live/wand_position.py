@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Locates the wand in the latest frames of placed cameras, to show it during a recording."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
-from calib.wand.detections import gather
+from calib.wand.detections import WandDetections, gather
 from calib.wand.labeling import label
 from calib.wand.timing import MAX_SPREAD_S, Timing
 from camera_node.arrays import Array
@@ -18,6 +19,7 @@ from camera_node.protocol.messages import Detections
 MAX_MISFIT = (
     0.2  # of a distance between two markers: the motion between frames changes it, a wrong match much more
 )
+MAX_CAMERAS = 4  # that locate a wand of two markers: each one doubles the number of correspondences
 ONE_FRAME = Timing(0.0, synchronous=True)  # labels need no other frames
 
 
@@ -29,7 +31,7 @@ def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, 
 
     Args:
         cameras: placed cameras by name.
-        wand: its markers; in one frame the ends of a wand of two can't be distinguished, so it is not located.
+        wand: its markers. Which end of a wand of two markers is which is unknown, unless they have numbers.
         latest: the latest frame of each camera, by name.
 
     Returns:
@@ -46,6 +48,8 @@ def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, 
     names = sorted(message.camera for message in recent)
     lenses = [cameras[name] for name in names]
     frames, detections = gather(recent, names, lenses)
+    if len(wand.markers) == 2 and not (detections.label >= 0).any():
+        return _locate_two(lenses, detections, wand)
     try:
         labeled, _ = label(frames, ONE_FRAME, detections, wand, lenses)
     except CalibrationError:  # a symmetric wand without numbers
@@ -56,6 +60,34 @@ def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, 
         if rows.sum() >= 2:
             points[marker] = _triangulate([lenses[k] for k in labeled.camera[rows]], labeled.uv[rows])
     return points if _fits(points, wand.points) else None
+
+
+def _locate_two(lenses: Sequence[Camera], detections: WandDetections, wand: Body) -> Array | None:
+    """Locate a wand of two markers that look alike, by the correspondence of its ends that has the smallest residual.
+
+    Returns:
+        (2, 3) world, in any order; None if no two cameras see just two roundels, or if these are not a wand apart.
+    """
+    pairs = [np.flatnonzero(detections.camera == k) for k in range(len(lenses))]
+    seen = [(lenses[k], detections.uv[rows]) for k, rows in enumerate(pairs) if len(rows) == 2][:MAX_CAMERAS]
+    if len(seen) < 2:
+        return None
+    cameras, ends = [camera for camera, _ in seen], np.stack([uv for _, uv in seen])
+    best, least = None, np.inf
+    for swaps in product((0, 1), repeat=len(seen) - 1):
+        ordered = np.stack([uv[::-1] if swap else uv for uv, swap in zip(ends, (0, *swaps), strict=True)])
+        points = np.stack([_triangulate(cameras, ordered[:, end]) for end in (0, 1)])
+        residual = _residual_px(cameras, points, ordered)
+        if residual < least:
+            best, least = points, residual
+    return best if best is not None and _fits(best, wand.points) else None
+
+
+def _residual_px(cameras: Sequence[Camera], points: Array, uv: Array) -> float:
+    """RMS distance of pixels (N, 2, 2) of N cameras from the images of two points; infinite behind a camera."""
+    images = np.stack([camera.project_world(points) for camera in cameras])
+    residual = float(np.sqrt(np.mean((images - uv) ** 2)))
+    return residual if np.isfinite(residual) else np.inf
 
 
 def _triangulate(cameras: list[Camera], uv: Array) -> Array:

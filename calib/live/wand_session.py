@@ -7,7 +7,10 @@ session ends when
 
 - every camera that sends frames is placed,
 - no camera's own covariance adds more than 5 % to the error of a roundel's pixel, and
-- the wand was seen in half of the image area that each camera shares with others, or in no new area for 15 s.
+- the wand was seen in half of the image area that each camera shares with others, or in no new area for 15 s;
+
+or when no roundel moves for 15 s: the wand was put down or carried away. While a camera is not placed, the session
+waits for the wand to return.
 """
 
 import os
@@ -25,7 +28,7 @@ from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames, collect_frames
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.grade import assess
+from calib.wand.quality.assessment import assess
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
@@ -38,6 +41,8 @@ MAX_ADDED_ERROR = 0.05  # that a camera's covariance may add to the error of a p
 MIN_USED = 0.5  # of the image area that a camera shares with others
 MIN_GROWTH = 0.01  # of the used area, summed over cameras: less counts as none
 IDLE_S = 15.0  # without growth of the used area
+GONE_S = 15.0  # without a roundel that moves: the wand is gone
+PAUSE_S = 3.0  # without a roundel that moves: the user is told
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +57,7 @@ class WandSession:
         trials: whether trial calibrations are computed.
         trial_every_s: the shortest time between two trials.
         stops_itself: whether the session ends when a trial is precise enough.
+        stops_without_wand: whether it ends when the wand is gone.
     """
 
     rig: Rig
@@ -61,6 +67,7 @@ class WandSession:
     trials: bool = True
     trial_every_s: float = TRIAL_EVERY_S
     stops_itself: bool = True
+    stops_without_wand: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,9 +188,23 @@ def run_wand_session(
             trial = solver.update(collected.messages, elapsed)
             enough = trial is not None and rule.is_met(trial, elapsed)
             show(summarize(collected, elapsed, trial, enough))
-            return "more frames would not improve the result" if enough and settings.stops_itself else ""
+            if enough and settings.stops_itself:
+                return "more frames would not improve the result"
+            is_gone = settings.stops_without_wand and is_wand_gone(collected, elapsed, trial, settings.trials)
+            return f"no roundel moved for {GONE_S:.0f} s" if is_gone else ""
 
         return collect_frames(session, arena, settings.seconds, inspect)
+
+
+def is_wand_gone(collected: CollectedFrames, elapsed: float, trial: Trial | None, trials: bool) -> bool:
+    """Whether the wand was waved and is gone; with trials, only once one of them places all cameras."""
+    is_placed = not trials or (trial is not None and not trial.fault and not trial.unplaced)
+    return is_placed and _still_s(collected, elapsed) > GONE_S
+
+
+def _still_s(collected: CollectedFrames, elapsed: float) -> float:
+    """For how long no roundel moved, seconds; 0 before the first motion."""
+    return 0.0 if collected.moved_s is None else elapsed - collected.moved_s
 
 
 def summarize(
@@ -202,6 +223,11 @@ def _advise(collected: CollectedFrames, elapsed: float, trial: Trial | None, eno
         return _name_silent(silent, len(collected.last_seen_s))
     if not collected.frames:
         return "waiting for roundels" if collected.messages else "waiting for cameras"
+    if (still_s := _still_s(collected, elapsed)) > PAUSE_S:
+        return (
+            f"no roundel has moved for {still_s:.0f} s: wave on, or end the session; once all cameras are placed it "
+            f"ends by itself after {GONE_S:.0f} s"
+        )
     return _advise_by(trial) if trial is not None else "wave the wand where two cameras or more see it"
 
 

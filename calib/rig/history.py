@@ -43,6 +43,10 @@ class History:
         """The older versions, newest last."""
         return self._older.files()
 
+    def undone(self) -> list[Path]:
+        """The undone versions; `redo` restores the last one."""
+        return self._undone.files()
+
     def back_up(self) -> Path | None:
         """Give the file a number, before it is replaced. Undone versions become older ones, which `undo` reaches.
 

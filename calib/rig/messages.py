@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The messages of calibration on Zenoh, encoded as in `camera_node.protocol.messages`, and their keys."""
 
-from typing import ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
+from calib.rig.changes import RigChange
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import VERSION, MessageError
 from camera_node.protocol.requests import RequestSource
 
+MAX_VERSIONS = 64  # in one history
 MAX_RIG_BYTES = 1 << 20  # of a message; 256 cameras with their reports take a quarter
 
 
@@ -49,6 +51,21 @@ class RigStepRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     source: RequestSource | None = None
 
 
+class RigVersion(RigChange, frozen=True, kw_only=True, omit_defaults=False):
+    """A version of the rig: the change that made it, and the server's file that holds it."""
+
+    state: Literal["earlier", "in force", "undone"]
+    file: Annotated[str, msgspec.Meta(max_length=255)] = ""  # empty if a restart loses it
+
+
+class RigHistory(msgspec.Struct, frozen=True, kw_only=True):
+    """The versions of the rig in their order, oldest first: the earlier ones, the one in force, the undone ones."""
+
+    version: int = VERSION
+    rig_t_ns: int | None = None  # `t_ns` of the `RigMessage` in force; None without a rig
+    versions: Annotated[tuple[RigVersion, ...], msgspec.Meta(max_length=MAX_VERSIONS)] = ()
+
+
 def set_rig_key(arena: str) -> str:
     """The key of the queryable that takes a `RigRequest` and answers with the `RigMessage` in force.
 
@@ -65,3 +82,8 @@ def undo_rig_key(arena: str) -> str:
 def redo_rig_key(arena: str) -> str:
     """The key of the queryable that takes a `RigStepRequest` and restores the rig that was undone last."""
     return f"{arena}/rig/redo"
+
+
+def rig_history_key(arena: str) -> str:
+    """The key of the queryable that answers with the `RigHistory`."""
+    return f"{arena}/rig/history"

@@ -23,7 +23,8 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 MAGIC = 8  # bytes at the start of every MCAP file
-CHUNK = 1 << 16  # bytes compressed together: the most that is lost when a recording is cut off
+MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
+MAX_LOST = 1 / 256  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
 
 
 class RecordingWriter:
@@ -46,6 +47,7 @@ class RecordingWriter:
         self.counts: Counter[str] = Counter()
         self._mode = "wb" if overwrite else "xb"
         self._channels: dict[str, int] = {}
+        self._chunk, self._pending = MIN_CHUNK, 0  # bytes
 
     def __enter__(self) -> "RecordingWriter":
         try:
@@ -54,7 +56,7 @@ class RecordingWriter:
             raise ConfigError(f"{self.path} exists; give another name, or --force to replace it") from None
         except OSError as error:
             raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
-        self._writer = Writer(self._file, chunk_size=CHUNK)
+        self._writer = Writer(self._file, chunk_size=MAX_CHUNK)
         self._writer.start(profile="roundel", library="roundel")
         return self
 
@@ -80,9 +82,17 @@ class RecordingWriter:
             if key not in self._channels:
                 self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
             self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
+            self._pending += len(data)
+            if self._pending >= self._chunk:
+                self._end_chunk()
         except OSError as error:
             raise self._close_full(error) from None
         self.counts[key] += 1
+
+    def _end_chunk(self) -> None:
+        """Write the pending messages; the next chunk is larger as the file grows."""
+        self._writer.flush()
+        self._chunk, self._pending = min(MAX_CHUNK, max(MIN_CHUNK, int(MAX_LOST * self.size))), 0
 
     def _close_full(self, error: OSError) -> ConfigError:
         """Close a file that can't grow, with an index in place of its last chunks; the error to raise."""

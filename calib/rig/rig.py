@@ -79,8 +79,13 @@ def _read(path: Path, kind: type[T]) -> T:
         raise ConfigError(f"{error}{hint}") from None
 
 
-def save_rig(rig: Rig, path: Path) -> Path | None:
+def save_rig(rig: Rig, path: Path, first_line: str = "") -> Path | None:
     """Write a rig atomically; fields at their defaults are omitted.
+
+    Args:
+        rig: the rig.
+        path: its file.
+        first_line: a comment that precedes it, such as `RigChange.line`.
 
     Returns:
         the backup of the previous file at `path`, if there was one (`calib undo` restores it).
@@ -95,7 +100,7 @@ def save_rig(rig: Rig, path: Path) -> Path | None:
         raise CalibrationError(f"{path} is not written: {error}") from None
     backup = History(path).back_up()
     try:
-        write_atomically(path, dump_rig(rig))
+        write_atomically(path, first_line + dump_rig(rig))
     except BaseException:
         if backup:
             backup.unlink()  # equal to the file

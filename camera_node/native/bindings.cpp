@@ -4,6 +4,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include "bind_lens.hpp"
 #include "detector.hpp"
 #include "frame_columns.hpp"
 
@@ -65,6 +66,7 @@ static nb::object explain(roundel::Detector& detector, const GreyImage& image) {
 }
 
 NB_MODULE(_core, m) {
+    bind_lens(m);
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
     nb::class_<roundel::RoundelLimits>(m, "RoundelLimits")

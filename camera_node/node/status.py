@@ -11,7 +11,7 @@ import numpy as np
 
 from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
-from camera_node.detection.roundels import DetectedRoundels
+from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.detection.sharpness import edge_blur_px
 from camera_node.protocol.messages import CameraStatus
 from camera_node.sources.frame import Frame, Source
@@ -30,10 +30,11 @@ NO_IMAGE, NO_CENTRES = np.empty((0, 0), np.uint8), np.empty((0, 2))
 
 @dataclass(frozen=True, slots=True)
 class DetectedFrame:
-    """A frame, its roundels, and the duration of their detection in microseconds."""
+    """A frame, its roundels as measured and as published, and the duration of their detection in microseconds."""
 
     frame: Frame
     roundels: DetectedRoundels
+    published: Roundels  # with the camera's lens, if it is known
     detect_us: float
 
 
@@ -95,6 +96,8 @@ class NodeStatistics:
                 fps=self._recent / max(1e-3, time.monotonic() - self._since),
                 frames=self._frames,
                 dropped=source.dropped,
+                incomplete=source.incomplete,
+                lost_packets=source.lost_packets,
                 detect_ms=self._detect_us / n / 1000,
                 roundels=self._roundels / n,
                 threshold=detector.threshold,

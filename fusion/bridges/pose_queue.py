@@ -7,7 +7,7 @@ import select
 import socket
 import time
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,7 +22,6 @@ log = logging.getLogger("fusion.bridge")
 
 QUEUE_SIZE = 4096  # poses; four frame sets of 1024 robots
 SILENCE_S = 5.0
-GATHER_S = 0.0005  # after the first pose: the rest of its frame set arrives, and is passed on by one wake-up
 WAIT_S = 0.2  # for poses, until a bridge looks whether it was stopped
 
 
@@ -48,7 +47,7 @@ class PoseQueue:
         self._reader.setblocking(False)
         self._writer.setblocking(False)
         self._received_s, self._is_silent = time.monotonic(), False
-        self._remove = client.poses().on_message(self._put)
+        self._remove = client.pose_sets().on_message(self._put)
 
     def close(self) -> None:
         """Receive no more poses."""
@@ -63,7 +62,6 @@ class PoseQueue:
     def take(self, timeout_s: float = 0.0) -> list[RobotPose]:
         """All poses that wait, in order of arrival; the first one is waited for up to `timeout_s`."""
         if select.select([self._reader], [], [], timeout_s)[0]:
-            time.sleep(GATHER_S)
             with contextlib.suppress(BlockingIOError):
                 self._reader.recv(64)
             self._is_signaled = False  # before the queue is emptied: a pose that arrives now signals again
@@ -82,10 +80,10 @@ class PoseQueue:
             message = "no pose %s within %g s; is roundel server running there?"
             log.warning(message, self.client.origin, SILENCE_S)
 
-    def _put(self, pose: RobotPose) -> None:
-        if len(self._poses) == QUEUE_SIZE:
-            self.faults["poses dropped because the bridge is too slow"] += 1
-        self._poses.append(pose)
+    def _put(self, poses: Sequence[RobotPose]) -> None:
+        if (excess := len(self._poses) + len(poses) - QUEUE_SIZE) > 0:
+            self.faults["poses dropped because the bridge is too slow"] += excess
+        self._poses.extend(poses)
         if not self._is_signaled:
             self._is_signaled = True
             with contextlib.suppress(BlockingIOError):

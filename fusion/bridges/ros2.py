@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import zenoh
 
@@ -49,17 +50,17 @@ class Ros2Node:
         self._namespace = namespace
         self._topics: dict[str, Ros2Topic] = {}
         self._lock = threading.Lock()  # of the topics: positions arrive in Zenoh's threads
-        self._robots: dict[str, str] = {}  # name in ROS -> name in the arena
+        self._robots: dict[str, RobotTopics] = {}  # by name in the arena
         self._token = session.liveliness().declare_token(self._entity(0, "NN"))
 
     def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
         """Publish `<robot>/pose`, `<robot>/odometry` of the robots that are not lost, and all of them in one `tf`."""
-        shown = [pose for pose in poses if pose.state != "lost" and self._has_name(pose.robot)]
-        names = [ros_name(pose.robot) for pose in shown]
-        for pose, name, odom in zip(shown, names, odometries(shown, frame, names), strict=True):
-            prefix = f"{self._namespace}/{name}".lstrip("/")
-            self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped").put(pose_stamped(pose, frame))
-            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry").put(odom)
+        shown = [pose for pose in poses if pose.state != "lost" and self._has_topics(pose.robot)]
+        robots = [self._robots[pose.robot] for pose in shown]
+        names = [robot.name for robot in robots]
+        for pose, robot, odom in zip(shown, robots, odometries(shown, frame, names), strict=True):
+            robot.odometry.put(odom)
+            robot.pose.put(pose_stamped(pose, frame))
         if shown:
             self._topic("tf", "tf2_msgs/msg/TFMessage").put(transforms(shown, frame, names))
 
@@ -70,12 +71,22 @@ class Ros2Node:
         for data in relative_poses(message, f"{name}_optical_frame"):
             topic.put(data)
 
-    def _has_name(self, robot: str) -> bool:
-        """Whether no other robot has its name in ROS; counted otherwise."""
-        first = self._robots.setdefault(ros_name(robot), robot)
-        if first != robot:
+    def _has_topics(self, robot: str) -> bool:
+        """Whether the robot has topics or gets them now; if another one has its name in ROS, its poses are counted."""
+        if robot in self._robots:
+            return True
+        name = ros_name(robot)
+        first = next((other for other, topics in self._robots.items() if topics.name == name), None)
+        if first is not None:
             self.faults[f"poses of '{robot}', which has the same ROS name as '{first}'"] += 1
-        return first == robot
+            return False
+        prefix = f"{self._namespace}/{name}".lstrip("/")
+        self._robots[robot] = RobotTopics(
+            name,
+            self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped"),
+            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry"),
+        )
+        return True
 
     def _topic(self, name: str, kind: str) -> "Ros2Topic":
         with self._lock:
@@ -110,6 +121,15 @@ class Ros2Topic:
         self._count += 1
         attachment = struct.pack("<qqB16s", self._count, time.time_ns(), len(self._gid), self._gid)
         self._publisher.put(data, attachment=attachment)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotTopics:
+    """A robot's name in ROS and its topics."""
+
+    name: str
+    pose: Ros2Topic
+    odometry: Ros2Topic
 
 
 def ros_name(robot: str) -> str:

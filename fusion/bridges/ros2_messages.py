@@ -7,6 +7,7 @@ position, then of rotation about the frame's fixed axes; a twist in the frame of
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,45 +26,14 @@ TYPE_HASHES = {
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
 
+ENCAPSULATION = b"\0\1\0\0"  # of little-endian CDR
+STAMP, LENGTH, SEVEN = struct.Struct("<II"), struct.Struct("<I"), struct.Struct("<7d")
 ANY_ANGLE = np.pi**2 / 3  # variance of an angle of which nothing is known, square radians
-
-
-class Cdr:
-    """Encodes CDR. The offset of each number behind the four-byte header is a multiple of its size."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-
-    def u32(self, *values: int) -> None:
-        self._align(4)
-        self._data += struct.pack(f"<{len(values)}I", *values)
-
-    def doubles(self, *values: float) -> None:
-        self._align(8)
-        self._data += struct.pack(f"<{len(values)}d", *values)
-
-    def array(self, values: Array) -> None:
-        self._align(8)
-        self._data += np.asarray(values, "<f8").tobytes()
-
-    def text(self, value: str) -> None:
-        data = value.encode() + b"\0"
-        self.u32(len(data))
-        self._data += data
-
-    def finish(self) -> bytes:
-        return b"\0\1\0\0" + self._data
-
-    def _align(self, size: int) -> None:
-        self._data += bytes(-len(self._data) % size)
 
 
 def pose_stamped(pose: RobotPose, frame: str) -> bytes:
     """`geometry_msgs/msg/PoseStamped` in the frame named `frame`, which is the arena's world."""
-    cdr = Cdr()
-    _put_header(cdr, pose, frame)
-    _put_pose(cdr, pose)
-    return cdr.finish()
+    return ENCAPSULATION + _header(pose.t_ns, _texts(STAMP.size, frame)) + _numbers(pose)
 
 
 def odometries(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) -> list[bytes]:
@@ -79,28 +49,22 @@ def odometries(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) 
     R = rotations(poses)
     twist = twists(poses, R)
     C = covariances(poses, R, twist)
-    messages = []
-    for k, (pose, child) in enumerate(zip(poses, children, strict=True)):
-        cdr = Cdr()
-        _put_header(cdr, pose, frame)
-        cdr.text(child)
-        _put_pose(cdr, pose)
-        cdr.array(C[k, :6, :6])
-        cdr.array(twist[k])
-        cdr.array(C[k, 6:, 6:])
-        messages.append(cdr.finish())
-    return messages
+    rows = [C[:, :6, :6].reshape(-1, 36), twist.reshape(-1, 6), C[:, 6:, 6:].reshape(-1, 36)]
+    behind_pose = np.concatenate(rows, axis=1).astype("<f8")
+    return [
+        ENCAPSULATION + _header(pose.t_ns, _texts(STAMP.size, frame, child)) + _numbers(pose) + row.tobytes()
+        for pose, child, row in zip(poses, children, behind_pose, strict=True)
+    ]
 
 
 def transforms(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) -> bytes:
     """`tf2_msgs/msg/TFMessage` with the transforms of N poses, whose bodies' frames are `children`, in `frame`."""
-    cdr = Cdr()
-    cdr.u32(len(poses))
+    parts = [ENCAPSULATION, LENGTH.pack(len(poses))]
+    offset = LENGTH.size  # of the next transform, modulo 8
     for pose, child in zip(poses, children, strict=True):
-        _put_header(cdr, pose, frame)
-        cdr.text(child)
-        _put_pose(cdr, pose)
-    return cdr.finish()
+        parts += [_header(pose.t_ns, _texts(offset + STAMP.size, frame, child)), _numbers(pose)]
+        offset = 0
+    return b"".join(parts)
 
 
 def relative_poses(message: RelativePositions, frame: str) -> list[bytes]:
@@ -120,12 +84,9 @@ def relative_poses(message: RelativePositions, frame: str) -> list[bytes]:
 def _relative_pose(
     message: RelativePositions, frame: str, position: Array, normal: Array, covariance: Array
 ) -> bytes:
-    cdr = Cdr()
-    _put_header(cdr, message, frame)
     w, x, y, z = wxyz_from_rotation(rotation_with_z(normal))
-    cdr.doubles(*position, x, y, z, w)
-    cdr.array(covariance)
-    return cdr.finish()
+    numbers = np.concatenate([position, [x, y, z, w], covariance.ravel()]).astype("<f8")
+    return ENCAPSULATION + _header(message.t_ns, _texts(STAMP.size, frame)) + numbers.tobytes()
 
 
 def _roundel_covariance(seen: LocatedRoundels, k: int) -> Array:
@@ -142,12 +103,24 @@ def _roundel_covariance(seen: LocatedRoundels, k: int) -> Array:
     return cov
 
 
-def _put_header(cdr: Cdr, message: RobotPose | RelativePositions, frame: str) -> None:
-    cdr.u32(*divmod(message.t_ns, 1_000_000_000))
-    cdr.text(frame)
+@lru_cache(maxsize=8192)
+def _texts(offset: int, *texts: str) -> bytes:
+    """Strings that begin at `offset`, and the padding in front of the doubles that follow.
+
+    The offset of each number behind the encapsulation is a multiple of its size.
+    """
+    data = bytearray(offset)
+    for text in texts:
+        encoded = text.encode() + b"\0"
+        data += bytes(-len(data) % 4) + LENGTH.pack(len(encoded)) + encoded
+    return bytes(data[offset:]) + bytes(-len(data) % 8)
 
 
-def _put_pose(cdr: Cdr, pose: RobotPose) -> None:
-    """Put the seven numbers that a Pose and a Transform have in common."""
+def _header(t_ns: int, texts: bytes) -> bytes:
+    return STAMP.pack(*divmod(t_ns, 1_000_000_000)) + texts
+
+
+def _numbers(pose: RobotPose) -> bytes:
+    """The seven numbers that a Pose and a Transform have in common."""
     w, x, y, z = pose.quaternion_wxyz
-    cdr.doubles(*pose.position, x, y, z, w)
+    return SEVEN.pack(*pose.position, x, y, z, w)

@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Measures a new robot: finds stationary unlabeled markers, and makes a constellation of them."""
+"""Measures a new robot: finds stationary unlabeled markers, and makes a constellation of them.
 
+Where the measured normals of the markers differ by 45 degrees or more, the robot has markers on several sides, and each
+marker has the normal of its side.
+"""
+
+import math
 import queue
 import time
 from collections.abc import Sequence
@@ -11,7 +16,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Array, Index, Mask
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.model.robots import MotionModel, Robot
@@ -20,21 +25,35 @@ from fusion.protocol.messages import Markers
 SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
 STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position
 MIN_SEEN = 0.5  # share of the messages that contain a marker that counts
+MAX_SIZE_ERROR = (
+    0.1  # between the given diameter and the one that is seen; beyond 0.2 a robot is never acquired
+)
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
+SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
 
 
 @dataclass(frozen=True)
 class StationaryMarkers:
-    """Stationary unlabeled markers: median positions (K, 3), mean normals (K, 3), NaN where unknown; world, metres."""
+    """Stationary unlabeled markers.
+
+    Attributes:
+        position, normal: (K, 3) medians, world, metres, and mean unit vectors, NaN where unknown.
+        diameter_m: (K,) median of the discs as they appear, NaN where unknown.
+    """
 
     position: Array
     normal: Array
+    diameter_m: Array
+
+    def select(self, rows: Index | Mask) -> "StationaryMarkers":
+        """The markers of a mask or an index array."""
+        return StationaryMarkers(self.position[rows], self.normal[rows], self.diameter_m[rows])
 
     def within(self, centre: ArrayLike, radius_m: float) -> "StationaryMarkers":
         """The markers within `radius_m` of a point (3,)."""
         near = np.linalg.norm(self.position - np.asarray(centre, float), axis=1) <= radius_m
-        return StationaryMarkers(self.position[near], self.normal[near])
+        return self.select(near)
 
 
 def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
@@ -66,19 +85,22 @@ def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[
 def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
     """The unlabeled markers that half of the messages or more contain, at one place."""
     unlabeled = [_unlabeled(message) for message in messages]
-    reference = max(unlabeled, key=len, default=np.empty((0, 6)))
-    seen = np.full((len(unlabeled), len(reference), 6), np.nan)  # messages x markers x (position, normal)
+    reference = max(unlabeled, key=len, default=np.empty((0, 7)))
+    seen = np.full(
+        (len(unlabeled), len(reference), 7), np.nan
+    )  # messages x markers x (position, normal, size)
     for row, markers in zip(seen, unlabeled, strict=True):
         ours, theirs = _mutual_nearest(reference[:, :3], markers[:, :3])
         row[ours] = markers[theirs]
     seen = seen[:, np.isfinite(seen[:, :, 0]).sum(0) >= max(1, MIN_SEEN * len(seen))]
     if not seen.size:
-        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)))
+        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     position = np.nanmedian(seen[..., :3], 0)
     spread = np.nanmedian(np.linalg.norm(seen[..., :3] - position, axis=2), 0)
     seen, position = seen[:, spread < STATIONARY_M], position[spread < STATIONARY_M]
-    normals = [_mean_direction(seen[:, k, 3:]) for k in range(len(position))]
-    return StationaryMarkers(position, np.array(normals).reshape(-1, 3))
+    normals = [_mean_direction(seen[:, k, 3:6]) for k in range(len(position))]
+    sizes = [_median_known(seen[:, k, 6]) for k in range(len(position))]
+    return StationaryMarkers(position, np.array(normals).reshape(-1, 3), np.array(sizes))
 
 
 def robot_from_markers(
@@ -88,23 +110,34 @@ def robot_from_markers(
 ) -> Robot:
     """A robot with these markers: its origin is their mean, z is out of the prints, x towards the first marker.
 
+    Of a robot with markers on several sides, z is out of the uppermost side.
+
     Raises:
-        FusionError: there are no markers, or no robot can have them.
+        FusionError: there are no markers, they have another diameter, no robot can have them, or the normal of one of
+            several sides is unknown.
     """
     if not len(markers.position):
         raise FusionError(
             "no stationary unlabeled marker found there; hold the robot still, with all markers up, in view of two "
             "cameras"
         )
+    seen_m = _median_known(markers.diameter_m)
+    if abs(diameter_m / seen_m - 1) > MAX_SIZE_ERROR:
+        raise FusionError(
+            f"the black discs measure about {1e3 * seen_m:.0f} mm, not {1e3 * diameter_m:.0f} mm; give their diameter, "
+            "or correct the lengths in wand.yaml and calibrate again if a ruler confirms it"
+        )
     try:
-        return Robot(diameter_m=diameter_m, markers=_in_body(markers), motion=motion)
+        positions, normals = _in_body(markers)
+        return Robot(diameter_m=diameter_m, markers=positions, normals=normals, motion=motion)
     except ValueError as error:
         raise FusionError(f"these markers make no robot: {error}") from None
 
 
 def _unlabeled(message: Markers) -> Array:
-    """(K, 6) positions and normals of unlabeled markers that more than one camera sees."""
-    rows = np.hstack([message.positions(), message.normals().astype(float)])[message.unlabeled()]
+    """(K, 7) positions, normals and diameters of unlabeled markers that more than one camera sees."""
+    columns = message.positions(), message.normals(), message.diameters()[:, None]
+    rows = np.hstack(columns).astype(float)[message.unlabeled()]
     return rows[np.isfinite(rows[:, :3]).all(1)]
 
 
@@ -118,6 +151,12 @@ def _mutual_nearest(a: Array, b: Array) -> tuple[Index, Index]:
     return rows, nearest[rows]
 
 
+def _median_known(values: Array) -> float:
+    """The median of the values (N,) that are not NaN; NaN if none is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
 def _mean_direction(normals: Array) -> Array:
     """(3,) mean direction of the normals (T, 3) that are known; NaN where none is."""
     known = normals[np.isfinite(normals).all(1)]
@@ -125,18 +164,59 @@ def _mean_direction(normals: Array) -> Array:
     return total / np.linalg.norm(total) if np.any(total) else np.full(3, np.nan)
 
 
-def _in_body(markers: StationaryMarkers) -> tuple[tuple[float, float, float], ...]:
-    """The positions in the robot's own frame, to a tenth of a millimetre."""
+Rows = tuple[tuple[float, float, float], ...]
+
+
+def _in_body(markers: StationaryMarkers) -> tuple[Rows, Rows]:
+    """Positions, to a tenth of a millimetre, and normals in the robot's own frame; no normals if all are +z."""
     centred = markers.position - markers.position.mean(0)
-    z = _z_axis(centred, markers.normal)
+    normals = _normals_of_sides(centred, markers.normal)
+    z = _z_axis(centred, markers.normal) if normals is None else normals[np.argmax(normals[:, 2])]
     flat = centred - np.outer(centred @ z, z)
     off = np.linalg.norm(flat, axis=1) >= OFF_CENTRE_M
     if not off.any():
-        return ((0.0, 0.0, 0.0),) * len(centred)  # one marker; `Robot` refuses several in one place
+        return ((0.0, 0.0, 0.0),) * len(centred), ()  # one marker; `Robot` refuses several in one place
     x = flat[np.argmax(off)] / np.linalg.norm(flat[np.argmax(off)])
-    body = centred @ np.column_stack([x, np.cross(z, x), z])
-    x, y, z = np.round(body, 4).T.tolist()
+    R_world_body = np.asarray(np.column_stack([x, np.cross(z, x), z]), float)
+    return _rows(centred @ R_world_body), () if normals is None else _rows(normals @ R_world_body)
+
+
+def _rows(vectors: Array) -> Rows:
+    x, y, z = (np.round(vectors, 4) + 0.0).T.tolist()
     return tuple(zip(x, y, z, strict=True))
+
+
+def _normals_of_sides(centred: Array, normals: Array) -> Array | None:
+    """(K, 3) the normals of the sides that the markers are on; None if all markers face one way.
+
+    Three markers or more in one plane show the normal of their side better than their outlines do.
+
+    Raises:
+        FusionError: there are several sides, and a normal is unknown.
+    """
+    is_known = np.isfinite(normals).all(1)
+    known = normals[is_known]
+    if not len(known) or (known @ known.T).min() > math.cos(SIDES_RAD):
+        return None
+    if not is_known.all():
+        raise FusionError(
+            f"the markers are on several sides, and the normals of {int((~is_known).sum())} of {len(normals)} are not "
+            "known: turn the robot, or let more cameras see it, so that two cameras see each marker from different "
+            "directions"
+        )
+    result = np.full_like(normals, np.nan)
+    while len(rows := np.flatnonzero(np.isnan(result[:, 0]))):
+        side = rows[normals[rows] @ normals[rows[0]] > math.cos(SIDES_RAD / 2)]
+        mean = _mean_direction(normals[side])
+        result[side] = _plane_normal(centred[side], mean)
+    return result
+
+
+def _plane_normal(points: Array, facing: Array) -> Array:
+    """(3,) the normal of planar points (N, 3) on the side of the unit vector `facing`; `facing` if they are not."""
+    _, spread, axes = np.linalg.svd(points - points.mean(0))
+    is_plane = len(points) >= 3 and spread[1] > OFF_CENTRE_M and spread[2] < PLANAR_M
+    return axes[2] * np.sign(axes[2] @ facing) if is_plane else facing
 
 
 def _z_axis(centred: Array, normals: Array) -> Array:

@@ -72,6 +72,13 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
             f"its markers are {residual:.1f} px from their places",
             "measure it again",
         )
+    for name, diameter_m in status.measured_diameters_m.items():
+        yield Finding(
+            "warning",
+            f"robot {name}",
+            f"its discs measure {1e3 * diameter_m:.1f} mm, other than declared",
+            "correct diameter_m in robots.yaml, or the lengths in wand.yaml if all robots differ",
+        )
 
 
 def _check_cameras(status: FusionStatus) -> Iterator[Finding]:

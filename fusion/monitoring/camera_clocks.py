@@ -2,9 +2,9 @@
 """Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
 
     arrival of a frame   -> `StampCheck`: its stamp jumped?             -> excluded from this frame on
-    every frame set      -> `offset_information`: one camera off?       -> excluded
+    every frame set      -> `ClockComparison.jump`: one camera off?     -> excluded
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
-    slow information     -> `DriftMonitor`: an offset, or a rate?       -> corrected while in use
+    slow information     -> `ClockComparison.drifts`                    -> corrected while in use
 
 See docs/time_offsets.md.
 """
@@ -21,24 +21,16 @@ from camera_node.arrays import Mask
 from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
-from fusion.model.states import States
-from fusion.monitoring.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.monitoring.clock_comparison import FAST_NS, ClockComparison
+from fusion.monitoring.clock_drift import Drift
 from fusion.monitoring.stamp_check import StampCheck
-from fusion.monitoring.time_offsets import OffsetInformation, disagreement, offset_information
-from fusion.monitoring.time_search import RANGE_S, Snapshot, TimeShift, find_time_shift
+from fusion.monitoring.time_offsets import Disagreement
+from fusion.monitoring.time_search import Snapshot, TimeShift, find_time_shift
 
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
 
-COMPARED_NS, CHECKED_NS = 45_000_000, 400_000_000  # between comparisons, and between searches for a drift
-LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set
-JUMP_SIGMA_V, DRIFT_SIGMA_V = (
-    0.5,
-    0.1,
-)  # of velocities, m/s: of a filter with wrong stamps, and of a mean velocity
-FAST_NS = 120_000_000  # of frame sets that show a jump
-JUMP_PX = 1.5  # RMS image motion that a jump must explain
 MAX_DRIFT_S = 0.01  # largest change of a correction by a slow departure
 FOLLOWED_NS = 10_000_000_000  # after a departure, in which smaller ones of the same camera count
 REPORTED_NS = 500_000  # smallest correction that is reported; later ones when it has doubled
@@ -51,8 +43,6 @@ STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the 
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
-MAX_MARKERS = 96  # observations of a frame set that are compared
-MIN_SPEED_M_S = 0.03  # of a robot that is compared
 UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
 MAX_SPREAD_S = 0.1  # standard deviation of all stamps while cameras contradict each other
 HELD_NS = 3_000_000_000  # after such a contradiction no camera counts as moved
@@ -106,14 +96,10 @@ class CameraClocks:
     """
 
     def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask) -> None:
-        self._cameras, self._markers, self._single = cameras, markers, single
+        self._cameras, self._markers = cameras, markers
         self._clocks = {name: _Clock() for name in cameras.names}
-        self._history: deque[Snapshot] = deque()
-        self._fast: deque[tuple[int, OffsetInformation]] = deque()
-        self._drifts = DriftMonitor()
-        self._lagged: deque[tuple[Snapshot, MatchedObservations]] = deque()
+        self._comparison = ClockComparison(cameras, markers, single)
         self._now_ns = self._undecided_ns = self._reported_ns = 0
-        self._compared_ns = self._lagged_ns = self._checked_ns = 0
         self._undecided_s = 0.0
 
     @property
@@ -149,32 +135,25 @@ class CameraClocks:
         return frame
 
     def observe(
-        self,
-        t_ns: int,
-        robots: tuple[States, Mask],
-        detections: DetectionTable,
-        assignments: Assignments,
-        is_doubtful: bool = False,
+        self, now: Snapshot, detections: DetectionTable, assignments: Assignments, is_doubtful: bool = False
     ) -> None:
         """Compare the cameras in a frame set.
 
         Args:
-            t_ns: time of the frame set.
-            robots: their states after the update, and (R,) those with status `tracked`.
+            now: the robots after the update.
             detections: of the frame set.
             assignments: of the detections.
             is_doubtful: a camera contradicts the others, so that states may be wrong: nothing is compared.
         """
-        self._now_ns, (states, tracked) = t_ns, robots
-        self._history.append(Snapshot(t_ns, states, tracked))
-        while self._history[0].t_ns < t_ns - (RANGE_S + 0.5) * 1e9:
-            self._history.popleft()
+        self._now_ns = now.t_ns
+        self._comparison.observe(now)
         if is_doubtful:
-            self._fast.clear()
-            self._lagged.clear()
-        elif t_ns >= self._compared_ns + COMPARED_NS:
-            self._compare(states, tracked, detections, assignments)
-        self._find_drifts()
+            self._comparison.forget_latest()
+        elif (found := self._comparison.jump(detections, assignments)) is not None:
+            self._exclude_contradicted(found)
+        departing = {k for k, clock in enumerate(self._clocks.values()) if self._departs(clock)}
+        for drift in self._comparison.drifts(departing):
+            self._correct_drift(drift)
         for name in self.excluded:
             self._search(name)
 
@@ -194,7 +173,7 @@ class CameraClocks:
     def reset(self, name: str) -> None:
         """Forget the clock of a camera that has another calibration."""
         self._clocks[name] = _Clock()
-        self._forget()
+        self._comparison.forget()
 
     def _is_undecided(self) -> bool:
         """Whether cameras contradicted each other lately and no majority decided."""
@@ -204,44 +183,8 @@ class CameraClocks:
         """The standard deviation of all stamps, as long as it is not known which of them are wrong."""
         return self._undecided_s if self._is_undecided() else 0.0
 
-    # Evidence.
-
-    def _compare(
-        self, states: States, tracked: Mask, detections: DetectionTable, assignments: Assignments
-    ) -> None:
-        """Compare the cameras by the robots that move."""
-        self._compared_ns = self._now_ns
-        moving = np.linalg.norm(states.v, axis=1) > MIN_SPEED_M_S
-        chosen = self._choose(states, tracked & moving, detections, assignments)
-        if not len(chosen):
-            return
-        observations = MatchedObservations.of(chosen, detections, self._markers)
-        self._find_jumps(offset_information(self._cameras, states, observations, self._single, JUMP_SIGMA_V))
-        if self._now_ns >= self._lagged_ns + LAGGED_NS:
-            self._lagged_ns = self._now_ns
-            self._lagged.append((Snapshot(self._now_ns, states, tracked), observations))
-
-    def _choose(
-        self, states: States, robots: Mask, detections: DetectionTable, assignments: Assignments
-    ) -> Assignments:
-        """Observations of the fastest of these robots, `MAX_MARKERS` at most."""
-        robot = self._markers.robot[assignments.marker]
-        count = np.bincount(robot, minlength=len(robots))
-        order = np.argsort(-np.linalg.norm(states.v, axis=1) * robots)
-        fits = robots[order] & (np.cumsum(count[order]) <= max(MAX_MARKERS, count[order][:1].sum()))
-        return assignments.select(np.isin(robot, order[fits]))
-
-    def _find_jumps(self, info: OffsetInformation) -> None:
-        """Exclude the cameras that the last frame sets contradict."""
-        self._fast.append((self._now_ns, info))
-        while self._fast[0][0] < self._now_ns - FAST_NS:
-            self._fast.popleft()
-        total = OffsetInformation.none(len(self._cameras.names))
-        for _, part in self._fast:
-            total = total.plus(part)
-        found = disagreement(total, JUMP_PX)
-        if found is None:
-            return
+    def _exclude_contradicted(self, found: Disagreement) -> None:
+        """Exclude the cameras that the last frame sets contradict, if it is clear which ones these are."""
         if not found.cameras:
             self._report_undecided(found.spread_s)
             return
@@ -249,32 +192,16 @@ class CameraClocks:
             clock = self._clocks[self._cameras.names[k]]
             if clock.state != "excluded" and self._now_ns > clock.trusted_ns:
                 self._exclude(clock, self._now_ns, FAST_NS)
-        self._fast.clear()
-
-    def _find_drifts(self) -> None:
-        """Correct the cameras that depart slowly from the others."""
-        while self._lagged and self._now_ns >= self._lagged[0][0].t_ns + HALF_NS:
-            snapshot, observations = self._lagged.popleft()
-            states, known = with_mean_velocities(snapshot, self._history)
-            observations = observations.select(known[observations.discs.body])
-            info = offset_information(self._cameras, states, observations, self._single, DRIFT_SIGMA_V)
-            self._drifts.add(snapshot.t_ns, info)
-        if self._now_ns >= self._checked_ns + CHECKED_NS:
-            self._checked_ns = self._now_ns
-            departing = {k for k, clock in enumerate(self._clocks.values()) if self._departs(clock)}
-            for drift in self._drifts.changes(departing) or self._drifts.offsets():
-                self._correct_drift(drift)
+        self._comparison.forget_jumps()
 
     def _departs(self, clock: _Clock) -> bool:
         """Whether a clock departed slowly from the others just now."""
         return bool(clock.departed_ns) and self._now_ns < clock.departed_ns + FOLLOWED_NS
 
-    # Changes.
-
     def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
         """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
         clock.state, clock.since_ns, clock.has_jumped = "excluded", now_ns, False
-        self._forget_since(now_ns - FAST_NS)
+        self._comparison.forget_since(now_ns - FAST_NS)
         while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
             clock.frames.popleft()
         if not back_ns:
@@ -282,7 +209,9 @@ class CameraClocks:
         clock.searched_ns = now_ns
 
     def _shift(self, name: str, clock: _Clock) -> TimeShift | None:
-        return find_time_shift(self._cameras, name, tuple(clock.frames), tuple(self._history), self._markers)
+        return find_time_shift(
+            self._cameras, name, tuple(clock.frames), tuple(self._comparison.history), self._markers
+        )
 
     def _search(self, name: str) -> None:
         """Find the time of an excluded camera's frames, and use it again if this is known."""
@@ -310,13 +239,13 @@ class CameraClocks:
         """Use a camera again whose clock is not at fault."""
         clock.state = "corrected" if clock.correction_ns else "correct"
         clock.trusted_ns = self._now_ns + PAUSE_NS
-        self._forget_since(clock.since_ns)
+        self._comparison.forget_since(clock.since_ns)
 
     def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
         clock = self._clocks[name]
         clock.correction_ns += round(offset_s * 1e9)
         clock.state, clock.sigma_s, clock.reported_ns = "corrected", sigma_s, clock.correction_ns
-        self._forget_since(clock.since_ns)
+        self._comparison.forget_since(clock.since_ns)
         clock.frames.clear()
         at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
         message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
@@ -333,9 +262,7 @@ class CameraClocks:
             return
         clock.correction_ns += round(change_s * 1e9)
         clock.state, clock.sigma_s, clock.departed_ns = "corrected", drift.sigma_s, self._now_ns
-        self._drifts.correct(drift)
-        self._fast.clear()
-        self._lagged.clear()
+        self._comparison.correct(drift)
         if abs(clock.correction_ns - clock.reported_ns) < REPORTED_NS + abs(clock.reported_ns):
             return
         clock.reported_ns = clock.correction_ns
@@ -345,19 +272,7 @@ class CameraClocks:
 
     def rebase(self) -> None:
         """A camera has another pose: its calibration errors, which bias offsets, are others."""
-        self._forget()
-
-    def _forget(self) -> None:
-        """Drop all information about offsets."""
-        self._fast.clear()
-        self._lagged.clear()
-        self._drifts.forget()
-
-    def _forget_since(self, t_ns: int) -> None:
-        """Drop the information of frames with an earlier correction, or of excluded cameras."""
-        self._fast.clear()
-        self._lagged.clear()
-        self._drifts.forget_since(t_ns)
+        self._comparison.forget()
 
     def _report_undecided(self, spread_s: float) -> None:
         self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)

@@ -1,23 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finds constellations whose markers are not at their declared positions: lost, glued elsewhere, or mismeasured.
+"""Finds robots that are not as declared.
 
-The residuals of such a robot are large in every frame set, also where the cameras agree about all other robots.
+Markers that are not at their declared positions (lost, glued elsewhere, or mismeasured) cause large residuals in every
+frame set and for every camera that sees them. What only one camera shows is a fault of that camera: of its pose, its
+clock, or roundels that are not there. Discs of another diameter look larger or smaller than they are at the range that
+several cameras triangulate.
 """
 
 import logging
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.arrays import Array, Index, Mask
+from camera_node.detection.disc_pose import decompose
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import DetectionTable
 
 MISFIT_PX = 1.0  # RMS residual; a good calibration has 0.1 to 0.5
 MAX_PX = 3.0  # larger residuals count as this: a few frame sets with a wrong clock blame no robot
 MEMORY = 60  # frame sets of the running mean
+MIN_CAMERAS = 2  # that show the residual
+SAMPLE = 16  # detections of a frame set whose size is measured: a millisecond for any number of robots
+MIN_MEASURED = 100  # detections of a robot
+MAX_SIZE_ERROR = 0.05  # of a declared diameter; thresholds and blur change apparent sizes by 1 to 3 %
+MAX_LOG_RATIO = 0.3  # larger ratios count as this: a partly covered disc decides nothing
 log = logging.getLogger("fusion")
 
 
 class GeometryCheck:
-    """Running mean squared residual of each robot.
+    """Running mean of the squared residual that at least `MIN_CAMERAS` cameras show, for each robot.
 
     Args:
         names: of the robots.
@@ -29,13 +40,17 @@ class GeometryCheck:
         self._mean_px2, self._count = np.zeros(len(names)), np.zeros(len(names), int)
         self._reported: set[str] = set()
 
-    def note(self, residual_px: Array) -> None:
-        """Add the RMS residuals (N,) of a frame set, pixels; NaN for robots without observations."""
-        seen = np.isfinite(residual_px) & ~self._single
+    def note(self, mean_px2: Array) -> None:
+        """Add the mean squared residuals (N, C) of a frame set by robot and camera, px^2; NaN where not observed."""
+        known = np.isfinite(mean_px2)
+        seen = (known.sum(1) >= MIN_CAMERAS) & ~self._single
+        if not seen.any():
+            return
+        largest_first = -np.sort(-np.where(known[seen], mean_px2[seen], -np.inf), axis=1)
+        shown_px2 = np.minimum(largest_first[:, MIN_CAMERAS - 1], MAX_PX**2)
         self._count[seen] += 1
         share = 1 / np.minimum(self._count[seen], MEMORY)
-        squared_px2 = np.minimum(residual_px[seen], MAX_PX) ** 2
-        self._mean_px2[seen] += share * (squared_px2 - self._mean_px2[seen])
+        self._mean_px2[seen] += share * (shown_px2 - self._mean_px2[seen])
 
     def misfits(self) -> dict[str, float]:
         """RMS residuals, pixels, of the robots above `MISFIT_PX`; logs each robot when it first appears."""
@@ -47,6 +62,58 @@ class GeometryCheck:
                 "fasten a loose marker, or measure the robot again",
                 name,
                 found[name],
+            )
+        self._reported = set(found)
+        return found
+
+
+class SizeCheck:
+    """Running mean of the apparent diameter of each robot's discs, in declared diameters.
+
+    Args:
+        names, diameters: (N,) of the robots, metres.
+    """
+
+    def __init__(self, names: tuple[str, ...], diameters: Array) -> None:
+        self._names, self._diameters = names, diameters
+        self._mean_log, self._count = np.zeros(len(names)), np.zeros(len(names), int)
+        self._turn = 0
+        self._reported: set[str] = set()
+
+    def sample(self, n: int) -> Index:
+        """The rows, of n detections, to measure in this frame set; others in the next one."""
+        self._turn += 1
+        step = -(-n // SAMPLE)
+        return np.arange(self._turn % step, n, step) if n else np.arange(0)
+
+    def note(self, cameras: CameraArray, detections: DetectionTable, robot: Index, position: Array) -> None:
+        """Measure the discs of detections (N,) of robots (N,), whose centres are at positions (N, 3), world."""
+        known = np.flatnonzero(np.isfinite(detections.axes_px[1]) & np.isfinite(detections.xy[0]))
+        if not len(known):
+            return
+        seen, robot = detections.select(known), robot[known]
+        unit_m = np.linalg.norm(decompose(seen.conics(), 1.0)[0], axis=2).mean(
+            1
+        )  # range of a disc of radius 1
+        range_m = np.linalg.norm(position[known] - cameras.centres[seen.camera], axis=1)
+        log_ratio = np.log(2 * range_m / unit_m / self._diameters[robot])
+        for k, value in zip(robot.tolist(), log_ratio.tolist(), strict=True):
+            if np.isfinite(value):
+                self._count[k] += 1
+                bounded = min(max(value, -MAX_LOG_RATIO), MAX_LOG_RATIO)
+                self._mean_log[k] += (bounded - self._mean_log[k]) / min(self._count[k], MIN_MEASURED)
+
+    def misfits(self) -> dict[str, float]:
+        """Measured diameters, metres, of robots with another declared one; logs each robot when it first appears."""
+        ratio = np.exp(self._mean_log)
+        rows = np.flatnonzero((self._count >= MIN_MEASURED) & (np.abs(ratio - 1) > MAX_SIZE_ERROR))
+        found = {self._names[k]: float(ratio[k] * self._diameters[k]) for k in rows}
+        for name in found.keys() - self._reported:
+            log.warning(
+                "robot %s: its discs measure %.1f mm, other than diameter_m in robots.yaml; correct that, or, if all "
+                "robots differ, the lengths in wand.yaml",
+                name,
+                1e3 * found[name],
             )
         self._reported = set(found)
         return found

@@ -46,16 +46,16 @@ class ResidualMonitor:
         self._usual_px += (median_px - self._usual_px) / min(self._learned, LEARNED)
 
 
-def camera_at_fault(cost: float, without: dict[str, float]) -> str | None:
+def camera_at_fault(cost: float, without: dict[int, float]) -> int | None:
     """The camera without which the cost of a frame set falls, far below that without any other; None without one.
 
     Args:
         cost: with all cameras, as by `cost_of`.
-        without: the cost without each camera, by name.
+        without: the cost without each camera, by its index.
     """
     if len(without) < 2:
         return None
-    best, second = sorted(without, key=lambda name: without[name])[:2]
+    best, second = sorted(without, key=lambda k: without[k])[:2]
     return best if without[best] < min(cost, without[second]) / MIN_RATIO else None
 
 

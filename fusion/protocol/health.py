@@ -61,6 +61,10 @@ def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> Arena
         f"robot {name}: its markers are not where robots.yaml has them ({residual:.1f} px)"
         for name, residual in status.geometry_residuals_px.items()
     ]
+    problems += [
+        f"robot {name}: its discs measure {1e3 * diameter_m:.0f} mm, not as declared"
+        for name, diameter_m in status.measured_diameters_m.items()
+    ]
     problems += calibration_problems(calibration)
     return ArenaHealth(
         cameras={name: False for name in placed} | {name: c.fps > 0 for name, c in status.cameras.items()},

@@ -2,6 +2,7 @@
 """The server's messages over Zenoh, in the encoding of `camera_node.protocol.messages`."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -72,6 +73,29 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
         return np.frombuffer(self.covariance, "<f4").reshape(12, 12).astype(float)
 
 
+class RobotPoses(msgspec.Struct, frozen=True, kw_only=True):
+    """The poses that the server publishes at the same moment, of many robots.
+
+    A reader of all robots decodes this one message in place of each robot's. The robots that were tracked before come
+    first; those that were acquired or are lost follow in another message of the same frame set.
+    """
+
+    version: int = VERSION
+    poses: tuple[RobotPose, ...]
+
+    @staticmethod
+    def join(encoded: Sequence[bytes]) -> bytes:
+        """The message of poses that are encoded already."""
+        return msgspec.msgpack.encode({"version": VERSION, "poses": [msgspec.Raw(pose) for pose in encoded]})
+
+    def check(self) -> None:
+        """Raise MessageError unless each pose is valid, and none has another version."""
+        for pose in self.poses:
+            if pose.version != VERSION:
+                raise MessageError(f"a pose of version {pose.version}; this program supports {VERSION}")
+            pose.check()
+
+
 class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
     """The poses of all robots of one shard at `t_ns`, so that other shards do not use the detections of these robots.
 
@@ -111,7 +135,8 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
 
     Columns, one row a marker: `position` (M, 3) <f8 m, world; `covariance` (M, 9) <f4 m^2, row by row; `normal`
     (M, 3) <f4 unit vector out of the printed side and `velocity` (M, 3) <f4 m/s, NaN where unknown; `candidates` (M, 6)
-    <f4 the two equally probable normals of a marker that one camera sees, NaN for other markers; `robot` (M,) <i4
+    <f4 the two equally probable normals of a marker that one camera sees, NaN for other markers; `diameter` (M,) <f4 m
+    of the disc of an unlabeled marker as two or more cameras see it, NaN for other markers; `robot` (M,) <i4
     index into `robots`, -1 for an unlabeled marker; `marker` (M,) <i4 index in that robot, or -1; `cameras` (M,) <u8
     bit k set if `camera_names[k]` saw it.
     """
@@ -125,6 +150,7 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
     normal: bytes
     velocity: bytes = b""  # empty if the server does not publish it
     candidates: bytes = b""  # empty if the server does not publish it
+    diameter: bytes = b""  # empty if the server does not publish it
     robot: bytes
     marker: bytes
     cameras: bytes
@@ -139,7 +165,7 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         for name, size in sizes.items():
             if len(getattr(self, name)) != n * size:
                 raise MessageError(f"column {name} has {len(getattr(self, name))} bytes for {n} markers")
-        for name, size in {"velocity": 12, "candidates": 24}.items():
+        for name, size in {"velocity": 12, "candidates": 24, "diameter": 4}.items():
             if len(getattr(self, name)) not in (0, size * n):
                 raise MessageError(f"column {name} has {len(getattr(self, name))} bytes for {n} markers")
         if not (np.abs(self.positions()) <= MAX_NUMBER).all():  # False for NaN
@@ -164,6 +190,11 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M, 2, 3) the equally probable normals of markers that one camera sees; NaN for other markers."""
         candidates = np.frombuffer(self.candidates, "<f4").reshape(-1, 2, 3)
         return candidates if self.candidates else np.full((len(self), 2, 3), np.nan, np.float32)
+
+    def diameters(self) -> NDArray[np.float32]:
+        """(M,) diameters of the discs of unlabeled markers as they appear, metres; NaN where unknown."""
+        diameters = np.frombuffer(self.diameter, "<f4")
+        return diameters if self.diameter else np.full(len(self), np.nan, np.float32)
 
     def robot_index(self) -> NDArray[np.int32]:
         """(M,) index into `robots`, -1 for unlabeled markers."""
@@ -251,6 +282,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     faults: dict[str, int]
     limits: Limits | None = None  # with which the server tracks, for a replay
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
+    measured_diameters_m: dict[str, float] = {}  # of the discs of robots that declare another diameter
     not_acquired: dict[str, str] = {}  # why, by robot
     unsaved_robots: tuple[str, ...] = ()  # names whose changes a restart would undo
     rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one

@@ -75,7 +75,7 @@ class TrackingPipeline:
         old = self.tracker
         self._start(self.cameras)
         if old is not None and self.tracker is not None:
-            self.tracker.clocks.inherit(old.clocks)
+            self.tracker.monitors.clocks.inherit(old.monitors.clocks)
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
@@ -83,7 +83,7 @@ class TrackingPipeline:
         Raises:
             FusionError, ConfigError, CalibrationError: it can't be used or saved; the old one stays in force.
         """
-        self._use(rig, lambda: self.active_rig.save(rig))
+        self._use(rig, lambda: self.active_rig.save(rig, now_ns, source))
         self.active_rig.use(rig, now_ns, source)
 
     def undo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
@@ -210,19 +210,19 @@ class TrackingPipeline:
 
     def clocks(self) -> dict[str, ClockHealth]:
         """The clocks of the cameras."""
-        return self.tracker.clocks.health() if self.tracker else {}
+        return self.tracker.monitors.clocks.health() if self.tracker else {}
 
     def withheld_cameras(self) -> set[str]:
         """Cameras whose frames are not used: their clocks are unknown, or their images frozen."""
-        return self.tracker.withheld if self.tracker else set()
+        return self.tracker.monitors.withheld if self.tracker else set()
 
     def excluded_cameras(self) -> set[str]:
         """Cameras that were moved, whose detections are excluded."""
-        return set(self.tracker.extrinsics.excluded) if self.tracker else set()
+        return set(self.tracker.monitors.extrinsics.excluded) if self.tracker else set()
 
     def frozen_cameras(self) -> set[str]:
         """Cameras that repeat an old image."""
-        return self.tracker.frozen.names if self.tracker else set()
+        return self.tracker.monitors.frozen.names if self.tracker else set()
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""
@@ -231,3 +231,7 @@ class TrackingPipeline:
     def geometry_residuals_px(self) -> dict[str, float]:
         """RMS residuals of the robots whose markers are not at the declared places."""
         return self.tracker.geometry.misfits() if self.tracker else {}
+
+    def measured_diameters_m(self) -> dict[str, float]:
+        """Measured diameters of the discs of robots that declare another one."""
+        return self.tracker.sizes.misfits() if self.tracker else {}

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import msgspec
 
 from calib.rig.messages import RigMessage
-from camera_node.protocol.messages import Keys
+from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.registration import CameraAssignment, assigned_key
 from fusion.model.frames import FrameSet
 from fusion.protocol.messages import (
@@ -15,6 +15,7 @@ from fusion.protocol.messages import (
     Latency,
     Markers,
     RobotPose,
+    RobotPoses,
     ShardPoses,
     frames_key,
     shard_key,
@@ -38,11 +39,12 @@ class ArenaPublisher:
         self._status_key = keys.fusion_status + ("" if shard.leads else f"/{shard.index}")
 
     def publish_poses(self, poses: Iterable[RobotPose], latency: Latency | None) -> None:
-        """Publish poses, each with the latency of its frame set."""
-        for pose in poses:
-            self._transport.publish(
-                self._keys.robot_pose(pose.robot), msgspec.structs.replace(pose, latency=latency)
-            )
+        """Publish poses, each with the latency of its frame set: all in one message, and each on its robot's key."""
+        encoded = {pose.robot: encode(msgspec.structs.replace(pose, latency=latency)) for pose in poses}
+        if encoded:
+            self._transport.put(self._keys.poses, RobotPoses.join(tuple(encoded.values())))
+        for robot, data in encoded.items():
+            self._transport.put(self._keys.robot_pose(robot), data)
 
     def publish_shard(self, poses: ShardPoses) -> None:
         """Publish this shard's robots for the other shards."""

@@ -12,6 +12,7 @@ from calib.rig.messages import (
     RigRequest,
     RigStepRequest,
     redo_rig_key,
+    rig_history_key,
     set_rig_key,
     undo_rig_key,
 )
@@ -68,9 +69,10 @@ class RequestHandlers:
             transport.answer(self._keys.clock, partial(self._answer_clock, self._clock))
 
     def declare_rig(self, transport: Transport, audit: AuditLog) -> None:
-        """Answer queries for the rig, and audited ones for changes of it."""
+        """Answer queries for the rig and its history, and audited ones for changes of it."""
         arena = self._keys.arena
         transport.answer(self._keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
+        transport.answer_on_server_thread(rig_history_key(arena), self._answer_history)
         for key, change, answer in (
             (set_rig_key(arena), "change of the rig", self._set_rig),
             (undo_rig_key(arena), "undo of the rig", self._undo_rig),
@@ -84,6 +86,9 @@ class RequestHandlers:
     def _answer_rig(self, query: zenoh.Query) -> None:
         if (message := self._pipeline.active_rig.message) is not None:
             query.reply(self._keys.rig, encode(message))
+
+    def _answer_history(self, query: zenoh.Query) -> bytes:
+        return encode_reply(payload_of(query), self._pipeline.active_rig.history())
 
     def _set_rig(self, query: zenoh.Query) -> bytes:
         request = parse_request(payload_of(query), RigRequest)

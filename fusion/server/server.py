@@ -215,6 +215,7 @@ class Server:
             clocks=self.pipeline.clocks(),
             rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
             geometry_residuals_px=self.pipeline.geometry_residuals_px(),
+            measured_diameters_m=self.pipeline.measured_diameters_m(),
             not_acquired=self.pipeline.not_acquired(),
             unsaved_robots=self.pipeline.unsaved_robots(),
         )

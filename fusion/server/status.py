@@ -34,6 +34,7 @@ class PipelineStatus:
         frozen: cameras that repeat an old image.
         clocks: of the cameras, by name.
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
+        measured_diameters_m: of the discs of robots that declare another diameter.
         not_acquired: why robots were not acquired, by name.
         unsaved_robots: names of the robots whose changes a restart would undo.
         rig_t_ns: since when the active rig is in force.
@@ -45,6 +46,7 @@ class PipelineStatus:
     frozen: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
+    measured_diameters_m: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
     unsaved_robots: tuple[str, ...] = ()
     rig_t_ns: int | None = None
@@ -177,6 +179,7 @@ class ServerStatistics:
             faults=faults,
             limits=pipeline.limits,
             geometry_residuals_px=pipeline.geometry_residuals_px,
+            measured_diameters_m=pipeline.measured_diameters_m,
             not_acquired=pipeline.not_acquired,
             unsaved_robots=pipeline.unsaved_robots,
             rig_t_ns=pipeline.rig_t_ns,

@@ -200,9 +200,13 @@ class Transport:
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Put a message on a key."""
+        self.put(key, encode(message))
+
+    def put(self, key: str, data: bytes) -> None:
+        """Put an encoded message on a key."""
         if key not in self._publishers:
             self._publishers[key] = self.session.declare_publisher(key)
-        self._publishers[key].put(encode(message))
+        self._publishers[key].put(data)
 
     def undeclare(self, key: str) -> None:
         """Undeclare the publisher of a key that is no longer used."""

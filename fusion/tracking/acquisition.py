@@ -5,44 +5,41 @@ Constellations are identified by the distances between their markers and by thei
 single marker, by size and reach. A marker that fits two robots equally well stays unlabeled.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from camera_node.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
+from fusion.model.observations import Assignments, DetectionTable
+from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
     ANY_DIAMETERS,
+    DIAMETER_TOLERANCE,
     MAX_CHI2,
-    POSITION_GATE,
-    START_S,
-    START_SIGMAS,
-    START_SIGMAS_SINGLE,
     mean_by_body,
-    misfit,
 )
-from fusion.tracking.identity.constellation import MIN_MARKERS, Fits, TriangulatedMarkers, search
+from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
     Histories,
     MarkerChoice,
     choose_markers,
-    history_chi2,
-    is_local,
 )
+from fusion.tracking.identity.trial_updates import Starts, refine
 from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
-SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
-FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
 MAX_PAIRS = 200_000
+# The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
+# defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
+MAX_OTHER_PAIRS = 20_000
 CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
 MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
@@ -69,16 +66,6 @@ class Acquired:
     markers: list[Marker]
     reasons: dict[int, str]
     crowded: Index
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Starts:
-    """K robots (rows) at rest, the assignments that support them, and the start of each assignment."""
-
-    robot: Index
-    states: States
-    assignments: Assignments
-    body: Index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +177,7 @@ class Acquisition:
         question = Question(robots, scene, search(robots, scene))
         identified = identify(
             question,
-            lambda fits: self._refine(table, _starts_of(fits, markers, table), detections),
+            lambda fits: self._refine(table, Starts.of(fits, markers, table.markers), detections),
             _usual_misfit(table, detections, assignments),
             turn,
         )
@@ -211,11 +198,8 @@ class Acquisition:
             start_rotation(self._cameras, detections, marker, table.robots[robot].diameter_m / 2)[0]
             for robot, marker in pairs
         ]
-        p = np.array([marker.position for _, marker in pairs]).reshape(-1, 3)
-        states = States.at_rest(np.array(R).reshape(-1, 3, 3), p, START_SIGMAS_SINGLE)
-        robot = np.array([robot for robot, _ in pairs], np.intp)
-        assignments, body = _assigned([marker for _, marker in pairs], table.markers.first[robot])
-        refined = self._refine(table, _Starts(robot, states, assignments, body), detections)
+        starts = Starts.of_singles([robot for robot, _ in pairs], [m for _, m in pairs], R, table.markers)
+        refined = self._refine(table, starts, detections)
         return refined.select(refined.misfit < MAX_CHI2)
 
     def _find_markers(
@@ -235,7 +219,30 @@ class Acquisition:
         limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
         portion = Portion(limit, self._frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
-        return find_markers(self._cameras, detections, rows, diameters), crowded
+        markers = find_markers(self._cameras, detections, rows, diameters)
+        if self._leads and len(table.names):
+            markers += self._find_other_sizes(detections, rows, markers, diameters)
+        return markers, crowded
+
+    def _find_other_sizes(
+        self, detections: DetectionTable, rows: Index, markers: list[Marker], diameters: Array
+    ) -> list[Marker]:
+        """Triangulate markers that no robot declares: a new robot may have another diameter.
+
+        Args:
+            detections: of a frame set.
+            rows: that were searched.
+            markers: that were found, of the declared `diameters`.
+        """
+        rest = np.setdiff1d(rows, np.concatenate([rows[:0], *(marker.detections for marker in markers)]))
+        rest = rest[np.isfinite(detections.axes_px[0, rest])]
+        count = np.bincount(detections.frame[rest])
+        if not 0 < (count.sum() ** 2 - (count**2).sum()) // 2 <= MAX_OTHER_PAIRS:
+            return []
+        others = find_markers(self._cameras, detections, rest, np.array(ANY_DIAMETERS))
+        size = np.array([marker.diameter_m for marker in others])
+        is_other = np.all(np.abs(size[:, None] / diameters - 1) > DIAMETER_TOLERANCE, axis=1)
+        return [others[k] for k in np.flatnonzero(is_other)]
 
     def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
         """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""
@@ -249,44 +256,8 @@ class Acquisition:
             for fits in weak
         ]
 
-    def _refine(self, table: TrackTable, starts: _Starts, detections: DetectionTable) -> RefinedFits:
-        """Update each start independently with its detections."""
-        n, body = len(starts.robot), starts.body
-        observations = MatchedObservations.of(starts.assignments, detections, table.markers)
-        observations = replace(observations, discs=replace(observations.discs, body=body))
-        estimator = self._estimator.select(starts.robot)
-        prediction = estimator.predict(starts.states, np.full(n, START_S))
-        states, residuals = estimator.update(prediction, observations, SMALL)
-        d2 = misfit(observations, residuals)
-        rows = starts.robot.tolist()
-        history = np.array(
-            [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
-        )
-        is_expected = (history < POSITION_GATE) & np.array([is_local(table, k) for k in rows], bool)
-        return RefinedFits(
-            starts.robot,
-            states,
-            np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
-            mean_by_body(d2, body, n),
-            is_expected,
-            starts.assignments.with_residuals(residuals),
-            body,
-        )
-
-
-def _starts_of(fits: Fits, markers: list[Marker], table: TrackTable) -> _Starts:
-    mappings = fits.mappings
-    rows = table.markers.first[mappings.robot][:, None] + mappings.numbers
-    assignments, of = _assigned([markers[p] for p in mappings.points.ravel().tolist()], rows.ravel())
-    body = np.repeat(np.arange(len(fits)), mappings.points.shape[1])[of]
-    return _Starts(mappings.robot, States.at_rest(fits.R, fits.t, START_SIGMAS), assignments, body)
-
-
-def _assigned(markers: list[Marker], rows: Index) -> tuple[Assignments, Index]:
-    """The detections of triangulated markers, assigned to `rows` of the marker table; and the marker of each."""
-    detections = [np.empty(0, np.intp), *(marker.detections for marker in markers)]
-    of = np.repeat(np.arange(len(markers)), [len(marker.detections) for marker in markers])
-    return Assignments.of(np.concatenate(detections), rows[of]), of
+    def _refine(self, table: TrackTable, starts: Starts, detections: DetectionTable) -> RefinedFits:
+        return refine(self._estimator, table, starts, detections)
 
 
 def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
@@ -306,6 +277,15 @@ def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:
     return [marker for marker in markers if taken.isdisjoint(marker.detections.tolist())]
 
 
+def _too_few(robot: Robot, scene: TriangulatedMarkers) -> str:
+    """Why a constellation has too few markers: they are not seen, or there are as many of another size."""
+    others = scene.diameter_m[~scene.with_diameter(robot.diameter_m)]
+    if len(others) < MIN_MARKERS:
+        return f"fewer than {MIN_MARKERS} of its {len(robot.markers)} markers are seen by two cameras"
+    declared_mm, seen_mm = 1e3 * robot.diameter_m, 1e3 * float(np.median(others))
+    return f"declared with discs of {declared_mm:.0f} mm, but unlabeled ones measure {seen_mm:.0f} mm"
+
+
 def _reason(table: TrackTable, k: int, question: Question, identified: Identified) -> str:
     """Why constellation k was not acquired."""
     n, found = len(table.robots[k].markers), question.candidates
@@ -317,5 +297,5 @@ def _reason(table: TrackTable, k: int, question: Question, identified: Identifie
         rival = identified.rivals[k]
         return "its markers fit in several places" if rival == k else f"ambiguous with {table.names[rival]}"
     if k not in found.tables or not len(found.tables[k]):
-        return f"fewer than {MIN_MARKERS} of its {n} markers are seen by two cameras"
+        return _too_few(table.robots[k], question.scene)
     return f"no {MIN_MARKERS} of its {n} markers fit well anywhere"

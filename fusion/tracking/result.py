@@ -41,12 +41,14 @@ class ObservationSummary:
         robot_cameras: (R, C) robots and cameras.
         marker_cameras: (K, C) rows of the marker table and cameras.
         n_markers: (R,) observed markers.
-        residual_px: (R,) RMS; NaN without observations.
+        mean_px2: (R, C) mean squared residual by robot and camera; NaN without observations.
+        residual_px: (R,) RMS over all cameras; NaN without observations.
     """
 
     robot_cameras: Mask
     marker_cameras: Mask
     n_markers: Index
+    mean_px2: Array
     residual_px: Array
 
     @classmethod
@@ -61,13 +63,19 @@ class ObservationSummary:
         """Summarize the assignments of a frame set."""
         n_cameras = len(cameras.names)
         robot, camera = marker_table.robot[assignments.marker], detections.camera[assignments.detection]
-        robot_cameras = np.zeros((n_robots, n_cameras), bool)
         marker_cameras = np.zeros((len(marker_table), n_cameras), bool)
-        robot_cameras[robot, camera] = marker_cameras[assignments.marker, camera] = True
-        count = np.bincount(robot, minlength=n_robots)
-        mean = np.bincount(robot, assignments.squared_px, n_robots) / np.where(count, count, np.nan)
+        marker_cameras[assignments.marker, camera] = True
+        view, shape = robot * n_cameras + camera, (n_robots, n_cameras)
+        count = np.bincount(view, minlength=n_robots * n_cameras).reshape(shape)
+        squared_px2 = np.bincount(view, assignments.squared_px, n_robots * n_cameras).reshape(shape)
+        mean_px2, mean = _ratio(squared_px2, count), _ratio(squared_px2.sum(1), count.sum(1))
         n_markers = np.bincount(marker_table.robot[marker_cameras.any(1)], minlength=n_robots)
-        return cls(robot_cameras, marker_cameras, n_markers, np.sqrt(mean))
+        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean))
+
+
+def _ratio(sums: NDArray, count: Index) -> Array:
+    """Means; NaN without a summand."""
+    return sums / np.where(count, count, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,8 +189,11 @@ def markers_message(
         camera_names=cameras.names,
         position=_column("<f8", states.p[owner] + arm, unlabeled.position),
         covariance=_column("<f4", covariance, unlabeled.covariance),
-        normal=_column("<f4", states.R[owner][:, :, 2], unlabeled.normal),
+        normal=_column("<f4", table.marker_normals(rows), unlabeled.normal),
         velocity=_column("<f4", states.v[owner] + by_rotation, unlabeled.velocity),
+        diameter=_column(
+            "<f4", np.full(len(rows), np.nan), np.array([m.diameter_m for m in unlabeled.markers])
+        ),
         robot=_column("<i4", owner, none),
         marker=_column("<i4", table.markers.number[rows], none),
         candidates=_column("<f4", no_candidates, unlabeled.candidates),

@@ -97,7 +97,7 @@ class SingleViewTracker:
     def _decompose(self, seen: DetectionTable) -> tuple[Array, Array, Array]:
         """Positions (N, 3), covariances (N, 3, 3) and both normals (N, 2, 3), world frame."""
         R = self._cameras.R_cam_world[seen.camera].transpose(0, 2, 1)
-        c, n = decompose(_conics(seen), 1.0)  # of a disc of radius 1
+        c, n = decompose(seen.conics(), 1.0)  # of a disc of radius 1
         positions = np.einsum("nij,nkj->nki", R, c)[:, None] * self._radii[:, None, None]
         positions = positions.reshape(len(seen), -1, 3)  # two for each radius, relative to the camera
         mean = positions.mean(1)
@@ -110,18 +110,6 @@ class SingleViewTracker:
         noise = along[:, None, None] * rays + across[:, None, None] * (np.eye(3) - rays)
         covariance = noise + np.einsum("nki,nkj->nij", off, off) / positions.shape[1]
         return self._cameras.centres[seen.camera] + mean, covariance, np.einsum("nij,nkj->nki", R, n)
-
-
-def _conics(seen: DetectionTable) -> Array:
-    """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); the lens is affine over an outline."""
-    c, s = np.cos(seen.angle_rad), np.sin(seen.angle_rad)
-    axes = np.array([[c, -s], [s, c]]) * seen.axes_px / 2  # half axes, pixels
-    half = np.linalg.solve(seen.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
-    dual = np.empty((len(seen), 3, 3))
-    m = np.column_stack([*seen.xy, np.ones(len(seen))])
-    dual[:] = m[:, :, None] * m[:, None]
-    dual[:, :2, :2] -= half @ half.transpose(0, 2, 1)
-    return -np.asarray(np.linalg.inv(dual), float)
 
 
 def _may_coincide(a: Array, cov_a: Array, b: Array, cov_b: Array) -> Mask:

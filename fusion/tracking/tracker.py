@@ -7,26 +7,23 @@ from functools import partial
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Index, Mask
+from camera_node.arrays import Index, Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
-from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
+from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.robots import Robot
-from fusion.model.states import States
-from fusion.monitoring.camera_clocks import CameraClocks
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
-from fusion.monitoring.frame_consistency import AssignedFrames, FrameConsistency
-from fusion.monitoring.frozen_images import FrozenImages
-from fusion.monitoring.geometry_check import GeometryCheck
-from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
+from fusion.monitoring.camera_monitors import CameraMonitors
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, TrackedScene
+from fusion.monitoring.frame_consistency import AssignedFrames
+from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.monitoring.time_search import Snapshot
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction
-from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
+from fusion.tracking.identity.own_detections import OwnDetections
 from fusion.tracking.multiview import Marker
 from fusion.tracking.result import (
     FilterStep,
@@ -36,12 +33,12 @@ from fusion.tracking.result import (
     markers_message,
     robot_poses,
 )
+from fusion.tracking.robust_update import RobustUpdate
 from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
 PAUSED = "no robot is acquired while the wand is recorded"
-CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,29 +80,6 @@ class Update:
     poses: dict[int, RobotPose]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """An update: the states, and the assignments that fit.
-
-    Attributes:
-        prediction: the robots before the update.
-        squared: (N,) squared residuals of the assignments in standard deviations.
-        n_rejected: observations of the robots that these contradict.
-    """
-
-    states: States
-    assignments: Assignments
-    prediction: Prediction
-    squared: Array
-    n_rejected: int
-
-    @property
-    def cost(self) -> float:
-        """See `cost_of`."""
-        corrections = self.states.minus(self.prediction.states)
-        return cost_of(self.squared, self.n_rejected, corrections, self.prediction.information)
-
-
 class Tracker:
     """Tracks robots; `track` shows the steps for one frame set.
 
@@ -136,31 +110,24 @@ class Tracker:
             -1, 2
         )  # without robots too
         self.estimator = Estimator(self.cameras, densities, self.table.single)
+        self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
+        self.robust = RobustUpdate(self.estimator, self.table.markers)
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
-        self.clocks = CameraClocks(self.cameras, self.table.markers, self.table.single)
-        self.frozen = FrozenImages(self.cameras, self.table.markers)
-        self.consistency = FrameConsistency(self.cameras, self.table.markers)
-        self.extrinsics = ExtrinsicsMonitor()
-        self.residuals = ResidualMonitor()
+        self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
+        diameters = np.array([robot.diameter_m for robot in robots.values()])
+        self.sizes = SizeCheck(self.table.names, diameters)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
 
-    @property
-    def withheld(self) -> set[str]:
-        """Cameras whose frames `admit` refuses: their clocks are unknown, or their images frozen."""
-        return self.clocks.excluded | self.frozen.names
-
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future."""
-        admitted = self.clocks.admit(frame)
-        if admitted is None:
-            return None
         t_ns, table = self.table.t_ns, self.table
-        now = None if t_ns is None else Snapshot(t_ns, table.states, table.tracked)
-        return None if self.frozen.is_frozen(admitted, now) else admitted
+        return self.monitors.admit(
+            frame, None if t_ns is None else Snapshot(t_ns, table.states, table.tracked)
+        )
 
     def track(self, frame_set: FrameSet) -> TrackingResult:
         """Track all robots and markers through a complete frame set."""
@@ -188,7 +155,7 @@ class Tracker:
 
     def associate(self, associated: AssociatedFrames, frame_set: FrameSet) -> AssociatedFrames:
         """Assign detections of the frames that are not associated yet to the markers of tracked robots."""
-        frames = self._admitted(frame_set).frames
+        frames = self.monitors.used(frame_set).frames
         return replace(associated, association=associated.association.extended(frames))
 
     def associate_early(
@@ -205,17 +172,18 @@ class Tracker:
             early: the last return value.
         """
         associated = self.predict(frame_set.t_ns, early)
-        pending = associated.association.pending(self._admitted(frame_set).frames)
+        pending = associated.association.pending(self.monitors.used(frame_set).frames)
         return self.associate(associated, frame_set) if len(pending) > n_missing > 0 else associated
 
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, all_assigned = self._collect(associated, self._admitted(frame_set))
-        assignments = self._update_states(associated.prediction, detections, all_assigned)
+        detections, all_assigned = self._collect(associated, self.monitors.used(frame_set))
+        assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
-        self.geometry.note(summary.residual_px)
+        self.geometry.note(summary.mean_px2)
+        self._check_sizes(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(
@@ -226,8 +194,8 @@ class Tracker:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         update, found = self._acquire(update)
         table = self.table
-        robots, is_doubtful = (table.states, table.tracked), bool(self._in_doubt(update.t_ns))
-        self.clocks.observe(update.t_ns, robots, update.detections, update.associated, is_doubtful)
+        now = Snapshot(update.t_ns, table.states, table.tracked)
+        self.monitors.observe(now, update.detections, update.associated)
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
@@ -237,24 +205,11 @@ class Tracker:
         """Compare the frames with the tracked robots; exclude moved cameras and apply recalibrated poses."""
         table, seen_by = self.table, result.summary.robot_cameras
         scene = TrackedScene(self.cameras, table.markers, table.states, table.tracked, seen_by)
-        corrections = self.extrinsics.check(frame_set, scene, self.shard.leads, self.clocks.suspects)
-        for correction in corrections:
-            if correction.camera is not None:
-                self.cameras.place(correction.name, correction.camera)
-                self.consistency.forget(correction.name)
-                self.clocks.rebase()
-        return corrections
-
-    def _in_doubt(self, t_ns: int) -> set[str]:
-        """Cameras that contradict the others, or whose poses are unknown."""
-        return self.consistency.in_doubt(t_ns) | self.extrinsics.excluded
+        return self.monitors.check_extrinsics(frame_set, scene, self.shard.leads)
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
-        if camera.time_offset_ms != self.cameras[name].time_offset_ms:
-            self.clocks.reset(name)
-        self.cameras.place(name, camera)
-        (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)
+        self.monitors.place(name, camera, pinned)
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots with the same cameras; robots with unchanged markers continue.
@@ -264,10 +219,8 @@ class Tracker:
             renamed: old name -> new name.
         """
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
-        other.clocks.inherit(self.clocks)
-        other.frozen.inherit(self.frozen)
-        other.consistency.inherit(self.consistency)
-        other.extrinsics, other.residuals = self.extrinsics, self.residuals
+        other.monitors.inherit(self.monitors)
+        other.robust.inherit(self.robust)
         other.acquires_none = self.acquires_none
         other.table.inherit(self.table, renamed)
         return other
@@ -286,11 +239,21 @@ class Tracker:
         detections, assignments = association.collect(frame_set)
         states, tracked = associated.prediction.states, associated.tracked
         given = AssignedFrames(frame_set.t_ns, states, tracked, detections, assignments)
-        wrong = set(self.consistency.contradicting(given).tolist())
+        wrong = set(self.monitors.consistency.contradicting(given).tolist())
         if not wrong:
             return detections, assignments
         frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
         return association.collect(FrameSet(frame_set.t_ns, frames))
+
+    def _check_sizes(self, detections: DetectionTable, assignments: Assignments) -> None:
+        """Compare some assigned detections with the declared diameters."""
+        rows = self.sizes.sample(len(assignments))
+        marker, seen = assignments.marker[rows], detections.select(assignments.detection[rows])
+        owner = self.table.markers.robot[marker]
+        arms = np.einsum(
+            "nij,jn->ni", self.table.states.R[owner], self.table.markers.position.take(marker, 1)
+        )
+        self.sizes.note(self.cameras, seen, owner, self.table.states.p[owner] + arms)
 
     def _is_current(self, association: Association, t_ns: int) -> bool:
         """Whether an association is of this frame set, and of the present robots and camera poses."""
@@ -299,13 +262,6 @@ class Tracker:
             and association.marker_table is self.table.markers
             and association.revision == self.cameras.revision
         )
-
-    def _admitted(self, frame_set: FrameSet) -> FrameSet:
-        """The frame set without the frames of excluded cameras."""
-        excluded = self.extrinsics.excluded
-        if not excluded:
-            return frame_set
-        return FrameSet(frame_set.t_ns, tuple(f for f in frame_set.frames if f.camera not in excluded))
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""
@@ -316,44 +272,19 @@ class Tracker:
         return ObservationSummary.of(self.cameras, table.markers, len(table.robots), detections, assignments)
 
     def _update_states(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
+        self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments
     ) -> Assignments:
         """Update the states of owned robots; returns the assignments that fit, with residuals."""
-        own = self.table.owned[self.table.markers.robot[assignments.marker]]
-        others, assignments = assignments.select(~own), assignments.select(own)
-        fitted = self._fit(prediction, detections, assignments)
-        if self.residuals.is_unusual(fitted.assignments.squared_px):
-            fitted = self._leave_one_out(prediction, detections, assignments, fitted)
+        prediction, tracked = associated.prediction, associated.tracked
+        given = AssignedFrames(
+            associated.association.t_ns, prediction.states, tracked, detections, assignments
+        )
+        are_own = self.own.are_own(given)
+        of_shard = self.table.owned[self.table.markers.robot[assignments.marker]]
+        others, assignments = assignments.select(~of_shard), assignments.select(of_shard & are_own)
+        fitted = self.robust.update(prediction, detections, assignments)
         self.table.states = fitted.states
         return fitted.assignments.joined(others)
-
-    def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> _Fit:
-        """The updated states; a robot that its detections contradict stays as predicted and loses them."""
-        observations = MatchedObservations.of(assignments, detections, self.table.markers)
-        states, residuals = self.estimator.update(prediction, observations)
-        assignments = assignments.with_residuals(residuals)
-        body, n = observations.discs.body, len(self.table.robots)
-        squared = misfit(observations, residuals)
-        contradicted = mean_by_body(squared > MAX_CHI2, body, n) > CONTRADICTED
-        rows, fits = np.flatnonzero(contradicted), ~contradicted[body]
-        if len(rows):
-            states = states.with_rows(rows, prediction.states.select(rows))
-        return _Fit(states, assignments.select(fits), prediction, squared[fits], len(body) - int(fits.sum()))
-
-    def _leave_one_out(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments, fitted: _Fit
-    ) -> _Fit:
-        """The fit without the camera that contradicts predictions and all others, if there is one."""
-        camera = detections.camera[assignments.detection]
-        without = {
-            self.cameras.names[k]: self._fit(prediction, detections, assignments.select(camera != k))
-            for k in np.unique(camera).tolist()
-        }
-        name = camera_at_fault(fitted.cost, {name: fit.cost for name, fit in without.items()})
-        if name is None:
-            self.residuals.learn(fitted.assignments.squared_px)
-            return fitted
-        return without[name]
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""

@@ -20,6 +20,7 @@ from fusion.tracking.company import Company
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import (
     ANY_DIAMETERS,
+    DIAMETER_TOLERANCE,
     FORGET_NS,
     MAX_CHI2,
     POSITION_GATE,
@@ -153,7 +154,7 @@ class UnlabeledTracker:
 
     Args:
         cameras: cameras of the rig.
-        radii: (R,) of the markers in use; where there is none, a marker has its apparent size.
+        radii: (R,) of the markers in use; a marker of another size has its apparent one.
     """
 
     def __init__(self, cameras: CameraArray, radii: Array) -> None:
@@ -232,8 +233,8 @@ class UnlabeledTracker:
             return before, np.zeros(0, bool)
         rows = np.concatenate([marker.detections for marker in markers])
         body = np.repeat(np.arange(n), [len(marker.detections) for marker in markers])
-        centres = np.zeros((3, len(rows)))
-        discs = Discs(detections.frame[rows], body, body, centres, tracks.radius[seen][body])
+        centres, up = np.zeros((3, len(rows))), np.tile([[0.0], [0.0], [1.0]], len(rows))
+        discs = Discs(detections.frame[rows], body, body, centres, up, tracks.radius[seen][body])
         observations = MatchedObservations.of_discs(detections.select(rows), discs)
         states, residuals = self._estimator(n).update(Prediction.without_motion(before), observations)
         return states, mean_by_body(misfit(observations, residuals), body, n) < MAX_CHI2
@@ -242,13 +243,14 @@ class UnlabeledTracker:
         return Estimator(self._cameras, np.tile(MOTIONS["aerial"].densities, (n, 1)), np.ones(n, bool))
 
     def _radius(self, marker: Marker) -> float:
-        """The radius in use that is closest to the apparent size of the marker."""
+        """The radius in use that is closest to the apparent size of the marker; the apparent one if none is near."""
         apparent = marker.diameter_m / 2
-        if not len(self._radii):
-            return apparent if np.isfinite(apparent) else ANY_DIAMETERS[0] / 2
         if not np.isfinite(apparent):
-            return float(self._radii[0])
-        return float(self._radii[np.argmin(np.abs(self._radii - apparent))])
+            return float(self._radii[0]) if len(self._radii) else ANY_DIAMETERS[0] / 2
+        off = np.abs(self._radii / apparent - 1)
+        if not len(off) or off.min() > DIAMETER_TOLERANCE:
+            return apparent
+        return float(self._radii[np.argmin(off)])
 
 
 def _pair(states: States, position: Array, covariance: Array) -> Index:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Latency that a bridge adds, and its share of a core, with 50 robots at 60 Hz: `python -m tests.benchmarks.bridges`.
 
-A process publishes poses as the server does. This process receives each pose twice: over Zenoh, and through the bridge.
-The added latency is the difference of both times of arrival. Each bridge is a process of its own.
+A process publishes poses by the server's own code. This process receives each pose twice: over Zenoh, and through the
+bridge. The added latency is the difference of both times of arrival. Each bridge is a process of its own.
 """
 
 import contextlib
@@ -13,52 +13,61 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
+import msgspec
 import psutil
 import tyro
 import zenoh
 
-from camera_node.protocol.messages import encode
+from camera_node.protocol.messages import Keys
 from camera_node.protocol.session import open_client, open_router
 from fusion.client.arena import Arena
+from fusion.protocol.messages import RobotPose
+from fusion.protocol.shards import Shard
+from fusion.server.publisher import ArenaPublisher
+from fusion.server.server_clock import ServerClock
+from fusion.server.transport import Transport
 from tests.conftest import ROOT, free_port
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient
 from tests.fusion.bridges.pose_server import ARENA, bridge, first_line, moving_pose
 
-ROBOTS, RATE_HZ, WARM_UP_S, LIMIT_MS, LIMIT_CORE = 50, 60, 3.0, 2.0, 0.15
+ROBOTS, RATE_HZ, WARM_UP_S, CATCH_UP_S, LIMIT_MS, LIMIT_CORE = 50, 60, 3.0, 0.5, 2.0, 0.15
 PUBLISH = "import sys; from tests.benchmarks.bridges import publish; publish(sys.argv[1])"
+
+
+Times = dict[tuple[str, int], int]  # of arrival (ns), by robot and time in microseconds
 
 
 @dataclass
 class Arrivals:
-    """When poses arrived (ns), by robot and time in microseconds: VRPN's times have no finer ones."""
+    """When poses arrived; their times are in microseconds, because VRPN's have no finer ones."""
 
-    times: dict[tuple[str, int], int] = field(default_factory=dict)
+    times: Times = field(default_factory=dict)
 
     def put(self, robot: str, t_ns: int) -> None:
         self.times[robot, t_ns // 1000] = time.monotonic_ns()
 
+    def put_all(self, poses: Sequence[RobotPose]) -> None:
+        now_ns = time.monotonic_ns()
+        self.times |= {(pose.robot, pose.t_ns // 1000): now_ns for pose in poses}
+
 
 def publish(endpoint: str) -> None:
-    """Publish all robots' poses in each frame set, until killed."""
-    with open_router([endpoint]) as session:
-        publishers = {
-            name: session.declare_publisher(
-                f"{ARENA}/robot/{name}/pose", priority=zenoh.Priority.REAL_TIME, express=True
-            )
-            for name in (f"robot{k:02}" for k in range(ROBOTS))
-        }
+    """Publish all robots' poses in each frame set by the server's own code, until killed."""
+    with open_router([endpoint]) as session, ExitStack() as closing:
+        transport = Transport(session, ServerClock(), lambda reason, key: None, closing)
+        publisher = ArenaPublisher(transport, Keys(ARENA), Shard())
+        poses = [moving_pose(f"robot{k:02}", 0, seed=k) for k in range(ROBOTS)]
         begun_ns, k = time.time_ns(), 0
         while True:
             k += 1
             t_ns = begun_ns + k * 1_000_000_000 // RATE_HZ
-            data = {name: encode(moving_pose(name, t_ns)) for name in publishers}
+            stamped = [msgspec.structs.replace(pose, t_ns=t_ns) for pose in poses]
             time.sleep(max(0.0, (t_ns - time.time_ns()) * 1e-9))
-            for name, publisher in publishers.items():
-                publisher.put(data[name])
+            publisher.publish_poses(stamped, None)
 
 
 @contextmanager
@@ -161,25 +170,24 @@ def measure(name: str, seconds: float) -> bool:
         stack.callback(server.wait)
         stack.callback(server.kill)
         client = stack.enter_context(Arena.connect(endpoint, arena=ARENA))
-        client.poses().on_message(lambda pose: direct.put(pose.robot, pose.t_ns))
+        client.pose_sets().on_message(direct.put_all)
         process = psutil.Process(stack.enter_context(BRIDGES[name](endpoint, bridged)))
         time.sleep(WARM_UP_S)
-        bridged.times.clear()
         direct.times.clear()
         used, begun_s = sum(process.cpu_times()[:2]), time.monotonic()
         time.sleep(seconds)
         core = (sum(process.cpu_times()[:2]) - used) / (time.monotonic() - begun_s)
-    return report(name, direct, bridged, core)
+        published = dict(direct.times)
+        time.sleep(CATCH_UP_S)
+        return report(name, published, dict(bridged.times), core)
 
 
-def report(name: str, direct: Arrivals, bridged: Arrivals, core: float) -> bool:
+def report(name: str, direct: Times, bridged: Times, core: float) -> bool:
     """Print a line; whether it is within the limits."""
-    added = [
-        (at - direct.times[key]) * 1e-6 for key, at in tuple(bridged.times.items()) if key in direct.times
-    ]
+    added = [(at - direct[key]) * 1e-6 for key, at in bridged.items() if key in direct]
     cuts = statistics.quantiles(added, n=100)
-    robots = {robot for robot, _ in bridged.times}
-    share = len(added) / max(1, sum(robot in robots for robot, _ in direct.times))
+    robots = {robot for robot, _ in bridged}
+    share = len(added) / max(1, sum(robot in robots for robot, _ in direct))
     print(f"{name:9} {len(added):7} {share:8.1%} {cuts[49]:9.2f} {cuts[98]:9.2f} {core:8.1%}", flush=True)
     return cuts[98] < LIMIT_MS and core < LIMIT_CORE
 

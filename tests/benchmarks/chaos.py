@@ -19,8 +19,9 @@ from camera_node.terminal import console, say, track
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.judge import Gap, WrongPose
 from tests.benchmarks.faults.kinds import KINDS, LONGEST_S, SHORT_S, VIRTUAL, Evidence, Fault
+from tests.benchmarks.faults.memory import Growth
 from tests.benchmarks.faults.virtual_arena import VirtualArena
-from tests.benchmarks.fuzz import EXTRA, MAX_MB_PER_MIN
+from tests.benchmarks.fuzz import EXTRA
 
 PAUSE_S = 0.5, 3.0  # between two faults
 SETTLE_S = 3.0  # after a fault, in which a gap is explained by it and its report counts
@@ -60,7 +61,7 @@ class ChaosResult:
         gaps: in the poses of visible robots, above `SHORT_S`; `waits_s` is for how long the machine let some
             thread wait for a processor during it.
         wrong: poses that are not excused.
-        slopes_mb_per_min: of the resident memory of long-lived processes.
+        growths: of the memory of each program, over all its lives.
     """
 
     episodes: list[Episode] = field(default_factory=list)
@@ -68,7 +69,7 @@ class ChaosResult:
     waits_s: dict[Gap, float] = field(default_factory=dict)
     wrong: list[WrongPose] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
-    slopes_mb_per_min: dict[str, float] = field(default_factory=dict)
+    growths: dict[str, Growth] = field(default_factory=dict)
     poses: int = 0
     rms_m: float = 0.0
 
@@ -96,14 +97,13 @@ class ChaosResult:
 
     def failures(self) -> list[str]:
         """What does not hold, one line each."""
-        slopes = {n: mb for n, mb in self.slopes_mb_per_min.items() if mb > MAX_MB_PER_MIN}
         return [
             *(f"crash: {crash}" for crash in self.crashes),
             *(f"not reported: {e.kind} of {e.fault.target}" for e in self.unreported()),
             *(self._describe(gap, "unexplained gap") for gap in self.unexplained()),
             *(self._describe(gap, "long gap") for gap in self.longest()),
             *self._describe_wrong(),
-            *(f"{name} grows by {mb:.2f} MB a minute" for name, mb in slopes.items()),
+            *(f"{name} grows by {growth}" for name, growth in self.growths.items() if growth.is_excessive),
         ]
 
     def _describe(self, gap: Gap, what: str) -> str:
@@ -231,7 +231,7 @@ def chaos(
         run = Chaos(arena, random.Random(seed), kinds)
         yield from run.run(seconds)
     run.result.crashes = arena.programs.crashes
-    run.result.slopes_mb_per_min = {n: max(s) for n, s in arena.programs.slopes_mb_per_min.items()}
+    run.result.growths = arena.programs.growths()
     yield run.result
 
 
@@ -289,8 +289,8 @@ def report(result: ChaosResult) -> None:
             kind, str(len(episodes)), str(len(delays)), after, by[:90], f"{max(gaps, default=0.0):.2f}"
         )
     console().print(table)
-    for name, mb in sorted(result.slopes_mb_per_min.items()):
-        say(f"{name}: {mb:.2f} MB a minute")
+    for name, growth in sorted(result.growths.items()):
+        say(f"memory of {name}: {growth}")
     longest = max((gap.seconds for gap in result.gaps), default=0.0)
     say(f"{len(result.episodes)} faults, {result.poses} tracked poses, RMS {result.rms_m * 1e3:.2f} mm")
     gaps = f"{len(result.gaps)} gaps above {SHORT_S} s, the longest {longest:.2f} s"

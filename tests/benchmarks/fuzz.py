@@ -15,6 +15,7 @@ from rich.table import Table
 from camera_node.terminal import console, say, track
 from tests.benchmarks.faults.arena import Fuzz, LiveArena, small_load
 from tests.benchmarks.faults.fuzzer import FUZZED
+from tests.benchmarks.faults.memory import Growth
 from tests.benchmarks.fusion_load import Load
 
 EXTRA = ("viewer", "page", "recorder", "listener", "rendered")
@@ -24,9 +25,8 @@ UNDISTURBED_S = 10.0  # of poses before the first fault
 MAX_OFFSET_M = 0.002  # by which the largest error may grow
 MAX_LINES = 100  # of all logs
 FILL_MB = (
-    60.0  # by which a program may grow until its caches are full, in a run that is too short for a slope
+    60.0  # by which a program may grow until its caches are full, in a run that is too short for its growth
 )
-MAX_MB_PER_MIN = 0.5  # after the warm-up
 CLOSE_S = 2.0  # after the last message, until its effects are over
 
 
@@ -39,8 +39,8 @@ class FuzzResult:
         wrong: poses whose error is above the largest without faults by more than `MAX_OFFSET_M`, and above 5 sigma.
         gap_s: the longest gap in the poses of a robot.
         lines: of all logs during the run.
-        growth_mb: of the resident memory of each program, from the first to the last sample.
-        slopes_mb_per_min: of the resident memory after the warm-up; empty after a short run.
+        grown_mb: memory of each program, from the first to the last sample.
+        growths: of the memory after the warm-up; empty after a short run.
         summary: what the fuzzer says that it sent.
     """
 
@@ -49,16 +49,15 @@ class FuzzResult:
     wrong: int = 0
     gap_s: float = 0.0
     lines: list[tuple[str, str]] = field(default_factory=list)
-    growth_mb: dict[str, float] = field(default_factory=dict)
-    slopes_mb_per_min: dict[str, float] = field(default_factory=dict)
+    grown_mb: dict[str, float] = field(default_factory=dict)
+    growths: dict[str, Growth] = field(default_factory=dict)
     crashes: list[str] = field(default_factory=list)
     faults: dict[str, int] = field(default_factory=dict)
     summary: str = ""
 
     def failures(self) -> list[str]:
         """What does not hold, one line each."""
-        growth = {n: mb for n, mb in self.growth_mb.items() if mb > FILL_MB}
-        slopes = {n: mb for n, mb in self.slopes_mb_per_min.items() if mb > MAX_MB_PER_MIN}
+        grown = {n: mb for n, mb in self.grown_mb.items() if mb > FILL_MB}
         return [
             *self.crashes,
             *(
@@ -67,8 +66,8 @@ class FuzzResult:
                 else []
             ),
             *([f"{len(self.lines)} log lines"] if len(self.lines) >= MAX_LINES else []),
-            *(f"{name} grew by {mb:.0f} MB" for name, mb in growth.items()),
-            *(f"{name} grows by {mb:.2f} MB a minute" for name, mb in slopes.items()),
+            *(f"{name} grew by {mb:.0f} MB" for name, mb in grown.items()),
+            *(f"{name} grows by {growth}" for name, growth in self.growths.items() if growth.is_excessive),
         ]
 
 
@@ -104,10 +103,10 @@ def fuzz(
         result.wrong = len(arena.judge.wrong)
         result.gap_s = max((gap.seconds for gap in arena.judge.gaps), default=0.0)
         result.lines += arena.programs.new_lines()
-        result.growth_mb = {n: arena.programs.memory_mb(n) - mb for n, mb in first.items()}
+        result.grown_mb = {n: arena.programs.memory_mb(n) - mb for n, mb in first.items()}
         result.faults = dict(arena.status.faults) if arena.status else {}
     result.crashes += arena.programs.crashes
-    result.slopes_mb_per_min = {n: s[-1] for n, s in arena.programs.slopes_mb_per_min.items()}
+    result.growths = arena.programs.growths()
     result.summary = (folder / "fuzzer.out").read_text()
     yield result
 
@@ -139,11 +138,10 @@ def main(messages: int = 1_000_000, seed: int = 1, rate: float = 2000.0, only: s
 
 def report(result: FuzzResult) -> None:
     """Print the result."""
-    table = Table("program", "grew by MB", "MB a minute", "log lines")
-    for name, mb in result.growth_mb.items():
-        slope = result.slopes_mb_per_min.get(name)
+    table = Table("program", "grew by MB", "growth after the warm-up", "log lines")
+    for name, mb in result.grown_mb.items():
         lines = sum(program == name for program, _ in result.lines)
-        table.add_row(name, f"{mb:.1f}", "" if slope is None else f"{slope:.2f}", str(lines))
+        table.add_row(name, f"{mb:.1f}", str(result.growths.get(name, "")), str(lines))
     console().print(table)
     for line in result.summary.splitlines()[-15:]:
         say(line)

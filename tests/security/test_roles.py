@@ -5,11 +5,14 @@ import contextlib
 import time
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 import pytest
 
 from calib.live.rig_requests import set_rig, undo_rig
+from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
+from camera_node.node.intrinsics import RigLens
 from camera_node.protocol.messages import Detections, Roundels, encode
 from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena
@@ -66,3 +69,18 @@ def test_only_an_operator_changes_the_rig(lab: Lab):
     assert set_rig(operator, ARENA, rig, "test").rig == rig
     with pytest.raises(RequestError, match="no earlier version"):
         undo_rig(operator, ARENA, "test")
+
+
+def test_a_camera_receives_its_lens(lab: Lab):
+    """It asks for the rig in force, and receives each change."""
+    operator = lab.session("operator")
+    own, other = list(four_cameras().cameras.values())[:2]
+    set_rig(operator, ARENA, Rig(cameras={"north": own}), "test")
+    followed = RigLens(lab.session("camera.north"), KEYS, "north")
+    wait_for(lambda: followed.lens is not None)
+    assert followed.lens is not None
+    assert followed.lens.fx == own.fx
+    changed = msgspec.structs.replace(other, fx=own.fx + 10)
+    set_rig(operator, ARENA, Rig(cameras={"north": changed}), "test")
+    wait_for(lambda: followed.lens is not None and followed.lens.fx == changed.fx)
+    followed.close()

@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tab Calibrate: the floor and the origin, and the history of the rig."""
 
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import dump_yaml
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
-from camera_node.protocol.requests import RequestSource
+from fusion.server.config import ArenaConfig
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
-from tests.waiting import repeating, wait_for
+from tests.fusion.serving import serving
+from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import loopback
+from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
 from web.feed import Feed
 from web.scene.cameras import CameraDrawing
 from web.subscription import Subscription
-from web.tabs.calibrate import describe_change, tabulate_rigs
-from web.tabs.rig_change import CalibrationFiles
+from web.tabs.calibrate import RigHistoryPanel
+from web.tabs.rig_change import CalibrationFiles, apply_rig
 from web.tabs.world import L_FRAME as BY_L_FRAME
 from web.tabs.world import STANDING, WorldPanel
 from web.view import View
@@ -79,23 +81,34 @@ def moved(rig: Rig, name: str, metres: float) -> Rig:
     return Rig(cameras={**rig.cameras, name: camera})
 
 
-def test_the_history_names_what_changed(arena: LiveArena, subscription: Subscription):
-    """Each rig once, newest first, with the program and the motion of its cameras."""
-    rig, feed = four_cameras(), subscription.feed
-    source = RequestSource(program="calib wand", host="lab", user="x")
-    rigs = [rig, moved(rig, "north", 0.012)]
-    messages = [
-        RigMessage(t_ns=(k + 1) * 10**18, rig=r, source=source if k else None) for k, r in enumerate(rigs)
-    ]
-    for message in (*messages, messages[-1]):  # a query repeats the one in force
-        arena.put(arena.keys.rig, encode(message))
-    wait_for(lambda: feed.state().message_counts["RigMessage"] == 3)
-    rows = tabulate_rigs(feed.state().rigs).rows
-    assert [row.cells[1:] for row in rows] == [
-        ("calib wand", "north 12.0 mm"),
-        ("the server", "4 cameras placed"),
-    ]
-    assert [row.level for row in rows] == ["ok", "wait"]
+def test_the_history_is_listed_undone_and_redone(tmp_path: Path):
+    """By clicks, on a real server. The page writes the file in which the server saves its rig, as in `roundel up`, and
+    each change is one step."""
+    rig = four_cameras()
+    files = CalibrationFiles(tmp_path / "rig.yaml", tmp_path / "wand.yaml")
+    save_rig(rig, files.rig)
+    settings = ArenaConfig(
+        arena="test", listen=("tcp/127.0.0.1:0",), saved_rig=str(files.rig), robots=str(tmp_path / "no.yaml")
+    )
+    settings = msgspec.structs.replace(settings, saved_robots=settings.robots)
+    with serving(settings) as (server, client), closing(ServerConnection(server.endpoints)) as connection:
+        subscription = Subscription(connection, Feed("test"))
+        view = View(subscription.feed, loopback())
+        view.add(RigHistoryPanel(view.server.gui, subscription))
+        with drawing(view), browsing(view) as page:
+            for metres in (0.012, 0.034):
+                apply_rig(subscription, files, moved(rig, "north", metres))
+            for change in ("north 12.0 mm", "north 22.0 mm"):
+                page.get_by_text(change).wait_for(timeout=20_000)
+            assert page.get_by_role("button", name="Redo").is_disabled()
+            page.get_by_role("button", name="Undo the last change").click()
+            page.get_by_role("cell", name="undone", exact=True).wait_for(timeout=20_000)
+            assert load_rig(files.rig) == moved(rig, "north", 0.012)
+            page.get_by_role("button", name="Redo").click()
+            page.get_by_role("cell", name="undone", exact=True).wait_for(state="detached", timeout=20_000)
+        assert load_rig(files.rig) == moved(rig, "north", 0.034)
+        assert [version.state for version in client.rig_history().versions] == ["earlier"] * 2 + ["in force"]
+        subscription.close()
 
 
 def test_only_what_changed_is_drawn_again():
@@ -112,13 +125,3 @@ def test_only_what_changed_is_drawn_again():
     drawing.draw(None)
     assert not drawing._frustums
     view.close()
-
-
-def test_changes_of_a_rig():
-    rig = four_cameras()
-    three = Rig(cameras={name: camera for name, camera in rig.cameras.items() if name != "west"})
-    assert describe_change(rig, rig) == "the same poses"
-    assert describe_change(rig, three) == "west not placed"
-    assert describe_change(three, rig) == "west placed"
-    everything = in_another_world(rig)
-    assert describe_change(rig, everything).endswith("1 more")

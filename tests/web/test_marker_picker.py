@@ -103,7 +103,7 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
 
 
 def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
-    """No marker selected; a marker deselected; one that is not there; two markers only; an invalid name."""
+    """No marker selected; a marker deselected; one that is not there; another diameter; two markers; a bad name."""
     _, _, picker = arena
     refused(picker, "no marker")
     picker._toggle()
@@ -115,6 +115,9 @@ def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicke
     assert picker.selected == [], "there is no marker in this direction"
     picker.selected = [np.array([0.9, 0.9, 0.1])]
     refused(picker, "0.90, 0.90, 0.10 m")
+    picker.selected = list(marker_positions())
+    refused(picker, "measure about 120 mm, not 90 mm")
+    picker._diameter.value = 120.0
     picker.selected = list(marker_positions()[:2])
     refused(picker, "make no robot")
     picker._name.value = "a/b"

@@ -140,4 +140,4 @@ def _match_selected(measured: StationaryMarkers, selected: Array) -> StationaryM
             f"the marker at {x:.2f}, {y:.2f}, {z:.2f} m moves or is not visible; hold the robot still"
         )
     nearest = distance.argmin(1)
-    return StationaryMarkers(measured.position[nearest], measured.normal[nearest])
+    return measured.select(nearest)

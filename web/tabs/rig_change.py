@@ -6,6 +6,7 @@ from pathlib import Path
 
 from calib.intrinsics.nominal_lens import load_known_lenses
 from calib.live.rig_requests import set_rig
+from calib.rig.changes import holds_rig
 from calib.rig.rig import Rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
@@ -42,14 +43,18 @@ def current_rig(subscription: Subscription, files: CalibrationFiles) -> Rig:
 
 
 def apply_rig(subscription: Subscription, files: CalibrationFiles, rig: Rig) -> str:
-    """Write a rig and have the server use it; returns the outcome as text.
+    """Have the server use a rig, and write it; returns the outcome as text.
+
+    The server is asked first: it may save its rig in the same file, which then is one step of the history.
 
     Raises:
         CalibrationError, ConfigError: the file can't be written.
     """
-    save_rig(rig, files.rig)
+    outcome = "in force on the server"
     try:
         set_rig(subscription.session, subscription.feed.keys.arena, rig, "web")
     except RoundelError as error:
-        return f"{files.rig} is written, but not in force: {error}"
-    return "in force on the server"
+        outcome = f"{files.rig} is written, but not in force: {error}"
+    if not holds_rig(files.rig, rig):
+        save_rig(rig, files.rig)
+    return outcome

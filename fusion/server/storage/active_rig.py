@@ -8,17 +8,21 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 from calib.rig.camera import Camera
+from calib.rig.changes import MAX_CHANGE, RigChange, describe_change, holds_rig, read_change
 from calib.rig.history import History
-from calib.rig.messages import RigMessage
+from calib.rig.messages import MAX_VERSIONS, RigHistory, RigMessage, RigVersion
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.errors import RoundelError
+from camera_node.config import write_atomically
+from camera_node.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.corrections import correct
 from fusion.server.storage.persistence import is_newer
 
 log = logging.getLogger("fusion")
+State = Literal["earlier", "in force", "undone"]
 
 
 class ActiveRig:
@@ -73,14 +77,28 @@ class ActiveRig:
         is_saved = self._saved is not None if saved is None else saved
         self.message = RigMessage(t_ns=now_ns, rig=rig, saved=is_saved, source=source)
 
-    def save(self, rig: Rig) -> None:
-        """Save another rig as the next step of the history.
+    def save(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
+        """Save another rig as the next step of the history, with what it changes, when, and who asked for it.
+
+        A file that the sender of the rig wrote before, as `calib` and the page do, is such a step already.
 
         Raises:
             ConfigError, CalibrationError: it can't be saved; the files hold the rig in use.
         """
-        self._save_active()
-        save_rig(rig, self._history.path)
+        change = RigChange(
+            t_ns=now_ns, change=describe_change(self.rig, rig)[:MAX_CHANGE], source=source
+        ).line()
+        path = self._history.path
+        if not holds_rig(path, rig) or not self._is_in_history():
+            self._save_active()
+            save_rig(rig, path, change)
+        elif rig != self.rig:
+            write_atomically(path, change + dump_rig(rig))
+
+    def _is_in_history(self) -> bool:
+        """Whether undo or redo would restore the rig in use, which the saved file no longer holds."""
+        files = [*self._history.older()[-1:], *self._history.undone()[-1:], self._history.path]
+        return self.rig is None or any(holds_rig(path, self.rig) for path in files)
 
     def correct(self, name: str, camera: Camera, now_ns: int) -> None:
         """Use a new pose of a camera that was moved. A fault of the disk is only logged."""
@@ -88,7 +106,7 @@ class ActiveRig:
         rig = correct(self.rig, name, camera, now_ns)
         saved = None
         try:
-            self.save(rig)
+            self.save(rig, now_ns)
         except RoundelError as error:
             log.warning("the corrected rig is used, but not saved for a restart: %s", error)
             saved = False
@@ -108,6 +126,42 @@ class ActiveRig:
         """The rig that `redo` restores; raises as `previous`."""
         return load_rig(self._history.next())
 
+    def history(self) -> RigHistory:
+        """All versions of the rig.
+
+        Raises:
+            ConfigError: a file can't be read.
+        """
+        if self.message is None:
+            return RigHistory()
+        older, undone = ([], []) if self._is_unsaved else (self._history.older(), self._history.undone())
+        try:
+            versions = [self._version(path, "earlier") for path in older]
+            versions += [self._version_in_force(self.message)]
+            versions += [self._version(path, "undone") for path in reversed(undone)]
+        except OSError as error:
+            raise ConfigError(f"the history of the rig can't be read: {error.strerror}") from None
+        return RigHistory(rig_t_ns=self.message.t_ns, versions=tuple(versions[-MAX_VERSIONS:]))
+
+    def _version(self, path: Path, state: State) -> RigVersion:
+        change = read_change(path)
+        file = path.name if self._saved is not None else ""
+        return RigVersion(
+            state=state, t_ns=change.t_ns, change=change.change, source=change.source, file=file
+        )
+
+    def _version_in_force(self, message: RigMessage) -> RigVersion:
+        """The rig in use; a rig of the configuration is in none of the files of the history."""
+        if not self._is_unsaved and holds_rig(self._history.path, message.rig):
+            return self._version(self._history.path, "in force")
+        change = describe_change(None, message.rig)
+        return RigVersion(state="in force", t_ns=message.t_ns, change=change, source=message.source)
+
+    @property
+    def _is_unsaved(self) -> bool:
+        """Whether the rig was never saved or changed: it has no history yet."""
+        return self._files is None and self._saved is None
+
     def undo(self) -> None:
         """Restore the file of the previous rig; raises as `previous`."""
         self._history.undo()
@@ -118,8 +172,10 @@ class ActiveRig:
 
     def _save_active(self) -> None:
         """Save the rig in use unless the saved file holds it: a rig of the configuration, or one that is newer."""
-        if self.rig is not None and not _holds(self._history.path, self.rig):
-            save_rig(self.rig, self._history.path)
+        if self.message is not None and not holds_rig(self._history.path, self.message.rig):
+            rig, t_ns = self.message.rig, self.message.t_ns
+            change = RigChange(t_ns=t_ns, change=describe_change(None, rig), source=self.message.source)
+            save_rig(rig, self._history.path, change.line())
 
     @property
     def _history(self) -> History:
@@ -137,14 +193,6 @@ class ActiveRig:
             return
         yield self._saved
         yield from reversed(self._history.older())
-
-
-def _holds(path: Path, rig: Rig) -> bool:
-    """Whether a file holds a rig, as `save_rig` writes it."""
-    try:
-        return path.read_text(encoding="utf-8") == dump_rig(rig)
-    except (OSError, UnicodeDecodeError):
-        return False
 
 
 def _temporary_folder() -> Path:

@@ -11,12 +11,13 @@ from rich.console import Console
 
 from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
-from tests.benchmarks.detector import accuracy, cameras, motion, negatives, pose, recall, speed
+from tests.benchmarks.detector import accuracy, cameras, known_lens, motion, negatives, pose, recall, speed
 from tests.benchmarks.detector.table import Run, print_verdicts
 
 PARTS = {
     "speed": speed.measure,
     "accuracy": accuracy.measure,
+    "known_lens": known_lens.measure,
     "recall": recall.measure,
     "motion": motion.measure,
     "false_positives": negatives.measure,
@@ -31,7 +32,18 @@ class Benchmark:
 
     parts: Annotated[
         tuple[
-            Literal["speed", "accuracy", "recall", "motion", "false_positives", "pose", "cameras", "all"], ...
+            Literal[
+                "speed",
+                "accuracy",
+                "known_lens",
+                "recall",
+                "motion",
+                "false_positives",
+                "pose",
+                "cameras",
+                "all",
+            ],
+            ...,
         ],
         tyro.conf.Positional,
     ] = ("all",)

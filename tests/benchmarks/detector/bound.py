@@ -41,6 +41,43 @@ class Bound:
         return self.distance * (noise**2 + ROUNDING)
 
 
+@dataclass(frozen=True)
+class PoseBound:
+    """The least standard deviations where the lens and the print are known, each as the RMS of one coordinate.
+
+    Attributes:
+        centre: of the outer ellipse, pixels.
+        size: of the mean of its diameters, relative.
+        normal: radians.
+    """
+
+    centre: float
+    size: float
+    normal: float
+
+
+PRINT_SIGMA = 0.002  # of the ratio of a print, which the detector assumes
+
+
+def pose_bound(sight: Sight, pieces: int, noise: float) -> PoseBound:
+    """The bound for known intrinsics without distortion and a print whose ratio is known to `PRINT_SIGMA`."""
+    moves = [*list(_moves(sight))[:-2], lambda k: replace(sight, ratio=sight.ratio + 0.002 * k)]
+    variance = noise**2 + ROUNDING
+    J = np.array([(trace(move(1.0), pieces) - trace(move(-1.0), pieces)).ravel() / 2 for move in moves])
+    information = J @ J.T / variance
+    information[-1, -1] += (0.002 / PRINT_SIGMA) ** 2
+    cov = np.linalg.inv(information)
+    ahead, behind = ([ellipse_of(move(k)) for move in moves] for k in (1.0, -1.0))
+    c = np.array([(a[0] - b[0]) / 2 for a, b in zip(ahead, behind, strict=True)])
+    d = np.array([(a[1].sum() - b[1].sum()) / 2 for a, b in zip(ahead, behind, strict=True)])
+    angle = 0.3 / _width(sight)
+    return PoseBound(
+        float(np.sqrt(np.trace(c.T @ cov @ c) / 2)),
+        float(np.sqrt(d @ cov @ d) / ellipse_of(sight)[1].sum()),
+        float(np.sqrt(np.trace(cov[3:5, 3:5]) / 2) * angle),
+    )
+
+
 def bound(sight: Sight, pieces: int) -> Bound:
     """The bound for a roundel and a lens without distortion."""
     grey, centre = [], []

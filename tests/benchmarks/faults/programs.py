@@ -13,22 +13,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import psutil
+
+from camera_node.arrays import Array
+from tests.benchmarks.faults.memory import Growth, anonymous_mb, growth
 
 END_S = 10.0  # within which a program ends after SIGTERM
-WARM_UP_S = 60.0  # of a process, until its caches are full
-MIN_SLOPE_S = 60.0  # of samples after the warm-up, from which a slope is computed
 
 
 @dataclass
 class Program:
-    """A running program: its process, since when it runs, and its resident memory over time (age s, MB).
+    """A running program: its process, since when it runs, and its anonymous memory over time (age s, MB).
 
     `ends` is whether it ends by itself, which `Programs.exit_code` awaits.
     """
 
     process: subprocess.Popen
-    meter: psutil.Process
     ends: bool = False
     started_s: float = field(default_factory=time.monotonic)
     memory: list[tuple[float, float]] = field(default_factory=list)
@@ -44,7 +43,7 @@ class Programs:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.crashes: list[str] = []
-        self.slopes_mb_per_min: dict[str, list[float]] = defaultdict(list)
+        self._lives: dict[str, list[Array]] = defaultdict(list)  # memory of the programs that ended
         self._running: dict[str, Program] = {}
         self._read: dict[str, int] = defaultdict(int)  # bytes of each log
 
@@ -79,7 +78,7 @@ class Programs:
                 env=environment,
                 start_new_session=True,
             )
-        self._running[name] = Program(process, psutil.Process(process.pid), ends)
+        self._running[name] = Program(process, ends)
 
     def is_running(self, name: str) -> bool:
         return name in self._running and self._running[name].process.poll() is None
@@ -123,11 +122,19 @@ class Programs:
                 self._forget(name, 0)
 
     def sample_memory(self) -> None:
-        """Note the resident memory of all programs."""
+        """Note the anonymous memory of all programs."""
         for program in self._running.values():
-            if program.process.poll() is None:
-                age_s = time.monotonic() - program.started_s
-                program.memory.append((age_s, program.meter.memory_info().rss / 1e6))
+            with contextlib.suppress(OSError, StopIteration):  # it is over
+                memory_mb = anonymous_mb(program.process.pid)
+                program.memory.append((time.monotonic() - program.started_s, memory_mb))
+
+    def growths(self) -> dict[str, Growth]:
+        """The growth of the memory of each program that ran for long enough, by name."""
+        lives = {name: list(ended) for name, ended in self._lives.items()}
+        for name, program in self._running.items():
+            lives.setdefault(name, []).append(np.array(program.memory))
+        measured = {name: growth(of_name) for name, of_name in lives.items()}
+        return {name: result for name, result in measured.items() if result is not None}
 
     def memory_mb(self, name: str) -> float:
         """Of the last sample; 0 without one."""
@@ -170,12 +177,7 @@ class Programs:
             process.wait()
         if process.stdin is not None:
             process.stdin.close()
-        self._note_slope(name, program)
-
-    def _note_slope(self, name: str, program: Program) -> None:
-        steady = np.array([sample for sample in program.memory if sample[0] > WARM_UP_S])
-        if len(steady) > 2 and steady[-1, 0] - steady[0, 0] >= MIN_SLOPE_S:
-            self.slopes_mb_per_min[name].append(60 * float(np.polyfit(steady[:, 0], steady[:, 1], 1)[0]))
+        self._lives[name].append(np.array(program.memory))
 
 
 def python(module: str, *arguments: object) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from camera_node.arrays import Array
 from fusion.model.states import States
 from tests.benchmarks.fusion_load import Load
 
@@ -26,13 +27,23 @@ class Clock:
 
 
 class RobotEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot is covered for a while and may be carried then: `before` and `after` are offsets of its path, m."""
+    """A robot is covered for a while and may be carried then: `before` and `after` are offsets of its path, m.
+
+    It is carried in the middle half of that time, without a jump of its velocity.
+    """
 
     robot: str
     hidden_from_ns: int
     hidden_until_ns: int
     before: Vector = (0.0, 0.0, 0.0)
     after: Vector = (0.0, 0.0, 0.0)
+
+    def offset(self, t_ns: int) -> Array:
+        """(3,) of the robot's path at a Unix time."""
+        elapsed = (t_ns - self.hidden_from_ns) / (self.hidden_until_ns - self.hidden_from_ns)
+        share = min(1.0, max(0.0, 2 * elapsed - 0.5))
+        smooth = share**2 * (3 - 2 * share)
+        return (1 - smooth) * np.array(self.before) + smooth * np.array(self.after)
 
 
 class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,7 +105,7 @@ class World:
         states = self.load.paths.at((t_ns - self.epoch_ns) * 1e-9)
         p = states.p.copy()
         for name, event in tuple(self.events.items()):
-            p[self.names.index(name)] += event.before if t_ns < event.hidden_until_ns else event.after
+            p[self.names.index(name)] += event.offset(t_ns)
         return replace(states, p=p)
 
     def hidden(self, t_ns: int) -> list[int]:

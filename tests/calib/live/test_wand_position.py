@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The wand is located in the latest frames of placed cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.live.wand_position import locate_wand
 from calib.rig.camera import transform
+from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import record, ring
 
@@ -29,6 +32,32 @@ def test_the_wand_is_where_it_is():
         true = transform(ARENA.wand_pose(t_ns * 1e-9), ARENA.wand.points)
         assert np.abs(points - true).max() < 5e-3
     assert n_seen > 10
+
+
+def test_a_wand_of_two_markers_is_where_it_is():
+    """In any order of its ends, which look alike, whenever two cameras see both."""
+    wand = Body(diameter_m=0.1, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
+    arena = replace(ring(3), wand=wand)
+    messages, n_seen = record(arena, 4.0, free_running=False), 0
+    for t_ns in sorted({m.t_ns for m in messages}):
+        frames = latest_frames(messages, t_ns)
+        if sum(len(frame) == 2 for frame in frames.values()) < 2:
+            continue
+        n_seen += 1
+        points = locate_wand(arena.truth.placed(), wand, frames)
+        assert points is not None
+        true = transform(arena.wand_pose(t_ns * 1e-9), wand.points)
+        assert min(np.abs(points - true).max(), np.abs(points[::-1] - true).max()) < 5e-3
+    assert n_seen > 10
+
+
+def test_two_roundels_at_another_distance_are_no_wand():
+    wand = Body(diameter_m=0.1, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
+    arena = replace(ring(3), wand=wand)
+    other = Body(diameter_m=0.1, markers=((0.0, 0.0, 0.0), (0.9, 0.0, 0.0)))
+    messages = record(arena, 2.0, free_running=False)
+    times = sorted({m.t_ns for m in messages})
+    assert all(locate_wand(arena.truth.placed(), other, latest_frames(messages, t)) is None for t in times)
 
 
 def test_nothing_is_located_without_two_placed_cameras():

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
@@ -18,11 +19,13 @@ from calib.commands.wand import Wand
 from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames
 from calib.live.wand_session import (
+    GONE_S,
     IDLE_S,
     SessionProgress,
     StoppingRule,
     Trial,
     WandSession,
+    is_wand_gone,
     run_wand_session,
     select_blocks,
     summarize,
@@ -61,7 +64,9 @@ def sending(
 def test_a_session_ends_when_a_trial_is_precise_enough():
     """20 s of recording at 0.02 px, all at once: by the first trial, pixel noise dominates."""
     arena, shown = ring(3), []
-    settings = WandSession(rig=arena.intrinsics, wand=arena.wand, seconds=90.0, trial_every_s=1.0)
+    settings = WandSession(
+        rig=arena.intrinsics, wand=arena.wand, seconds=90.0, trial_every_s=1.0, stops_without_wand=False
+    )
     with sending(record(arena, 20.0, sigma_px=0.02)) as (client, done):
         collected, reason = run_wand_session(client, "test", settings, shown.append)
         done()
@@ -89,6 +94,53 @@ def test_a_session_ends_after_its_time_or_by_the_user():
             run_wand_session(client, "test", replace(settings, seconds=0.1))
 
 
+GOOD = Trial(noise_ratio={"a": 0.3, "b": 0.1}, used={"a": 0.6, "b": 0.9})
+SPARSE = replace(GOOD, used={"a": 0.2, "b": 0.9}, advice={"a": "wave in its left"})
+NOISY = replace(GOOD, noise_ratio={"a": 0.4, "b": 0.1})  # (1 + 0.4^2)^1/2 = 1.077
+INCOMPLETE = replace(GOOD, unplaced={"c": "it never saw the wand"})
+
+
+def waved(seconds: float, at_s: float) -> CollectedFrames:
+    """Frames of a waved wand, whose last one arrived at a time of the session."""
+    collected = CollectedFrames()
+    messages = sorted(record(ring(2), seconds), key=lambda message: message.t_ns)
+    for message in messages:
+        collected.add(encode(message), at_s + (message.t_ns - messages[-1].t_ns) * 1e-9)
+    return collected
+
+
+def test_a_session_without_a_wand_ends_once_the_cameras_are_placed():
+    """Roundels that do not move are no wand. Before the first motion there is nothing to end."""
+    collected, still = waved(3.0, at_s=5.0), CollectedFrames()
+    last = max(record(ring(2), 3.0), key=lambda message: message.t_ns)
+    for k in range(60):
+        later = msgspec.structs.replace(last, t_ns=last.t_ns + (k + 1) * 10**9)
+        collected.add(encode(later), 5.0 + k)
+        still.add(encode(later), 5.0 + k)
+    assert collected.moved_s is not None
+    assert 4.0 < collected.moved_s < 6.5
+    assert still.moved_s is None
+    end_s = collected.moved_s + GONE_S
+    for trial, trials, ends in (
+        (GOOD, True, True),
+        (SPARSE, True, True),
+        (INCOMPLETE, True, False),
+        (Trial("it failed"), True, False),
+        (None, True, False),
+        (None, False, True),
+    ):
+        assert not is_wand_gone(collected, end_s - 0.1, trial, trials)
+        assert is_wand_gone(collected, end_s + 0.1, trial, trials) == ends
+    assert not is_wand_gone(still, 99.0, GOOD, True)
+
+
+def test_a_pause_is_reported():
+    collected = waved(3.0, at_s=5.0)
+    assert "moved" not in summarize(collected, 6.0, GOOD, False).advice
+    collected.last_seen_s = dict.fromkeys(collected.last_seen_s, 10.0)
+    assert summarize(collected, 10.0, GOOD, False).advice.startswith("no roundel has moved for 5 s: wave on")
+
+
 def test_ctrl_c_ends_a_session_and_keeps_its_frames():
     arena = ring(2)
     settings = WandSession(rig=arena.intrinsics, wand=arena.wand, seconds=60.0, trials=False)
@@ -112,12 +164,6 @@ def test_cameras_that_stop_sending_are_named():
     assert collected.silent_cameras(2.9) == []
     assert summarize(collected, 5.0, None, False).advice.startswith("'cam1': no frames")
     assert summarize(collected, 8.0, None, False).advice.startswith("no camera sends")
-
-
-GOOD = Trial(noise_ratio={"a": 0.3, "b": 0.1}, used={"a": 0.6, "b": 0.9})
-SPARSE = replace(GOOD, used={"a": 0.2, "b": 0.9}, advice={"a": "wave in its left"})
-NOISY = replace(GOOD, noise_ratio={"a": 0.4, "b": 0.1})  # (1 + 0.4^2)^1/2 = 1.077
-INCOMPLETE = replace(GOOD, unplaced={"c": "it never saw the wand"})
 
 
 def test_the_stopping_rule_needs_all_cameras_precise_and_the_area_used_or_idle():

@@ -9,7 +9,13 @@ import pytest
 from tests.conftest import ROOT
 
 CAMERA_NODE, FUSION = ROOT / "camera_node" / "native", ROOT / "fusion" / "native"
-LAYERS = (("numeric",), ("fit",), ("search", "verify"), ("blur", "reference"), (".",))  # the lowest first
+LAYERS = (
+    ("numeric",),
+    ("fit", "lens"),
+    ("search", "verify"),
+    ("blur", "reference"),
+    (".",),
+)  # the lowest first
 LEVEL = {folder: level for level, folders in enumerate(LAYERS) for folder in folders}
 
 

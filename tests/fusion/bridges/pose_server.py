@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import zenoh
@@ -14,7 +14,7 @@ import zenoh
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.messages import RobotPose, RobotPoses
 from tests.conftest import ROOT
 from tests.waiting import DEADLINE_S, wait_for
 
@@ -43,6 +43,14 @@ def moving_pose(robot: str, t_ns: int, seed: int = 1, state: str = "tracked") ->
         covariance=(A @ A.T).astype("<f4").tobytes(),
         n_markers=3,
     )
+
+
+def publish_poses(session: zenoh.Session, poses: Sequence[RobotPose]) -> None:
+    """Publish poses as a server does: all in one message, and each on the key of its robot."""
+    encoded = {Keys(ARENA).robot_pose(pose.robot): encode(pose) for pose in poses}
+    session.put(Keys(ARENA).poses, RobotPoses.join(tuple(encoded.values())))
+    for key, data in encoded.items():
+        session.put(key, data)
 
 
 class PoseServer:
@@ -98,7 +106,7 @@ class PoseServer:
             for seed, robot in enumerate((*self.robots, "gone")):
                 pose = moving_pose(robot, t_ns, seed, "lost" if robot == "gone" else "tracked")
                 self.published[robot, t_ns] = pose
-                session.put(self._keys.robot_pose(robot), encode(pose))
+            publish_poses(session, [self.published[robot, t_ns] for robot in (*self.robots, "gone")])
 
 
 @contextlib.contextmanager

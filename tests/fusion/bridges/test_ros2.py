@@ -18,7 +18,6 @@ from zenoh.ext import Int64, z_deserialize
 
 from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
-from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.bridges.ros2 import Ros2Node, ros_name
@@ -26,6 +25,7 @@ from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, 
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.messages import RobotPose
+from tests.fusion.bridges.pose_server import publish_poses
 
 DEADLINE_S = 60.0
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -160,8 +160,7 @@ def bridging(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
 def repeat(session: zenoh.Session, poses: list[RobotPose], done: threading.Event) -> None:
     """Publish the poses repeatedly, as a server does."""
     while not done.wait(0.05):
-        for pose in poses:
-            session.put(Keys("test").robot_pose(pose.robot), encode(pose))
+        publish_poses(session, poses)
 
 
 @pytest.mark.parametrize("humble", [False, True])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Recordings survive what happens to recorders: existing files, signals, full disks, power cuts."""
 
+import math
 import random
 import signal
 import subprocess
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording import MAX_LOST, MIN_CHUNK, RecordingWriter, read_messages
 from calib.rig.recording_repair import repair_recording
 from camera_node.errors import ConfigError
 from fusion.commands.repair import repair
@@ -69,6 +70,20 @@ def recorder(
         finally:
             process.kill()
             process.communicate()
+
+
+def test_what_a_cut_off_loses_and_what_the_recorder_remembers_are_a_small_share(tmp_path: Path):
+    """Chunks of 64 kB cost a recorder 1 MB of memory a minute, by 2 kB of index for each."""
+    size = 30_000
+    write(tmp_path / "long.mcap", entries(1500, size))
+    with (tmp_path / "long.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = [(chunk.chunk_start_offset, chunk.uncompressed_size) for chunk in summary.chunk_indexes]
+    assert all(chunk < max(MIN_CHUNK, MAX_LOST * offset) + 2 * size for offset, chunk in chunks)
+    end = MAX_LOST * (tmp_path / "long.mcap").stat().st_size / MIN_CHUNK
+    assert end > 2  # so that the chunks must have grown
+    assert len(chunks) <= (1 + math.log(end)) / MAX_LOST
 
 
 def test_an_existing_recording_is_not_overwritten(tmp_path):

@@ -42,6 +42,7 @@ KEYS_OF_MESSAGES = (
     KEYS.detections("other"),
     KEYS.camera_status("cam0"),
     KEYS.robot_pose("a"),
+    KEYS.poses,
     KEYS.markers,
     KEYS.fusion_status,
     KEYS.rig,

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 
 import msgspec
 import numpy as np
@@ -16,11 +17,12 @@ from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
-from fusion.protocol.messages import FusionStatus, RobotPose
+from fusion.protocol.messages import FusionStatus, RobotPose, RobotPoses
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, connected, live, send, serving, until
+from tests.waiting import Inbox
 
 
 def test_detections_become_poses_and_markers(tmp_path):
@@ -199,11 +201,36 @@ def test_poses_can_be_awaited_and_iterated(tmp_path):
         send_later.join(DEADLINE_S)
 
 
+def test_each_pose_is_published_once_with_others_and_once_on_its_robots_key(tmp_path):
+    """A subscriber of all keys receives the second only."""
+    together, alone = Inbox(), Inbox()
+    with serving(config(tmp_path)) as (server, client):
+        subscribers = [
+            client.session.declare_subscriber(
+                KEYS.poses, lambda sample: together.put(sample.payload.to_bytes())
+            ),
+            client.session.declare_subscriber(
+                "test/**", lambda s: alone.put((str(s.key_expr), s.payload.to_bytes()))
+            ),
+        ]
+        until(lambda: client.status(DEADLINE_S).next())
+        send(server, live(ARENA.messages(12)))
+        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        until(lambda: client.status(DEADLINE_S).next())
+        for subscriber in subscribers:
+            subscriber.undeclare()
+    single = Counter(data for key, data in alone.items if key == KEYS.robot_pose("a"))
+    joined = Counter(encode(pose) for data in together.items for pose in decode(data, RobotPoses).poses)
+    assert joined == single
+    assert set(single.values()) == {1}
+    assert all("@" not in key for key, _ in alone.items)
+
+
 def test_undecodable_poses_are_counted(tmp_path):
     with serving(config(tmp_path)) as (server, client):
-        server.session.put(KEYS.robot_pose("a"), b"nonsense")
+        server.session.put(KEYS.poses, b"nonsense")
         status = client.status(DEADLINE_S)
-        until(lambda: status.next() and client.faults["RobotPose"] == 1)
+        until(lambda: status.next() and client.faults["RobotPoses"] == 1)
 
 
 def test_the_process_of_the_server_has_no_threads_for_linear_algebra():

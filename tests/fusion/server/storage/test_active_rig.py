@@ -4,16 +4,20 @@
 import logging
 import os
 import shutil
+import time
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from calib.live.rig_requests import set_rig
-from calib.rig.rig import Rig, dump_rig, load_rig
+from calib.rig.history import History
+from calib.rig.messages import RigHistory
+from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena as Client
+from fusion.commands.history import history
 from fusion.server.config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
 from tests.fusion.serving import ARENA, DEADLINE_S, config, connected, live, run_program, send, serving, until
@@ -136,11 +140,66 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
         assert done.stdout == expected
         assert client.rig(DEADLINE_S) == GIVEN
         assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.extrinsics.pinned == {"cam1"}
+        assert server.pipeline.tracker.monitors.extrinsics.pinned == {"cam1"}
         done = run_program("fusion", "redo", *where)
         assert done.stdout == "the undone rig is in force on the server; changed cameras: cam1\n"
         done = run_program("fusion", "redo", *where)
         assert (done.returncode, "no undone version" in done.stderr) == (2, True)
+
+
+def states(client: Client) -> list[tuple[str, str, str]]:
+    """State, change and file of each version."""
+    return [(v.state, v.change, v.file) for v in client.rig_history().versions]
+
+
+def test_the_history_names_each_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """With its time and sender, also after a restart; an undone version stays in the list."""
+    settings = saving(tmp_path, with_rig=False)
+    with serving(settings) as (_, client):
+        assert client.rig_history() == RigHistory()
+        client.set_rig(GIVEN)
+        before_ns = time.time_ns()
+        client.set_rig(numbered(1))
+        client.set_rig(FEWER)
+        client.undo_rig()
+    with serving(settings) as (server, client):
+        assert states(client) == [
+            ("earlier", f"{len(GIVEN.cameras)} cameras placed", "rig.saved.1.yaml"),
+            ("in force", "clock offset of cam0", "rig.saved.yaml"),
+            ("undone", "cam2, cam3 not placed, clock offset of cam0", "rig.saved.undone.1.yaml"),
+        ]
+        versions = client.rig_history().versions
+        assert [version.source and version.source.program for version in versions] == ["fusion.client"] * 3
+        assert 0 < versions[1].t_ns - before_ns < 60 * 10**9
+        history(connect=tuple(server.endpoints), arena="test")
+    lines = capsys.readouterr().out.splitlines()
+    assert ["clock offset of cam0, by fusion.client of" in line for line in lines] == [False, True, True]
+
+
+def test_a_history_without_files(tmp_path: Path):
+    """Of a server that saves nothing: the rig of the configuration, then its changes."""
+    with serving(config(tmp_path)) as (_, client):
+        placed = f"{len(GIVEN.cameras)} cameras placed"
+        assert states(client) == [("in force", placed, "")]
+        client.set_rig(numbered(1))
+        assert states(client) == [("earlier", placed, ""), ("in force", "clock offset of cam0", "")]
+
+
+@pytest.mark.parametrize("step", ["set", "undo"])
+def test_a_file_that_the_sender_wrote_before_is_one_step(tmp_path: Path, step: str):
+    """`calib wand --live --out` and `calib undo --live` write the file in which the server saves its rig."""
+    settings = saving(tmp_path, with_rig=False)
+    path = Path(settings.saved_rig or "")
+    with serving(settings) as (_, client):
+        client.set_rig(numbered(1))
+        client.set_rig(numbered(2))
+        if step == "set":
+            save_rig(numbered(3), path)
+        else:
+            History(path).undo()
+        client.set_rig(load_rig(path))
+        offsets = [offset_of(load_rig(tmp_path / version.file)) for version in client.rig_history().versions]
+        assert offsets == ([1, 2, 3] if step == "set" else [1, 2])
 
 
 def loaded(given: Path, saved: Path) -> Rig | None:

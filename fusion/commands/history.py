@@ -1,18 +1,53 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion undo` and `fusion redo`: step through the history of the running server's rig."""
+"""`fusion history`, `fusion undo` and `fusion redo`: list the versions of the running server's rig, and step through
+them."""
 
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 import zenoh
 
-from calib.live.rig_requests import redo_rig, request_rig, undo_rig
-from calib.rig.messages import RigMessage
+from calib.live.rig_requests import redo_rig, request_rig, request_rig_history, undo_rig
+from calib.rig.messages import RigMessage, RigVersion
 from camera_node.protocol.session import open_client
 from camera_node.terminal import say
+from camera_node.text import printable
 from fusion.model.corrections import corrected_camera
+
+
+def history(
+    *,
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
+    arena: str = "arena",
+    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+) -> int:
+    """List the versions of the running server's rig, oldest first: when each was made, by whom, and what it changed.
+
+    An undo restores the line above the one in force, a redo the line below.
+
+    Args:
+        connect: the server's Zenoh endpoints.
+        arena: the arena's name.
+        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+    """
+    with open_client(connect, zenoh_config) as session:
+        versions = request_rig_history(session, arena).versions
+    for version in versions:
+        say(_line(version))
+    if not versions:
+        say("the server has no rig yet; calibrate with roundel calibrate wand --live")
+    return 0
+
+
+def _line(version: RigVersion) -> str:
+    made = datetime.fromtimestamp(version.t_ns / 1e9).isoformat(" ", "seconds")
+    by = version.source or "the server or a file"
+    where = version.file or "in no file"
+    text = f"{version.state:8}  {made}  {where}: {version.change or 'unknown change'}, by {by}"
+    return printable(text)
 
 
 def undo(

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Changes of a rig: what differs from the rig before, when it was made and by whom.
+
+A saved rig has its change as a comment in its first line, so that a numbered version takes it along.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig, dump_rig
+from camera_node.arrays import Array
+from camera_node.geometry.lens import Lens
+from camera_node.protocol.requests import RequestSource
+
+MOVED_MM = 0.05  # a smaller motion of a camera is none
+MAX_NAMED = 3  # cameras whose motion is named
+MAX_CHANGE = 1000  # characters of the text of a change
+MARK = "# changed: "
+MAX_LINE = 4096  # bytes of a first line
+RIGID_M = 1e-4  # that a common motion of all cameras leaves, at most
+
+
+class RigChange(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A change of the rig.
+
+    Attributes:
+        t_ns: when it was made.
+        change: what differs from the rig before; empty where unknown.
+        source: who asked for it; None for the server itself, and where unknown.
+    """
+
+    t_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    change: Annotated[str, msgspec.Meta(max_length=MAX_CHANGE)] = ""
+    source: RequestSource | None = None
+
+    def line(self) -> str:
+        """The first line of the rig's file."""
+        return f"{MARK}{msgspec.json.encode(self).decode()}\n"
+
+
+def read_change(path: Path) -> RigChange:
+    """The change that made a saved rig; of a file without it, the time of the last modification.
+
+    Raises:
+        OSError: the file can't be read.
+    """
+    with path.open("rb") as file:
+        line = file.readline(MAX_LINE)
+    mark = MARK.encode()
+    if line.startswith(mark):
+        try:
+            return msgspec.json.decode(line[len(mark) :], type=RigChange)
+        except (msgspec.MsgspecError, ValueError):  # edited by hand
+            pass
+    return RigChange(t_ns=path.stat().st_mtime_ns)
+
+
+def holds_rig(path: Path, rig: Rig) -> bool:
+    """Whether a file holds a rig as `save_rig` writes it, whatever its first line says of the change."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    return (text.partition("\n")[2] if text.startswith(MARK) else text) == dump_rig(rig)
+
+
+def describe_change(before: Rig | None, after: Rig) -> str:
+    """What changed from one rig to the next: cameras that were placed, removed, renamed or moved, lenses and clocks."""
+    new, old = after.placed(), before.placed() if before is not None else {}
+    if before is None:
+        return f"{len(new)} cameras placed"
+    renamed = _renamed(before.cameras, after.cameras)
+    both = sorted(after.cameras.keys() & before.cameras.keys())
+    parts = [f"{was} renamed {name}" for name, was in renamed.items()]
+    parts += _describe_motion(old, new)
+    parts += _name_some("{} placed", sorted(new.keys() - old.keys() - renamed.keys()))
+    parts += _name_some("{} not placed", sorted(old.keys() - new.keys() - set(renamed.values())))
+    now, then = after.cameras, before.cameras
+    parts += _name_some("lens of {}", [name for name in both if _lens(now[name]) != _lens(then[name])])
+    offsets = [name for name in both if now[name].time_offset_ms != then[name].time_offset_ms]
+    parts += _name_some("clock offset of {}", offsets)
+    return ", ".join(parts) or "the same poses"
+
+
+def _renamed(old: dict[str, Camera], new: dict[str, Camera]) -> dict[str, str]:
+    """The old name of each camera that has another one."""
+    gone, added = old.keys() - new.keys(), sorted(new.keys() - old.keys())
+    return {name: was for name in added for was in sorted(gone) if new[name] == old[was]}
+
+
+def _describe_motion(old: dict[str, Camera], new: dict[str, Camera]) -> list[str]:
+    both = sorted(new.keys() & old.keys())
+    moved = {name: mm for name in both if (mm := _moved_mm(old[name], new[name])) > MOVED_MM}
+    if len(moved) > 1 and _is_one_motion([old[name] for name in both], [new[name] for name in both]):
+        return ["floor and origin"]
+    most = sorted(moved, key=moved.__getitem__, reverse=True)
+    parts = [f"{name} {moved[name]:.1f} mm" for name in most[:MAX_NAMED]]
+    return parts + ([f"{len(moved) - MAX_NAMED} more"] if len(moved) > MAX_NAMED else [])
+
+
+def _moved_mm(old: Camera, new: Camera) -> float:
+    return 1e3 * float(np.linalg.norm(new.matrix()[:3, 3] - old.matrix()[:3, 3]))
+
+
+def _is_one_motion(old: list[Camera], new: list[Camera]) -> bool:
+    """Whether one motion moves all old poses to the new ones."""
+    motion: Array = new[0].matrix() @ np.linalg.inv(old[0].matrix())
+    errors = [np.abs(motion @ a.matrix() - b.matrix()).max() for a, b in zip(old, new, strict=True)]
+    return max(errors) < RIGID_M
+
+
+def _name_some(text: str, names: list[str]) -> list[str]:
+    """A text about some cameras; of many, with their number."""
+    if not names:
+        return []
+    return [text.format(", ".join(names) if len(names) <= MAX_NAMED else f"{len(names)} cameras")]
+
+
+def _lens(camera: Camera) -> tuple[object, ...]:
+    return tuple(getattr(camera, name) for name in Lens.__struct_fields__)

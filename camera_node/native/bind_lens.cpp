@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "bind_lens.hpp"
+
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <array>
+
+#include "lens/known_lens.hpp"
+
+namespace nb = nanobind;
+using roundel::DiscMeasurement;
+
+template <typename Shape>
+using Column = nb::ndarray<const double, Shape, nb::c_contig, nb::device::cpu>;
+using Values = Column<nb::shape<-1>>;
+using Pairs = Column<nb::shape<-1, 2>>;
+using Covariances = Column<nb::shape<-1, DiscMeasurement::kCount, DiscMeasurement::kCount>>;
+
+/// The ellipses and offsets of N roundels, as `DetectedRoundels` has them, and their covariances.
+struct Measurements {
+    Pairs uv, axes;
+    Values angle;
+    Pairs offset;
+    Covariances covariance;
+
+    DiscMeasurement operator[](size_t k) const {
+        DiscMeasurement m{
+            {uv(k, 0), uv(k, 1), axes(k, 0), axes(k, 1), angle(k)}, {offset(k, 0), offset(k, 1)}, {}};
+        constexpr size_t n = DiscMeasurement::kCount;
+        for (size_t i = 0; i < n; ++i)
+            for (size_t j = 0; j < n; ++j) m.covariance[i][j] = covariance(k, i, j);
+        return m;
+    }
+};
+
+static roundel::Lens make_lens(bool is_fisheye, const Values& numbers) {
+    constexpr size_t kBasic = 4, kMost = kBasic + roundel::Lens::kDistortion;
+    if (numbers.size() < kBasic || numbers.size() > kMost)
+        throw nb::value_error("a lens has fx, fy, cx, cy and up to 12 distortion numbers");
+    std::array<double, kMost> all{};
+    std::copy_n(numbers.data(), numbers.size(), all.data());
+    std::array<double, roundel::Lens::kDistortion> distortion;
+    std::copy(all.begin() + kBasic, all.end(), distortion.begin());
+    return {is_fisheye, all[0], all[1], all[2], all[3], distortion};
+}
+
+/// One row a roundel: u, v, major, minor, angle, the covariance of u, v as uu, uv, vv, and chi-square.
+static nb::object constrain(const roundel::Lens& lens, double lens_sigma, const Pairs& uv, const Pairs& axes,
+                            const Values& angle, const Pairs& offset, const Covariances& covariance) {
+    constexpr size_t kColumns = 9;
+    const size_t n = uv.shape(0);
+    if (axes.shape(0) != n || angle.shape(0) != n || offset.shape(0) != n || covariance.shape(0) != n)
+        throw nb::value_error("all columns must have one row for each roundel");
+    auto* rows = new double[std::max<size_t>(1, n * kColumns)];
+    const nb::capsule owner(rows, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+    const Measurements measured{uv, axes, angle, offset, covariance};
+    for (size_t k = 0; k < n; ++k) {
+        const auto [e, cov, chi2] = roundel::constrain_to_lens(measured[k], lens, lens_sigma);
+        const std::array row{e.x, e.y, e.major, e.minor, e.angle, cov.xx, cov.xy, cov.yy, chi2};
+        std::copy(row.begin(), row.end(), rows + k * kColumns);
+    }
+    return nb::cast(nb::ndarray<nb::numpy, double>(rows, {n, kColumns}, owner));
+}
+
+void bind_lens(nb::module_& m) {
+    nb::class_<roundel::Lens>(m, "Lens")
+        .def(
+            "__init__",
+            [](roundel::Lens* lens, bool is_fisheye, const Values& numbers) {
+                new (lens) roundel::Lens(make_lens(is_fisheye, numbers));
+            },
+            nb::arg("is_fisheye"), nb::arg("numbers"))
+        .def("constrain", &constrain, nb::arg("lens_sigma"), nb::arg("uv"), nb::arg("axes_px"),
+             nb::arg("angle_rad"), nb::arg("offset_px"), nb::arg("pose_cov"));
+}

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Updates the states of robots with detections of which some may be wrong.
+
+A robot that its detections contradict keeps its prediction. If the residuals of all robots are unusual, the camera that
+causes them is left out of the frame set (`residual_monitor`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera_node.arrays import Array
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.states import States
+from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
+from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
+
+CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobustFit:
+    """An update: the states, and the assignments that fit, with residuals.
+
+    Attributes:
+        prediction: the robots before the update.
+        squared: (N,) squared residuals of the assignments in standard deviations.
+        n_rejected: observations of the robots that these contradict.
+    """
+
+    states: States
+    assignments: Assignments
+    prediction: Prediction
+    squared: Array
+    n_rejected: int
+
+    @property
+    def cost(self) -> float:
+        """See `cost_of`."""
+        corrections = self.states.minus(self.prediction.states)
+        return cost_of(self.squared, self.n_rejected, corrections, self.prediction.information)
+
+
+class RobustUpdate:
+    """Updates robots, and learns which residuals are usual.
+
+    Args:
+        estimator: of the robots.
+        markers: of the robots.
+    """
+
+    def __init__(self, estimator: Estimator, markers: MarkerTable) -> None:
+        self._estimator, self._markers = estimator, markers
+        self._residuals = ResidualMonitor()
+
+    def inherit(self, old: "RobustUpdate") -> None:
+        """Continue with the usual residuals of other robots."""
+        self._residuals = old._residuals
+
+    def update(
+        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
+    ) -> RobustFit:
+        """The updated states, and the assignments that fit."""
+        fitted = self._fit(prediction, detections, assignments)
+        if self._residuals.is_unusual(fitted.assignments.squared_px):
+            return self._leave_one_out(prediction, detections, assignments, fitted)
+        return fitted
+
+    def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> RobustFit:
+        """The updated states; a robot that its detections contradict stays as predicted and loses them."""
+        observations = MatchedObservations.of(assignments, detections, self._markers)
+        states, residuals = self._estimator.update(prediction, observations)
+        assignments = assignments.with_residuals(residuals)
+        body, n = observations.discs.body, len(prediction.states)
+        squared = misfit(observations, residuals)
+        contradicted = mean_by_body(squared > MAX_CHI2, body, n) > CONTRADICTED
+        rows, fits = np.flatnonzero(contradicted), ~contradicted[body]
+        if len(rows):
+            states = states.with_rows(rows, prediction.states.select(rows))
+        n_rejected = len(body) - int(fits.sum())
+        return RobustFit(states, assignments.select(fits), prediction, squared[fits], n_rejected)
+
+    def _leave_one_out(
+        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments, fitted: RobustFit
+    ) -> RobustFit:
+        """The fit without the camera that contradicts predictions and all others, if there is one."""
+        camera = detections.camera[assignments.detection]
+        without = {
+            k: self._fit(prediction, detections, assignments.select(camera != k))
+            for k in np.unique(camera).tolist()
+        }
+        at_fault = camera_at_fault(fitted.cost, {k: fit.cost for k, fit in without.items()})
+        if at_fault is None:
+            self._residuals.learn(fitted.assignments.squared_px)
+            return fitted
+        return without[at_fault]
