@@ -24,8 +24,10 @@ class CameraExposures:
 class DiscColumns:
     """N discs, each in one frame and on one body."""
 
-    def __init__(self, frame: Index, body: Index, position: Array, normal: Array, radius: Array, /) -> None:
-        """Frame, body and radius (N,); position and unit normal (3, N) in the frame of the body."""
+    def __init__(
+        self, frame: Index, body: Index, position: Array, normal: Array, radius: Array, delay: Array, /
+    ) -> None:
+        """Frame, body, radius and delay (N,), s after the frame; position and unit normal (3, N), body frame."""
 
 class FramePoses:
     """The poses of all bodies at the capture times of all frames."""
@@ -50,8 +52,10 @@ class FramePoses:
 class DetectionColumns:
     """N detections sorted by frame."""
 
-    def __init__(self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, /) -> None:
-        """Frame and major (N,), xy (2, N), scale and cov (2, 2, N)."""
+    def __init__(
+        self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, delay: Array, /
+    ) -> None:
+        """Frame, major and delay (N,), s after the frame; xy (2, N), scale and cov (2, 2, N)."""
 
 class ExpectedMarkers:
     """M markers of tracked bodies, with the covariances of their positions."""

@@ -16,8 +16,8 @@ from camera_node.errors import CameraAbsentError, ConfigError
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
 from camera_node.service import ServiceManager, stopped_by_signals
 from camera_node.sources.address import without_credentials
+from camera_node.sources.drivers import local_cameras
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.v4l2 import camera_names
 from camera_node.supervisor import Supervisor
 from camera_node.terminal import say
 
@@ -70,8 +70,10 @@ class JoinArena:
         self.relative.check()
         if self.zenoh is not None and not (self.connect or self.listen):
             raise ConfigError("--zenoh needs --connect: a protected server is not found by scouting")
-        if not self.source and not camera_names():
-            raise CameraAbsentError("this machine has no camera; plug one in, or give --source")
+        if not self.source and not local_cameras():
+            raise CameraAbsentError(
+                "this machine has no camera; plug one in, or give --source (roundel camera --list shows them)"
+            )
 
     def _check_listen(self) -> None:
         if self.listen and self.connect:
@@ -111,7 +113,7 @@ def given_options(settings: SourceSettings | RelativeSettings) -> list[str]:
         word
         for name, value in values.items()
         if value != defaults[name]
-        for word in (f"--{name.replace('_', '-')}", str(value))
+        for word in (f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value]))
     ]
 
 
@@ -136,7 +138,7 @@ class LocalCameras:
     def start(self) -> None:
         """Start a node for each source that has none yet."""
         self._next_look_s = time.monotonic() + LOOK_S
-        present = self._sources or tuple(str(device) for device in camera_names())
+        present = self._sources or tuple(local_cameras())
         self._seen &= set(present)  # a camera that was unplugged may come back
         for source in present:
             if source not in self._seen:

@@ -19,12 +19,13 @@ struct ExpectedMarker {
 };
 
 /// N detections sorted by frame: undistorted centres, Jacobians of raw pixels with respect to them, pixel
-/// covariances, and full major axes (NaN where unknown).
+/// covariances, full major axes (NaN where unknown), and the times from the frame to the capture of the
+/// detection's row by a rolling shutter, seconds.
 struct Detections {
     const int64_t* frame;
     Columns<2> xy;
     Columns<4> scale, cov;
-    const double* major;
+    const double *major, *delay;
 
     size_t size() const { return xy.n; }
 };

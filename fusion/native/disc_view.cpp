@@ -19,16 +19,27 @@ DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc) {
 }
 
 FramePoses::FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures)
-    : n_bodies_(bodies.size()), exposures_(exposures) {
+    : n_bodies_(bodies.size()), bodies_(bodies), exposures_(exposures) {
     poses_.reserve(exposures_.size() * n_bodies_);
     for (const Exposure& exposure : exposures_)
         for (const Body& body : bodies) poses_.push_back(transform(body, exposure));
 }
 
+Exposure FramePoses::exposure(const Discs& discs, size_t k) const {
+    Exposure row = exposures_[discs.frame[k]];
+    row.tau += discs.delay[k];
+    return row;
+}
+
+BodyInCamera FramePoses::at(const Discs& discs, size_t k) const {
+    if (discs.delay[k] == 0) return at(discs.frame[k], discs.body[k]);
+    return transform(bodies_[discs.body[k]], exposure(discs, k));
+}
+
 void view_discs(const FramePoses& poses, const Discs& discs, double* to) {
     const size_t n = discs.size();
     for (size_t k = 0; k < n; ++k) {
-        const DiscView seen = view_disc(poses.at(discs.frame[k], discs.body[k]), discs.at(k));
+        const DiscView seen = view_disc(poses.at(discs, k), discs.at(k));
         double* row = to + k;
         for (const Vector& v : {seen.centre, seen.normal, seen.q})
             for (const double value : {v.x, v.y, v.z}) *row = value, row += n;

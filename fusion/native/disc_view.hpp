@@ -62,18 +62,24 @@ class FramePoses {
     size_t n_bodies() const { return n_bodies_; }
     const std::vector<Exposure>& exposures() const { return exposures_; }
     const BodyInCamera& at(size_t frame, size_t body) const { return poses_[frame * n_bodies_ + body]; }
+    /// The pose of the body of disc `k` when its image was captured.
+    BodyInCamera at(const struct Discs& discs, size_t k) const;
+    /// The exposure of the row of disc `k`.
+    Exposure exposure(const struct Discs& discs, size_t k) const;
 
   private:
     size_t n_bodies_;
+    std::vector<Body> bodies_;
     std::vector<Exposure> exposures_;
     std::vector<BodyInCamera> poses_;
 };
 
-/// N discs, each in one frame and on one body. `position` and the unit `normal` are in the frame of the body.
+/// N discs, each in one frame and on one body. `position` and the unit `normal` are in the frame of the body;
+/// `delay` is the time from the frame to the capture of the disc's row by a rolling shutter, seconds.
 struct Discs {
     const int64_t *frame, *body;
     Columns<3> position, normal;
-    const double* radius;
+    const double *radius, *delay;
 
     size_t size() const { return position.n; }
     DiscOnBody at(size_t k) const { return {position.vector(k), normal.vector(k), radius[k]}; }

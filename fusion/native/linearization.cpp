@@ -66,7 +66,8 @@ void write_shears(const Shear (&at)[3], const PlaneAxes& about, double sigma, Eq
 void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
+        const Exposure exposure = poses.exposure(discs, k);
+        const BodyInCamera body = poses.at(discs, k);
         const DiscOnBody disc = discs.at(k);
         const DiscView expected = view_disc(body, disc);
         const double x = observed.xy.at(0, k) - expected.x, y = observed.xy.at(1, k) - expected.y;
@@ -75,8 +76,7 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
         for (int a = 0; a < 2; ++a) {
             const double wx = observed.whiten.at(2 * a, k), wy = observed.whiten.at(2 * a + 1, k);
             double* row = to[k].A[a];
-            write_row(differentiate(expected, disc.radius, wx, wy), body, poses.exposures()[discs.frame[k]],
-                      disc, row);
+            write_row(differentiate(expected, disc.radius, wx, wy), body, exposure, disc, row);
             if (observed.single[discs.body[k]]) write(row + 6, {0, 0, 0});
             row[kErrors] = wx * x + wy * y;
         }
@@ -86,7 +86,7 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
 void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
+        const BodyInCamera body = poses.at(discs, k);
         const DiscView expected = view_disc(body, discs.at(k));
         to[k] = {};
         const Shape measured =

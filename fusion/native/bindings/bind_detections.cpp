@@ -15,17 +15,18 @@ struct DetectionColumns {
     Index frame;
     Pairs xy;
     Matrices2 scale, cov;
-    Numbers major;
+    Numbers major, delay;
 
     DetectionColumns(const Index& frames, const Pairs& xys, const Matrices2& scales, const Matrices2& covs,
-                     const Numbers& majors)
-        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors) {
-        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size()});
+                     const Numbers& majors, const Numbers& delays)
+        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors), delay(delays) {
+        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), delay.size()});
     }
 
     Detections view() const {
         const size_t n = frame.size();
-        return {frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n), major.data()};
+        return {frame.data(),       columns<2>(xy, n), columns<4>(scale, n),
+                columns<4>(cov, n), major.data(),      delay.data()};
     }
 };
 
@@ -84,7 +85,8 @@ auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const I
 void bind_detections(nb::module_& m) {
     m.attr("SLACK_PX") = kSlackPx;
     nb::class_<DetectionColumns>(m, "DetectionColumns")
-        .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&>());
+        .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&,
+                      const Numbers&>());
     nb::class_<Markers>(m, "ExpectedMarkers")
         .def("__init__", &make_expected)
         .def("covariances", &covariances)

@@ -113,6 +113,25 @@ def test_equations_of_outlines_equal_difference_quotients():
     assert_near(found, rows, atol=1e-6)
 
 
+def test_rows_of_a_rolling_shutter_are_frames_of_their_own():
+    """Discs that are captured some time after their frames have the views and equations of frames at that time."""
+    states, seen = scene()
+    exposures, n = seen.detections.exposures, len(seen)
+    delay = np.random.default_rng(4).uniform(-0.02, 0.02, n)
+    rows = replace(exposures, **{k: getattr(exposures, k)[seen.discs.frame] for k in exposures.__slots__})
+    rows = replace(rows, tau=rows.tau + delay)
+    discs = replace(seen.discs, delay=delay), replace(seen.discs, frame=np.arange(n), delay=None)
+    poses = ARRAY.frame_poses(states, exposures), ARRAY.frame_poses(states, rows)
+    given = seen.detections.xy, seen.whiten, np.zeros(BODIES, bool)
+    outlines = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, np.full(n, 0.1)
+    for call in (
+        lambda p, d: p.views(d.columns),
+        lambda p, d: p.linearize_centres(d.columns, *given),
+        lambda p, d: p.linearize_outlines(d.columns, *outlines),
+    ):
+        assert_near(call(poses[0], discs[0]), call(poses[1], discs[1]))
+
+
 def test_sums_and_weights_equal_reweighted_least_squares():
     random = np.random.default_rng(8)
     rows, body = random.normal(size=(200, 2, 13)), random.integers(0, 5, 200)
@@ -218,9 +237,9 @@ def test_indices_and_lengths_are_checked():
     position, normal, radius = seen.discs.position, seen.discs.normal, seen.discs.radius
     for wrong in (body + BODIES, body - BODIES):
         with pytest.raises(IndexError):
-            poses.views(_core.DiscColumns(frame, wrong, position, normal, radius))
+            poses.views(_core.DiscColumns(frame, wrong, position, normal, radius, 0 * radius))
     with pytest.raises(ValueError, match="lengths"):
-        _core.DiscColumns(frame, body, position[:, 1:].copy(), normal, radius)
+        _core.DiscColumns(frame, body, position[:, 1:].copy(), normal, radius, 0 * radius)
     with pytest.raises(IndexError):
         _core.residuals(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
 
@@ -236,7 +255,7 @@ def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
     exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     poses = _core.FramePoses(_core.BodyStates(R, ahead, still, still), exposures)
     up = np.tile([[0.0], [0.0], [1.0]], n)
-    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), up, np.full(n, 0.04))
+    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), up, np.full(n, 0.04), np.zeros(n))
     scale = np.tile(800 * np.eye(2)[..., None], n)
     axes = np.tile([[30.0], [10.0]], n)
     rows = poses.linearize_outlines(discs, axes, np.zeros(n), scale, np.full(n, 0.1))
