@@ -24,6 +24,7 @@ from tests.web.roundel.programs import Program, roundel, roundel_command
 
 # The tests that run the commands of a page which are not in the README.
 TESTED = {
+    "recordings.md": "tests/fusion/recordings/test_recordings_page.py",
     "clients.md": "tests/examples/test_clients.py",
     "bridges.md": "tests/fusion/bridges/test_bridges_page.py",
     "security.md": "tests/security/test_security_page.py",

@@ -139,6 +139,13 @@ class Estimator:
             P[self.single] = reset_unobservable(P[self.single])
         return replace(states.retract(solution.delta), P=P), _in_pixels(observations, solution.residuals)
 
+    def innovations(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
+        """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
+        seen, discs = observations.detections, observations.discs
+        poses = self.cameras.frame_poses(states, seen.exposures)
+        equations = poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
+        return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
+
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the bodies."""
         return Estimator(self.cameras, self.densities[rows], self.single[rows])
