@@ -296,6 +296,10 @@ def _reason(table: TrackTable, k: int, question: Question, identified: Identifie
     if k in identified.rivals:
         rival = identified.rivals[k]
         return "its markers fit in several places" if rival == k else f"ambiguous with {table.names[rival]}"
+    if k in identified.unexplained:
+        return (
+            "some of its markers fit, but the cameras do not detect most of the others that they should see"
+        )
     if k not in found.tables or not len(found.tables[k]):
         return _too_few(table.robots[k], question.scene)
     return f"no {MIN_MARKERS} of its {n} markers fit well anywhere"
