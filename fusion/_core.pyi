@@ -24,8 +24,10 @@ class CameraExposures:
 class DiscColumns:
     """N discs, each in one frame and on one body."""
 
-    def __init__(self, frame: Index, body: Index, position: Array, radius: Array, /) -> None:
-        """Frame, body and radius (N,); position (3, N) in the frame of the body."""
+    def __init__(
+        self, frame: Index, body: Index, position: Array, normal: Array, radius: Array, delay: Array, /
+    ) -> None:
+        """Frame, body, radius and delay (N,), s after the frame; position and unit normal (3, N), body frame."""
 
 class FramePoses:
     """The poses of all bodies at the capture times of all frames."""
@@ -50,14 +52,18 @@ class FramePoses:
 class DetectionColumns:
     """N detections sorted by frame."""
 
-    def __init__(self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, /) -> None:
-        """Frame and major (N,), xy (2, N), scale and cov (2, 2, N)."""
+    def __init__(
+        self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, delay: Array, /
+    ) -> None:
+        """Frame, major and delay (N,), s after the frame; xy (2, N), scale and cov (2, 2, N)."""
 
 class ExpectedMarkers:
     """M markers of tracked bodies, with the covariances of their positions."""
 
-    def __init__(self, R: Array, P: Array, body: Index, position: Array, radius: Array, /) -> None:
-        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,) and position (3, M) by marker."""
+    def __init__(
+        self, R: Array, P: Array, body: Index, position: Array, normal: Array, radius: Array, /
+    ) -> None:
+        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,), position and normal (3, M) by marker."""
 
     def covariances(self, tau: float, /) -> Array:
         """(M, 3, 3) covariances of world positions, tau seconds after the time of the states."""
@@ -80,20 +86,35 @@ class MarkerCloud:
     """N triangulated markers, among which constellations are searched for."""
 
     def __init__(
-        self, positions: Array, covariances: Array, slack_m: float, sigmas: float, reach_m: float, /
+        self,
+        positions: Array,
+        covariances: Array,
+        to_cameras: Array,
+        slack_m: float,
+        sigmas: float,
+        reach_m: float,
+        /,
     ) -> None:
-        """Positions (N, 3) and covariances (N, 3, 3).
+        """Positions (N, 3), covariances (N, 3, 3), vectors to the cameras that saw each (N, C, 3), NaN for others.
 
         A distance is known to `slack_m` + `sigmas` standard deviations; constellations extend over `reach_m`.
         """
 
     def mappings(
-        self, distances: Array, usable: NDArray[np.bool_], max_steps: int, max_mappings: int, /
+        self,
+        distances: Array,
+        angles: Array,
+        usable: NDArray[np.bool_],
+        max_steps: int,
+        max_mappings: int,
+        /,
     ) -> tuple[Index, bool]:
         """Maximal mappings (K, M) of three or more markers of a constellation to points, -1 for unseen markers.
 
-        `distances` (M, M) are the constellation's; `usable` (N,) says which points may be its markers. False if there
-        are more mappings, with as many markers as one limit allows or fewer; beyond `max_steps` there are none.
+        `distances` and `angles` (M, M) are the constellation's: between markers, and between the normal of the marker
+        of the row and the direction to that of the column, rad; `usable` (N,) says which points may be its markers.
+        False if there are more mappings, with as many markers as one limit allows or fewer; beyond `max_steps` there
+        are none.
         """
 
 def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ from tests.web.roundel.programs import Program, roundel, roundel_command
 
 # The tests that run the commands of a page which are not in the README.
 TESTED = {
+    "recordings.md": "tests/fusion/recordings/test_recordings_page.py",
     "clients.md": "tests/examples/test_clients.py",
     "bridges.md": "tests/fusion/bridges/test_bridges_page.py",
     "security.md": "tests/security/test_security_page.py",
@@ -31,6 +32,7 @@ TESTED = {
     "lab.md": "tests/test_docs.py",
     "import_export.md": "tests/test_docs.py",
     "network_cameras.md": "tests/test_docs.py",
+    "cameras.md": "tests/camera_node/commands/test_camera_reports.py",
     "detector_seen_refused.md": "tests/test_docs.py",
 }
 # They change the machine, or need a container engine; tests/test_lab.py checks the services.

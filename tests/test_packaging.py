@@ -45,7 +45,7 @@ def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
     subprocess.run(probe, check=True, timeout=60, cwd=tmp_path, env=env)
     # `roundel` and the programs that it starts work in the checkout too, where the sources have no native modules.
     command = [*probe[:2], "-P", "-c", "from web.roundel.command import main; main()"]
-    picture = [*command, "detect", str(ROOT / "docs" / "demo.png")]
+    picture = [*command, "detect", str(ROOT / "docs" / "detector_seen_refused.png")]
     subprocess.run(picture, check=True, timeout=60, cwd=ROOT, env=env, stdout=subprocess.DEVNULL)
     child = [sys.executable, "-S", "-m", "camera_node", "detect", "--help"]
     env["PYTHONSAFEPATH"] = "1"  # as `roundel` sets it

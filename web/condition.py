@@ -31,6 +31,8 @@ def assess(state: ArenaState, endpoint: str) -> Condition:
         state: of a feed.
         endpoint: where the server is expected.
     """
+    if is_relative(state):
+        return _relative_condition(state)
     faults = [*_server_faults(state, endpoint), *_camera_faults(state), *_robot_faults(state)]
     for level in ("wait", "bad", "warn"):
         found = [fault for fault in faults if fault.level == level]
@@ -40,8 +42,24 @@ def assess(state: ArenaState, endpoint: str) -> Condition:
     return Condition("ok", _figures(state))
 
 
+def is_relative(state: ArenaState) -> bool:
+    """Whether cameras locate roundels by themselves, without a server: nothing is to be calibrated or declared."""
+    located = any(state.age_s(timed) <= STALE_S for timed in state.relative.values())
+    return located and state.status is None and not state.server_alive
+
+
+def _relative_condition(state: ArenaState) -> Condition:
+    for fault in _silent_cameras(state):
+        return fault
+    n = sum(state.age_s(timed) <= STALE_S for timed in state.relative.values())
+    verb = "locates" if n == 1 else "locate"
+    return Condition("ok", f"{_count(n, 'camera')} {verb} roundels relative to themselves, without a server")
+
+
 def next_step(state: ArenaState) -> Step:
     """What the operator should do next, in the order of the work."""
+    if is_relative(state):
+        return "run"
     if not any(camera_silence_s(state, name) is None for name in state.cameras):
         return "cameras"
     if state.rig is None or not state.rig.placed():
@@ -69,9 +87,7 @@ def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
 def _camera_faults(state: ArenaState) -> Iterator[Condition]:
     if state.age_s(state.status) > STALE_S:
         return
-    silent = {name: s for name in sorted(state.cameras) if (s := camera_silence_s(state, name)) is not None}
-    for name, seconds in silent.items():
-        yield Condition("bad", f"camera {name} {describe_silence(seconds)}")
+    yield from _silent_cameras(state)
     if not state.cameras:
         yield Condition("warn", "no camera sends anything: start one with roundel camera")
         return
@@ -79,8 +95,14 @@ def _camera_faults(state: ArenaState) -> Iterator[Condition]:
         yield Condition("warn", "the cameras are not calibrated: open Calibrate and record a wand")
         return
     for row in tabulate_cameras(state).rows:
-        if row.note and row.cells[0] not in silent:
+        if row.note and camera_silence_s(state, row.cells[0]) is None:
             yield Condition("warn", f"camera {row.cells[0]}: {row.note}")
+
+
+def _silent_cameras(state: ArenaState) -> Iterator[Condition]:
+    for name in sorted(state.cameras):
+        if (seconds := camera_silence_s(state, name)) is not None:
+            yield Condition("bad", f"camera {name} {describe_silence(seconds)}")
 
 
 def _robot_faults(state: ArenaState) -> Iterator[Condition]:

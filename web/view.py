@@ -16,7 +16,7 @@ from web.feed import ArenaState, Feed
 from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding
 from web.scene.cameras import CameraDrawing
-from web.scene.markers import MarkerCloud, TruePoints
+from web.scene.markers import MarkerCloud, MarkerDiscs, TruePoints
 from web.scene.relative import RelativeFrames
 from web.scene.robots import RobotDrawing
 from web.scene.surroundings import FIELD_OF_VIEW, add_floor, add_lights, default_viewpoint
@@ -60,6 +60,7 @@ class View:
         self.cameras = CameraDrawing(self.server.scene)
         self._robots = RobotDrawing(self.server.scene)
         self._markers = MarkerCloud(self.server.scene)
+        self.discs = MarkerDiscs(self.server.scene)
         self.true_points = TruePoints(self.server.scene)
         self._relative = RelativeFrames(self.server.scene)
         add_lights(self.server.scene)
@@ -97,6 +98,7 @@ class View:
                 self._draw_rig(state.rig)
             self._robots.draw(state, is_slow=self._drawings % SLOW_INTERVAL == 0)
             self._markers.draw(state)
+            self.discs.draw(state)
             self.true_points.draw(state)
             self._relative.draw(state)
             if self._drawings % PANEL_INTERVAL == 0:

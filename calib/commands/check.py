@@ -16,7 +16,7 @@ from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
-from calib.wand.quality.grade import assess
+from calib.wand.quality.assessment import assess
 from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body

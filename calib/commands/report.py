@@ -16,6 +16,9 @@ from camera_node.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
 CLEAR = 3.0  # standard deviations, from which a clock drift is printed
+MAX_READOUT_SIGMA_MS = (
+    2.0  # of a readout time that counts as determined: 1 mm at the edge of the image at 1 m/s
+)
 MAX_GROSS = 0.15  # share of gross errors, above which a recording contradicts itself
 MAX_OUTLIERS = 5  # that are listed one by one
 
@@ -27,6 +30,7 @@ def print_report(result: WandCalibration, quality: RigQuality) -> None:
     for line in [
         *_remarks(result.report),
         *_drifts(result),
+        *_readouts(result),
         *([f"warning: camera {result.jump.camera}: {result.jump.sentence()}"] if result.jump else []),
         *lenses,
         *(quality.expected.lines() if quality.expected else []),
@@ -81,6 +85,19 @@ def _drifts(result: WandCalibration) -> list[str]:
         return []
     rows = zip(result.names, result.drift_ppm, result.drift_sigma_ppm, strict=True)
     return ["clock drift, ppm: " + ", ".join(f"{n} {d:+.1f} ± {s:.1f}" for n, d, s in rows)]
+
+
+def _readouts(result: WandCalibration) -> list[str]:
+    if not (result.readout_sigma_ms > 0).any():
+        return []
+    rows = zip(result.names, result.readout_ms, result.readout_sigma_ms, strict=True)
+    shown = (
+        f"{name} {ms:+.2f} ± {sigma:.2f}"
+        if sigma < MAX_READOUT_SIGMA_MS
+        else f"{name} not determined ({sigma:.0f})"
+        for name, ms, sigma in rows
+    )
+    return ["rolling shutter, readout time of the image, ms: " + ", ".join(shown)]
 
 
 def _remarks(report: WandReport) -> list[str]:

@@ -25,7 +25,7 @@ from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
 from calib.wand.bundle_adjustment.lens_prior import widen_lenses
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.grade import assess
+from calib.wand.quality.assessment import assess
 from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import Distance
 from camera_node.errors import ConfigError

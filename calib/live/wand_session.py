@@ -28,7 +28,7 @@ from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames, collect_frames
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.grade import assess
+from calib.wand.quality.assessment import assess
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

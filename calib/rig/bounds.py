@@ -8,6 +8,7 @@ from typing import Any
 
 from calib.rig.camera import Camera
 from camera_node.config import NAME_RULE, is_name
+from camera_node.protocol.messages import MAX_READOUT_US
 
 MAX_CAMERAS = 256
 MAX_IMAGE_PX = 64e6  # pixels of one image; the server computes a table of the lens in 3 s and 0.7 GB
@@ -47,6 +48,8 @@ def _find_fault(camera: Camera) -> str:
         return f"a distortion number is beyond {MAX_DISTORTION:g}"
     if not abs(camera.time_offset_ms) <= MAX_TIME_OFFSET_MS:  # NaN is not
         return f"time_offset_ms must be within {MAX_TIME_OFFSET_MS:g} ms"
+    if not abs(camera.readout_us or 0.0) <= MAX_READOUT_US:
+        return f"readout_us must be within {MAX_READOUT_US:g}"
     return _find_fault_of_pose(camera)
 
 

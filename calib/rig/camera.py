@@ -13,10 +13,10 @@ from camera_node.geometry.pose import Pose, invert, skew
 AnyLens = TypeVar("AnyLens", bound=Lens)
 
 # The parameters of one camera, by their columns in every Jacobian and covariance: rotation and translation in the
-# camera's own frame, time offset, clock drift, and of the lens: log focal length (mean of fx and fy), cx, cy, k1,
-# log fx / fy, and the four distortion coefficients after k1, of which a fisheye has three.
-POSE, OFFSET, DRIFT, LENS = tuple(range(6)), (6,), (7,), tuple(range(8, 17))
-PER_CAMERA = 17
+# camera's own frame, time offset, clock drift, readout time, and of the lens: log focal length (mean of fx and fy), cx,
+# cy, k1, log fx / fy, and the four distortion coefficients after k1, of which a fisheye has three.
+POSE, OFFSET, DRIFT, READOUT, LENS = tuple(range(6)), (6,), (7,), (8,), tuple(range(9, 18))
+PER_CAMERA = 18
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -25,6 +25,8 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     Attributes:
         T_world_cam: the pose; None before the camera is calibrated.
         time_offset_ms: true capture time = stamp + offset.
+        readout_us: time in which a rolling shutter reads all rows, microseconds, negative from the last to the first:
+            the row at height h of the image (`image_row`) is captured h readout times later. None: as the camera says.
         covariance: (6, 6) of the pose in GTSAM's tangent order (rotation, then translation, both in the camera's
             frame), rad and m; None where unknown.
         lens_sigma: standard deviations of the lens's `parameters`, in their order; None where never measured.
@@ -32,6 +34,7 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
     T_world_cam: Pose | None = None
     time_offset_ms: float = 0.0
+    readout_us: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
     lens_sigma: tuple[float, ...] | None = None
 
@@ -52,6 +55,10 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         uv = np.asarray(uv, float).reshape(-1, 2)
         inside = (uv >= -0.5) & (uv < [self.width - 0.5, self.height - 0.5])
         return inside[:, 0] & inside[:, 1]
+
+    def readout_s(self, stated_us: float) -> float:
+        """The readout time, s: the calibrated one, or `stated_us`, microseconds, of the camera's own messages."""
+        return 1e-6 * (stated_us if self.readout_us is None else self.readout_us)
 
     def matrix(self) -> Array:
         """T_world_cam as a (4, 4) matrix.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
-from calib.rig.camera import POSE, Camera, pixel_jacobians, transform
+from calib.rig.camera import LENS, OFFSET, POSE, Camera, pixel_jacobians, transform
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
@@ -145,8 +145,8 @@ def _world_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...])
 def camera_jacobians(camera: Lens, points: Array, parameters: tuple[int, ...] = POSE) -> Array:
     """(N, 2, d) derivatives of the pixels of points (N, 3), camera frame, by the camera's `parameters`.
 
-    Parameters are numbered as in `calib.rig.camera`. Time offset and drift do not move points at rest.
+    Parameters are numbered as in `calib.rig.camera`. Times do not move points at rest.
     """
     _, _, J_pose, J_lens = pixel_jacobians(camera, points)
-    clock = np.zeros((len(points), 2, 2))
+    clock = np.zeros((len(points), 2, LENS[0] - OFFSET[0]))
     return np.concatenate([J_pose, clock, J_lens], axis=2)[:, :, list(parameters)]

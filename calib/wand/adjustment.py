@@ -6,16 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
-from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.rig.camera import LENS, POSE
+from calib.wand.bundle_adjustment.clock_model import (
+    ClockModel,
+    choose_clocks,
+    clock_candidates,
+    with_readout_times,
+)
+from calib.wand.bundle_adjustment.covariance import inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize, optimize_robustly
 from calib.wand.bundle_adjustment.problem import (
-    CRYSTAL_DRIFT,
-    SLEWED_DRIFT,
     Estimate,
-    Problem,
     State,
     WandObservations,
 )
@@ -29,7 +32,6 @@ from camera_node.arrays import Array, Mask
 COARSE_SETS, FINE_SETS = 250, 1000  # frame sets of either stage
 MAX_MEASURED = 20_000  # detections whose residuals are stated
 RUN, PARTS = 8, 5  # of this many parts of a recording, runs of consecutive instants, one is held out
-MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ def adjust_rig(recording: LabeledRecording, rough: RoughRig) -> Solution:
     check_lenses(recording.names, coarse)
     check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
-    clocks = _choose_clocks(coarse)
+    clocks = choose_clocks(coarse)
     fine = _prepare_fine(recording, rough, coarse, clocks)
     solution = _adjust_finely(fine, coarse.inflation)
     check_agreement(recording.names, solution.adjusted, solution.observations)
@@ -105,7 +107,7 @@ def _validate(recording: LabeledRecording, solution: Solution) -> Solution:
     given = triangulated_residuals(corrected, adjusted.state)
     residuals = np.full(len(measured), np.nan)
     residuals[measured] = np.linalg.norm(given.pixels, axis=1)
-    run = np.unique(corrected.detections.t_s, return_inverse=True)[1] // RUN
+    run = recording.timing.instants(corrected.detections.t_s) // RUN
     last = np.zeros(len(measured), bool)
     last[measured] = run % PARTS == PARTS - 1
     held_out = corrected.select(last[measured])
@@ -158,54 +160,18 @@ def _build(recording: LabeledRecording, rough: RoughRig, budget: int) -> Estimat
 def adjust_coarsely(recording: LabeledRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
     """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
     start = _build(recording, rough, budget)
-    problem = start.problem.with_free(POSE, *_clock_candidates(recording, start.problem))
+    problem = start.problem.with_free(POSE, *clock_candidates(recording.timing, start.problem))
     state = optimize_robustly(problem, start.observations, start.state)
     # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
     # motion absorbs noise and the residuals are too small.
     density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
-    return adjust(problem, observations, state)
-
-
-def _clock_candidates(recording: LabeledRecording, problem: Problem) -> tuple[tuple[int, ...], ...]:
-    """The clock parameters that the recording may show."""
-    if recording.timing.synchronous:
-        return ()
-    return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
-
-
-@dataclass(frozen=True, slots=True)
-class _ClockModel:
-    """Groups of clock parameters that are free, (C, 2) initial offsets and drifts, and the prior of the drift."""
-
-    free: tuple[tuple[int, ...], ...]
-    clocks: Array
-    drift_sigma: float
-
-
-def _choose_clocks(coarse: Adjusted) -> _ClockModel:
-    """Which clock parameters the recording shows. With an offset, the drift is free too: a clock that runs on its own
-    drifts, though a short recording may not show it."""
-    candidates = tuple(group for group in (OFFSET, DRIFT) if group[0] in coarse.problem.free)
-    shown = tuple(group for group in candidates if _is_significant(coarse, group))
-    free = candidates if OFFSET in shown else shown
-    clocks = np.where([OFFSET in shown, DRIFT in shown], coarse.state.clocks, 0.0)
-    return _ClockModel(free, clocks, SLEWED_DRIFT if DRIFT in shown else CRYSTAL_DRIFT)
-
-
-def _is_significant(coarse: Adjusted, group: tuple[int, ...]) -> bool:
-    """Whether the clocks differ in a parameter, by Schwarz's criterion (BIC) with the inflated covariance and the
-    number of independent observations that it implies."""
-    values = coarse.state.clocks[:, group[0] - OFFSET[0]]
-    values = values - values.mean()
-    cov = camera_covariance(coarse).of(group)[:, 0, :, 0]
-    squared = values @ np.linalg.pinv(cov, rcond=1e-9, hermitian=True) @ values
-    return bool(squared > (len(values) - 1) * np.log(2 * coarse.used.sum() / coarse.inflation))
+    return with_readout_times(adjust(problem, observations, state), observations, recording.timing)
 
 
 def _prepare_fine(
-    recording: LabeledRecording, rough: RoughRig, coarse: Adjusted, clocks: _ClockModel
+    recording: LabeledRecording, rough: RoughRig, coarse: Adjusted, clocks: ClockModel
 ) -> Estimate:
     """The problem of the fine stage, from the coarse stage's cameras, lenses and clocks."""
     lenses = [coarse.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]

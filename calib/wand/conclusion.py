@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, Camera
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera
 from calib.rig.rig import Rig
 from calib.wand.adjustment import Solution
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
@@ -59,10 +59,11 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
     covariance = camera_covariance(adjusted)
     offsets, offset_sigma = clock_values(adjusted.state, covariance, OFFSET, 1e3)
     drift, drift_sigma = clock_values(adjusted.state, covariance, DRIFT, 1e6)
+    readout, readout_sigma = clock_values(adjusted.state, covariance, READOUT, 1e3)
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
     size = 6 * len(placement.names)
     return WandCalibration(
-        rig=_place(rig, adjusted.state, covariance, placement, offsets),
+        rig=_place(rig, adjusted, covariance, placement, offsets),
         report=_build_report(replace(solution, adjusted=adjusted), covariance, placement),
         names=placement.names,
         adjusted=adjusted,
@@ -72,6 +73,8 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
         time_sigma_ms=offset_sigma,
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,
+        readout_ms=readout + 1e3 * adjusted.problem.readout_s,
+        readout_sigma_ms=readout_sigma,
         jump=find_jump(placement.names, adjusted, observations),
     )
 
@@ -79,35 +82,41 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
 def clock_values(
     state: State, covariance: CameraCovariance, part: tuple[int, ...], unit: float
 ) -> tuple[Array, Array]:
-    """Return values and standard deviations (C,) of a clock parameter, OFFSET or DRIFT, times `unit`."""
+    """Return values and standard deviations (C,) of a clock parameter, OFFSET, DRIFT or READOUT, times `unit`."""
     values = state.clocks[:, part[0] - OFFSET[0]]
     sigma = np.sqrt(np.einsum("cpcp->c", covariance.of(part)))
     return values * unit, sigma * unit
 
 
 def adjusted_camera(
-    camera: Camera, state: State, covariance: CameraCovariance, k: int, offset_ms: float
+    camera: Camera, adjusted: Adjusted, covariance: CameraCovariance, k: int, offset_ms: float
 ) -> Camera:
-    """Return the camera with the adjusted lens and pose of index k, their covariances, and a time offset."""
-    lens = state.lens(k, camera)
+    """Return the camera with the adjusted lens, pose and readout time of index k, their covariances, and a time
+    offset."""
+    state = adjusted.state
+    lens, readout_us = state.lens(k, camera), camera.readout_us
+    if READOUT[0] in adjusted.problem.free:
+        readout_us = 1e6 * float(adjusted.problem.readout_s[k] + state.clocks[k, 2])
     lens_sigma = np.sqrt(np.diag(covariance.of(LENS)[k, :, k]))
     return msgspec.structs.replace(
         camera.with_parameters(lens.parameters),
         T_world_cam=Pose.from_matrix(state.cameras[k]),
         time_offset_ms=offset_ms,
+        readout_us=readout_us,
         covariance=tuple(tuple(row) for row in covariance.of(POSE)[k, :, k].tolist()),
         lens_sigma=parameter_sigma(lens, camera.lens_sigma, lens_sigma),
     )
 
 
 def _place(
-    rig: Rig, state: State, covariance: CameraCovariance, placement: Placement, offset_ms: Array
+    rig: Rig, adjusted: Adjusted, covariance: CameraCovariance, placement: Placement, offset_ms: Array
 ) -> Rig:
     cameras = dict(rig.cameras)
     for name in placement.unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
     for k, name in enumerate(placement.names):
-        cameras[name] = adjusted_camera(cameras[name], state, covariance, k, float(offset_ms[k]))
+        cameras[name] = adjusted_camera(cameras[name], adjusted, covariance, k, float(offset_ms[k]))
+    state = adjusted.state
     T_world = upright_frame(state.cameras, state.motion[:, 0].reshape(-1, 3))
     return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 

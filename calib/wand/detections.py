@@ -9,12 +9,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.camera import Camera
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 
 MAX_CLOCK_ERROR_S = 1.0  # bound for a timestamp without a clock error: above any difference of camera clocks
-HEADER = ("camera", "t_ns", "clock_error_us")
+HEADER = ("camera", "t_ns", "clock_error_us", "readout_us")
 # Columns of a `Detections` message: element type, and elements per roundel.
 COLUMNS = {
     "uv": ("<f8", 2),
@@ -45,10 +46,12 @@ class FrameTable:
     Attributes:
         camera: (F,) index of the camera.
         t_s: (F,) timestamp of the middle of the exposure, seconds after the first frame.
+        readout_s: (F,) given readout time, seconds; 0 of a global shutter or if unknown.
     """
 
     camera: Index
     t_s: Array
+    readout_s: Array
 
     def period_s(self) -> float:
         """Return the median time between consecutive frames of a camera, seconds; 0 if no camera has two."""
@@ -62,7 +65,8 @@ class WandDetections:
 
     Attributes:
         camera, frame: (n,) indices of the camera and of the frame.
-        t_s: (n,) timestamp of the frame, seconds.
+        t_s: (n,) timestamp of the frame, seconds; of the detection's row where the readout time is given.
+        image_row: (n,) height in the image, -1/2 to 1/2 (`Lens.image_row`).
         stamp_sigma_s: (n,) standard deviation of the timestamp, without the offset common to the camera's timestamps.
         label: (n,) marker of the wand, -1 if unknown.
         uv: (n, 2) centre of the ellipse, raw pixels.
@@ -74,6 +78,7 @@ class WandDetections:
     camera: Index
     frame: Index
     t_s: Array
+    image_row: Array
     stamp_sigma_s: Array
     label: Index
     uv: Array
@@ -96,7 +101,7 @@ class WandDetections:
 
 
 def gather(
-    messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Lens]
+    messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Camera]
 ) -> tuple[FrameTable, WandDetections]:
     """Collect the detections of the cameras `names` from their messages.
 
@@ -104,16 +109,21 @@ def gather(
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
-    camera_of, t_ns, bound_us, *columns = zip(*map(attrgetter(*HEADER, *COLUMNS), messages), strict=True)
+    camera_of, t_ns, bound_us, stated_us, *columns = zip(
+        *map(attrgetter(*HEADER, *COLUMNS), messages), strict=True
+    )
     camera = np.array([index[name] for name in camera_of], np.intp)
-    frames = FrameTable(camera, (np.array(t_ns) - min(t_ns)) * 1e-9)
+    readout_s = np.array([lenses[k].readout_s(us) for k, us in zip(camera, stated_us, strict=True)])
+    frames = FrameTable(camera, (np.array(t_ns) - min(t_ns)) * 1e-9, readout_s)
     tables = [_read_column(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
     uv, cov, axes_px, angle_rad, number = tables
     frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])
+    image_row = image_rows(lenses, camera[frame], uv)
     detections = WandDetections(
         camera[frame],
         frame,
-        frames.t_s[frame],
+        frames.t_s[frame] + readout_s[frame] * image_row,
+        image_row,
         stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
         number[:, 0].astype(np.intp),
         uv,
@@ -123,6 +133,14 @@ def gather(
         normalise(lenses, camera[frame], uv),
     )
     return frames, detections.select(np.flatnonzero(np.isfinite(detections.xy).all(axis=1)))
+
+
+def image_rows(lenses: Sequence[Lens], camera: Index, uv: Array) -> Array:
+    """Return (n,) heights in the image of pixels (n, 2) of the cameras (n,), see `Lens.image_row`."""
+    rows = np.empty(len(uv))
+    for k, lens in enumerate(lenses):
+        rows[camera == k] = lens.image_row(uv[camera == k])
+    return rows
 
 
 def normalise(lenses: Sequence[Lens], camera: Index, uv: Array) -> Array:

@@ -57,10 +57,12 @@ def label_recording(
         CalibrationError: see `label`.
     """
     names = sorted({message.camera for message in messages})
-    lenses: list[Lens] = [rig.cameras[name] for name in names]
+    lenses = [rig.cameras[name] for name in names]
     frames, detections = gather(messages, names, lenses)
     timing = Timing(frames.period_s(), synchronous)
-    return WandRecording(names, lenses, frames, timing, *label(frames, timing, detections, wand, lenses))
+    return WandRecording(
+        names, list(lenses), frames, timing, *label(frames, timing, detections, wand, lenses)
+    )
 
 
 def label(

@@ -11,6 +11,7 @@ from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE
 from calib.rig.rig import Rig
 from calib.wand.adjustment import Solution
+from calib.wand.bundle_adjustment.clock_model import with_readout_times
 from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
@@ -130,7 +131,8 @@ def _adjust(recording: LabeledRecording, start: Estimate, this: int) -> Solution
     problem = replace(start.problem.with_free(POSE, clock), estimated=(this,))
     state = optimize_robustly(problem, start.observations, start.state)
     observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
-    first = inflate_covariance(adjust(problem.with_free(POSE, clock, LENS), observations, state))
+    first = adjust(problem.with_free(POSE, clock, LENS), observations, state)
+    first = inflate_covariance(with_readout_times(first, observations, recording.timing))
     check_lenses(recording.names, first)
     problem = estimate_lens_priors(first.problem, first)
     adjusted = inflate_covariance(adjust(problem, observations, first.state))
@@ -143,7 +145,7 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
     covariance, T = camera_covariance(adjusted), adjusted.state.cameras[this]
     cov = covariance.of(POSE)[this, :, this]
     offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted.state, covariance, OFFSET, 1e3))
-    camera = adjusted_camera(before, adjusted.state, covariance, this, float(offset_ms))
+    camera = adjusted_camera(before, adjusted, covariance, this, float(offset_ms))
     used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
     return Recalibration(

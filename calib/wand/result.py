@@ -229,6 +229,8 @@ class WandCalibration:
             standard deviations, 0 if the data need no offsets.
         drift_ppm, drift_sigma_ppm: (C,) growth of the offsets, microseconds per second, mean 0; and standard
             deviations.
+        readout_ms, readout_sigma_ms: (C,) readout times of rolling shutters, and standard deviations, 0 where they are
+            only given.
         jump: the clock jump during the recording, if there is one.
     """
 
@@ -242,6 +244,8 @@ class WandCalibration:
     time_sigma_ms: Array
     drift_ppm: Array
     drift_sigma_ppm: Array
+    readout_ms: Array
+    readout_sigma_ms: Array
     jump: ClockJump | None
 
     @property
@@ -254,6 +258,7 @@ class WandCalibration:
         columns = {
             "time_offset_ms": (self.time_offset_ms, self.time_sigma_ms),
             "drift_ppm": (self.drift_ppm, self.drift_sigma_ppm),
+            "readout_ms": (self.readout_ms, self.readout_sigma_ms),
         }
         clocks = {key: self._by_camera(*column) for key, column in columns.items() if (column[1] > 0).any()}
         jump = {"clock_jump": {self.jump.camera: self.jump.as_dict()}} if self.jump else {}

@@ -27,6 +27,7 @@ BUDGET = 80  # instants that either model is fitted to
 RUN = 8  # consecutive instants that belong to the same half, so that tracks can be interpolated within it
 # Interpolation averages the noise of two frames, which by itself lowers residuals by up to 8 %: midway, the weights of
 # the cubic polynomial give half of the variance to one of two cameras.
+ROLLING = "the rows of rolling shutters are captured one after another, so the wand's motion matters"
 MIN_GAIN = 1.1  # ratio of the residuals without and with clock offsets, from which offsets are preferred
 
 
@@ -52,12 +53,16 @@ def label_by_timing(
                 "the cameras are declared synchronous, but no two cameras have frames with equal stamps; leave out "
                 "--synchronised, or give simultaneous frames the same t_ns"
             )
+        if by_clocks.frames.readout_s.any():
+            return by_clocks, f"synchronous cameras: declared, but {ROLLING}"
         return label_recording(rig, wand, messages, synchronous=True), "synchronous cameras: declared"
     if share < MIN_COINCIDENT:
         return (
             by_clocks,
             f"clock offsets are estimated: only {share:.0%} of a camera's frames share their stamps",
         )
+    if by_clocks.frames.readout_s.any():
+        return by_clocks, f"clock offsets are estimated, although frames share their stamps: {ROLLING}"
     by_stamps = label_recording(rig, wand, messages, synchronous=True)
     return _prefer(by_stamps, by_clocks, wand, share)
 
@@ -93,7 +98,7 @@ def _prefer(
 def _fit_half(recording: WandRecording, wand: Body) -> tuple[int, float]:
     """Fit every other run of instants; return the number of cameras placed, and the median residual of the others,
     pixels; infinite where nothing can be fitted."""
-    instant = np.unique(recording.detections.t_s, return_inverse=True)[1]
+    instant = recording.timing.instants(recording.detections.t_s)
     fitted = (instant // RUN) % 2 == 0
     half, pairs = _select(recording, wand, fitted)
     start = build_initial_rig(pairs, range(len(recording.names)))

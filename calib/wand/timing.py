@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.wand.detections import FrameTable
+from camera_node.arrays import Array, Index
 
 MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
@@ -45,6 +46,12 @@ class Timing:
         if not self.period_s:
             return MAX_SPREAD_S
         return min(max(self.period_s / 2, min(self.period_s, MIN_SPREAD_S)), MAX_SPREAD_S)
+
+    def instants(self, t_s: Array) -> Index:
+        """(n,) numbers of the instants at which stamps (n,) lie: of equal stamps, or of frame periods."""
+        if self.synchronous or not self.period_s:
+            return np.unique(t_s, return_inverse=True)[1]
+        return np.floor((t_s - t_s.min(initial=np.inf)) / self.period_s).astype(np.intp)
 
 
 def coincident_share(frames: FrameTable) -> float:

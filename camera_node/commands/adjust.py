@@ -22,6 +22,7 @@ from camera_node.protocol.camera_requests import (
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
 from camera_node.protocol.session import open_client
+from camera_node.sources.frame import parse_controls
 from camera_node.terminal import say
 
 
@@ -74,6 +75,10 @@ class ChangeSettings:
     """Exposure time, microseconds; turns automatic exposure off."""
     gain: float | None = None
     """In the driver's units."""
+    controls: tuple[str, ...] = ()
+    """Further controls of the camera as NAME=VALUE, such as focus_absolute=30; an unknown name lists the known ones."""
+    readout_us: float | None = None
+    """Time in which a rolling shutter reads all rows, microseconds; negative from the last row to the first."""
     min_contrast: float | None = None
     """Least contrast of a roundel, grey levels."""
     mask_detected: bool = False
@@ -93,6 +98,8 @@ class ChangeSettings:
             wanted = Settings(
                 exposure_us=self.exposure_us,
                 gain=self.gain,
+                controls=parse_controls(self.controls) or None,
+                readout_us=self.readout_us,
                 min_contrast=self.min_contrast,
                 mask=self._changed_mask(session, used, drawn),
             )

@@ -10,18 +10,21 @@ from typing import Annotated
 
 import tyro
 
+from camera_node.commands.camera_check import check_cameras
+from camera_node.commands.camera_list import list_cameras
 from camera_node.commands.relative import RelativeSettings
 from camera_node.config import require_name
 from camera_node.errors import CameraAbsentError, ConfigError
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
 from camera_node.service import ServiceManager, stopped_by_signals
 from camera_node.sources.address import without_credentials
+from camera_node.sources.drivers import local_cameras
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.v4l2 import camera_names
 from camera_node.supervisor import Supervisor
 from camera_node.terminal import say
 
 TICK_S = 0.25
+MAX_CHECK_S = 3600.0
 LOOK_S = 3.0  # between looks for cameras that were plugged in
 
 
@@ -33,8 +36,9 @@ class JoinArena:
     """
 
     source: tuple[str, ...] = ()
-    """Cameras by number (0), path (/dev/video2) or name; videos; folders of <t_ns>.png|jpg; or sim:NAME. All cameras of
-    this machine unless given, also those that are plugged in later."""
+    """Cameras by number (0), path (/dev/video2) or name; genicam:SERIAL; picamera:NUMBER; addresses of streams; videos;
+    folders of <t_ns>.png|jpg; or sim:NAME. All cameras of this machine unless given, also those that are plugged in
+    later; cameras of the network are given by name."""
     name: str | None = None
     """A fixed name for a single source; the server neither names it nor stores its settings."""
     connect: tuple[str, ...] = ()
@@ -46,13 +50,26 @@ class JoinArena:
     listen: tuple[str, ...] = ()
     """Run one camera without a server, as on a robot: be the Zenoh router that listens on these endpoints, such as
     tcp/127.0.0.1:7447, to which the robot's programs connect. Requires --name."""
+    show_list: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """Print the cameras of all drivers with their modes, and end."""
+    check: bool = False
+    """Read each camera for --seconds and report stamps, rate, losses, light and focus; publish nothing."""
+    seconds: float = 10.0
+    """Duration of --check for each camera."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print --list or --check as JSON; the list then has all controls with their limits."""
     relative: Annotated[RelativeSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=RelativeSettings)
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> int:
         """Run one node per camera until stopped, or until all recordings ended."""
+        if self.show_list:
+            return list_cameras(self.as_json)
         self._check()
         with stopped_by_signals() as stop:
+            if self.check:
+                sources = self.source or tuple(local_cameras())
+                return check_cameras(sources, self.settings, self.seconds, self.as_json, stop)
             found = self._find(stop)
             if found is None:
                 return 0
@@ -60,6 +77,7 @@ class JoinArena:
             return cameras.run(stop)
 
     def _check(self) -> None:
+        self._check_report()
         if self.arena is not None:
             require_name(self.arena, "an arena")
         if self.name is not None:
@@ -70,8 +88,16 @@ class JoinArena:
         self.relative.check()
         if self.zenoh is not None and not (self.connect or self.listen):
             raise ConfigError("--zenoh needs --connect: a protected server is not found by scouting")
-        if not self.source and not camera_names():
-            raise CameraAbsentError("this machine has no camera; plug one in, or give --source")
+        if not self.source and not local_cameras():
+            raise CameraAbsentError(
+                "this machine has no camera; plug one in, or give --source (roundel camera --list shows them)"
+            )
+
+    def _check_report(self) -> None:
+        if self.as_json and not self.check:
+            raise ConfigError("--json prints --list or --check; give one of them with it")
+        if not 0 < self.seconds <= MAX_CHECK_S:
+            raise ConfigError(f"--seconds {self.seconds:g}: give a duration of up to {MAX_CHECK_S:g} s")
 
     def _check_listen(self) -> None:
         if self.listen and self.connect:
@@ -111,7 +137,7 @@ def given_options(settings: SourceSettings | RelativeSettings) -> list[str]:
         word
         for name, value in values.items()
         if value != defaults[name]
-        for word in (f"--{name.replace('_', '-')}", str(value))
+        for word in (f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value]))
     ]
 
 
@@ -136,7 +162,7 @@ class LocalCameras:
     def start(self) -> None:
         """Start a node for each source that has none yet."""
         self._next_look_s = time.monotonic() + LOOK_S
-        present = self._sources or tuple(str(device) for device in camera_names())
+        present = self._sources or tuple(local_cameras())
         self._seen &= set(present)  # a camera that was unplugged may come back
         for source in present:
             if source not in self._seen:

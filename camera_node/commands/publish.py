@@ -18,11 +18,11 @@ from camera_node.protocol.registration import CameraAssignment, CameraRegistrati
 from camera_node.service import ServiceManager
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.address import is_url
+from camera_node.sources.drivers import driver_of
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.identity import SourceIdentity, identify, is_simulation
 from camera_node.sources.replay import ArenaTime, FrameFolder, PacedSource, VideoFile
-from camera_node.sources.stream import StreamSource
-from camera_node.sources.v4l2 import V4l2Source, find_device
+from camera_node.sources.stream import open_stream
 
 if typing.TYPE_CHECKING:
     import zenoh
@@ -39,8 +39,8 @@ class Publish:
     """
 
     source: str
-    """A camera by number (0), path (/dev/video2) or name; a video file; a folder of <t_ns>.png|jpg; or sim, or
-    sim:NAME for a camera of the scene."""
+    """A camera by number (0), path (/dev/video2) or name; genicam:SERIAL; picamera:NUMBER; the address of a stream; a
+    video file; a folder of <t_ns>.png|jpg; or sim, or sim:NAME for a camera of the scene."""
     name: str | None = None
     """The camera's name in the arena and in rig.yaml, such as cam0; the server's choice unless given."""
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -151,7 +151,7 @@ def open_source(
     text: str, settings: SourceSettings, name: str = "cam0", arena_time: ArenaTime | None = None
 ) -> Source:
     """Open the source that `--source` names: `sim`, a folder, a video file, the address of a stream, or a
-    camera by number, path or name.
+    camera of a driver.
 
     Args:
         text: the value of `--source`.
@@ -168,12 +168,13 @@ def open_source(
     if is_simulation(text):
         return _open_simulation(settings, text.partition(":")[2] or name, arena_time)
     if is_url(text):
-        return StreamSource(text)
+        return open_stream(text)
     if Path(text).is_dir():
         return PacedSource(FrameFolder(Path(text)), settings, arena_time)
     if Path(text).is_file():
         return PacedSource(VideoFile(Path(text), settings.fps), settings, arena_time)
-    return V4l2Source(find_device(text), settings)
+    driver, camera = driver_of(text)
+    return driver.open(camera, settings)
 
 
 def first_time(text: str, settings: SourceSettings) -> int | None:

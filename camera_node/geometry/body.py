@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rigid bodies with printed roundels: wands and robots."""
 
+import math
+
 import msgspec
 import numpy as np
 
@@ -8,20 +10,25 @@ from camera_node.arrays import Array
 
 Vector = tuple[float, float, float]
 MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter
+UP: Vector = (0.0, 0.0, 1.0)
+UNIT = 1e-9  # a normal whose length differs from 1 by less stays as it is, so that a saved body equals its original
 
 
 class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Roundels of one size at known positions of a rigid body, with their printed side towards +z.
+    """Roundels of one size at known positions of a rigid body.
 
     Attributes:
         diameter_m: outer diameter d_o of the black disc, metres.
         markers: centres of the roundels, body frame, metres.
+        normals: directions out of the prints, one for each marker, body frame, scaled to unit vectors; empty if all
+            are +z.
         inner_ratio: d_i / d_o, diameter of the white inner disc over d_o; 0.6 in the paper.
         surround_ratio: d / d_o, diameter of the white card over d_o; 9/7 in the paper.
     """
 
     diameter_m: float
     markers: tuple[Vector, ...] = ((0.0, 0.0, 0.0),)
+    normals: tuple[Vector, ...] = ()
     inner_ratio: float = 0.6
     surround_ratio: float = 9 / 7
 
@@ -38,8 +45,36 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             )
         if not (0.1 <= self.inner_ratio <= 0.95 and 1.0 <= self.surround_ratio <= 10):
             raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
+        self._scale_normals()
 
     @property
     def points(self) -> Array:
         """(M, 3) marker centres, body frame, metres."""
         return np.array(self.markers, float)
+
+    @property
+    def unit_normals(self) -> Array:
+        """(M, 3) directions out of the prints, body frame."""
+        return np.array(self.normals or (UP,) * len(self.markers), float)
+
+    def has_markers_of(self, other: "Body") -> bool:
+        """Whether both have the same markers, with the same normals."""
+        return self.markers == other.markers and self.normals == other.normals
+
+    def _scale_normals(self) -> None:
+        """Make unit vectors of the normals; raise ValueError where one has no direction."""
+        if self.normals and len(self.normals) != len(self.markers):
+            raise ValueError(
+                f"{len(self.normals)} normals for {len(self.markers)} markers; give one [x, y, z] for each marker, or "
+                "none if all prints face +z"
+            )
+        normals = tuple(_unit(normal) for normal in self.normals)
+        msgspec.structs.force_setattr(self, "normals", () if set(normals) <= {UP} else normals)
+
+
+def _unit(v: Vector) -> Vector:
+    length = math.hypot(*v)
+    if not 1e-6 < length < 1e6:  # False for NaN
+        raise ValueError(f"the normal {list(v)} has no direction; give a finite [x, y, z] out of the print")
+    x, y, z = v
+    return v if abs(length - 1) < UNIT else (x / length, y / length, z / length)

@@ -147,6 +147,13 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         stretch[theta > np.radians(MAX_FISHEYE_DEG)] = np.nan
         return stretch[:, None] * distorted
 
+    def image_row(self, uv: ArrayLike) -> Array:
+        """(N,) heights in the image of raw pixels (N, 2), from -1/2 at the upper edge to 1/2 at the lower one.
+
+        A rolling shutter captures them this part of its readout time after the middle of the image.
+        """
+        return (np.asarray(uv, float).reshape(-1, 2)[:, 1] + 0.5) / self.height - 0.5
+
     def rays(self, uv: ArrayLike) -> Array:
         """Unit viewing rays (N, 3), camera frame, of raw pixels (N, 2)."""
         xy = self.normalise(uv)

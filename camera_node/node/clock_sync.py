@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Converts this machine's time to the server's: by round trips over Zenoh, or directly where both share one clock.
 
-`camera_node.node.clock_offset` estimates the offset; docs/clock_offset.md describes the method.
+`camera_node.clocks.clock_offset` estimates the offset; docs/clock_offset.md describes the method.
 """
 
 import logging
@@ -10,8 +10,8 @@ import time
 
 import zenoh
 
-from camera_node.node.clock_offset import READING_NS, OffsetEstimator, RoundTrip
-from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
+from camera_node.clocks.clock_offset import READING_NS, OffsetEstimator, RoundTrip
+from camera_node.clocks.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys, MessageError, decode
 from camera_node.protocol.session import is_from_router
 

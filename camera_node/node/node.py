@@ -98,7 +98,8 @@ class Node:
         self._clock = ClockSync(session, self._keys)
         self._statistics = NodeStatistics(name)
         self.on_settings: Callable[[Settings], object] = lambda wanted: None
-        self._changing = threading.Lock()  # of the detector, by requests
+        self._readout_us: float | None = None  # as set; None: as the source says
+        self._changing = threading.Lock()  # of the settings, by requests
         self._snapshots = RateLimit(SNAPSHOTS_HZ, SNAPSHOTS_HZ)
         self._explanations = RateLimit(EXPLANATIONS_HZ, EXPLANATIONS_HZ)
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
@@ -140,7 +141,12 @@ class Node:
             ConfigError: the source or the detector does not have a setting or refuses its value.
         """
         with self._changing:
-            self._detector = apply_settings(wanted, self._source, self._detector)
+            self._apply(wanted)
+
+    def _apply(self, wanted: Settings) -> None:
+        self._detector = apply_settings(wanted, self._source, self._detector)
+        if wanted.readout_us is not None:
+            self._readout_us = wanted.readout_us
 
     def _detect(self, frame: Frame) -> DetectedFrame:
         begun_ns = time.perf_counter_ns()
@@ -171,9 +177,11 @@ class Node:
         }
 
     def _encode(self, detected: DetectedFrame, header: dict[str, Any]) -> bytes:
-        height, width = detected.frame.image.shape
+        frame = detected.frame
+        height, width = frame.image.shape
         message = Detections.pack(
             detected.published,
+            readout_us=frame.readout_us if self._readout_us is None else self._readout_us,
             detect_us=detected.detect_us,
             width=width,
             height=height,
@@ -245,15 +253,15 @@ class Node:
 
     def _publish_status(self, watch: ServerWatch, service: ServiceManager) -> None:
         publisher = self._session.declare_publisher(self._keys.camera_status(self.name))
-        announced = False
+        n_full = 0  # statuses since the first frame
         while not self._closed.wait(STATUS_S):
             try:
                 if not self._options.is_alone:
                     watch.report_absence()
                 status = self._summarize()
                 publisher.put(encode(status))
-                if status.fps > 0 and not announced:
-                    announced = True
+                n_full += status.fps > 0 or n_full > 0
+                if n_full == 2:  # the first one counts the frames of a part of its second
                     self._announce(status)
                 service.report(f"{status.fps:.1f} frames/s, {status.roundels:.1f} roundels in a frame")
             except Exception:  # the next status is another
@@ -296,11 +304,11 @@ class Node:
                 raise RequestError(f"more than {CHANGES_HZ:g} changes of settings a second; try again later")
             if payload:
                 wanted = parse_request(payload, Settings)
-                self._detector = apply_settings(wanted, self._source, self._detector)
+                self._apply(wanted)
                 log.info(
                     "settings changed by a session that claims to be %s: %s",
                     sender_of(query) or "unknown",
                     wanted,
                 )
                 self.on_settings(wanted)
-            return encode_reply(payload, read_settings(self._source, self._detector))
+            return encode_reply(payload, read_settings(self._source, self._detector, self._readout_us))

@@ -6,9 +6,15 @@ from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import Source
 
 
-def read_settings(source: Source, detector: Detector) -> Settings:
+def read_settings(source: Source, detector: Detector, readout_us: float | None = None) -> Settings:
     """The settings in use."""
-    return Settings(exposure_us=source.exposure_us, gain=source.gain, **detector.settings)
+    return Settings(
+        exposure_us=source.exposure_us,
+        gain=source.gain,
+        controls=dict(source.controls) or None,
+        readout_us=readout_us,
+        **detector.settings,
+    )
 
 
 def apply_settings(wanted: Settings, source: Source, detector: Detector) -> Detector:
@@ -23,6 +29,6 @@ def apply_settings(wanted: Settings, source: Source, detector: Detector) -> Dete
     changes = {name: getattr(wanted, name) for name in detector.settings}
     changes = {name: value for name, value in changes.items() if value is not None}
     adjusted = detector.adjusted(**changes) if changes else detector
-    if wanted.exposure_us is not None or wanted.gain is not None:
-        source.adjust(wanted.exposure_us, wanted.gain)
+    if (wanted.exposure_us, wanted.gain, wanted.controls) != (None, None, None):
+        source.adjust(wanted.exposure_us, wanted.gain, wanted.controls)
     return adjusted

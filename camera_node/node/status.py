@@ -96,6 +96,8 @@ class NodeStatistics:
                 fps=self._recent / max(1e-3, time.monotonic() - self._since),
                 frames=self._frames,
                 dropped=source.dropped,
+                incomplete=source.incomplete,
+                lost_packets=source.lost_packets,
                 detect_ms=self._detect_us / n / 1000,
                 roundels=self._roundels / n,
                 threshold=detector.threshold,

@@ -104,8 +104,8 @@ def body_page(body: Body, paper: str, name: str, title: str) -> Page | None:
     The page is the body seen from above: x points up, y left. The body's origin is a small cross.
     """
     points, half = 1e3 * body.points, 500 * body.diameter_m
-    if np.ptp(points[:, 2]) > 0:
-        return None  # roundels at different heights are on different cards
+    if np.ptp(points[:, 2]) > 0 or body.normals:
+        return None  # roundels at different heights, or on several sides, are on different cards
     width, height = paper_size(paper)
     low, high = points[:, :2].min(0) - half, points[:, :2].max(0) + half
     room = np.array([height - MARGIN_MM - FOOT_MM, width - 2 * MARGIN_MM])  # along the body's x and y

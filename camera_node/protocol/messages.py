@@ -16,6 +16,8 @@ MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_RATIOS = 16  # kinds of prints of one camera
 MAX_PREVIEW_BYTES, MAX_PREVIEW_SIDE = 1 << 16, 1024  # of a small picture; its side in pixels
+MAX_CONTROLS, MAX_CONTROL = 64, 64  # controls of one camera; characters of a name or of a text
+MAX_READOUT_US = 1e6  # a frame takes no longer
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
 COLUMNS = {  # of detections: type and number of values in each row
@@ -29,6 +31,7 @@ COLUMNS = {  # of detections: type and number of values in each row
     "track": (I4, 1),
 }
 T = TypeVar("T", bound=msgspec.Struct)
+ControlValue = bool | int | float | str  # of a camera's control, such as focus_absolute or TriggerMode
 
 
 class Keys:
@@ -86,6 +89,10 @@ class MessageError(ValueError):
 class Detections(msgspec.Struct, frozen=True, kw_only=True):
     """All roundels of one frame. `t_ns` is the middle of the exposure in the server's time (Unix, nanoseconds).
 
+    A rolling shutter exposes the rows one after another, during `readout_us`: `t_ns` is that of the middle of the
+    image, and a row at height h (`Lens.image_row`) is captured h readout times later. Where the last row is read
+    first, it is negative.
+
     Columns with one row for each roundel: `uv` (N, 2) <f8 raw pixels; `cov` (N, 3) <f4 uu, uv, vv, square pixels;
     `axes_px` (N, 2) <f4 full major and minor axis; `angle_rad`, `ratio`, `contrast` (N,) <f4;
     `id` and `track` (N,) <i4, -1 for none. Unknown values are NaN.
@@ -96,6 +103,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     seq: int
     t_ns: int
     exposure_us: float = 0.0
+    readout_us: float = 0.0  # of all rows, see above; 0 of a global shutter or if unknown
     detect_us: float = 0.0  # duration of detection
     sent_ns: int = 0  # time of publication, server's time
     clock_error_us: float = 0.0  # bound of the clock error in `t_ns`; NaN before the server's first answer
@@ -154,6 +162,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("an invalid camera name, or an impossible image size")
         if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us) and math.isfinite(self.detect_us)):
             raise MessageError("an impossible t_ns, exposure_us or detect_us")
+        if not abs(self.readout_us) <= MAX_READOUT_US:
+            raise MessageError("an impossible readout_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
         _check_ratios(self.found_ratios)
@@ -192,6 +202,8 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
     fps: float
     frames: int  # since the node started
     dropped: int  # frames skipped since the start because a newer one was available
+    incomplete: int = 0  # frames since the start that were discarded because parts of them did not arrive
+    lost_packets: int = 0  # packets of the camera's network connection since the start that never arrived
     detect_ms: float  # mean over the last second
     roundels: float  # mean number in each frame over the last second
     saturated: float  # share of pixels at the upper end of the grey levels, 0 to 1
@@ -222,14 +234,17 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that can be changed while a camera runs.
 
-    None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us` and `gain` belong
-    to the camera, the other settings to `Detector`; `mask` lists polygons of three or more [u, v], raw pixels, in which
-    roundels are ignored.
+    None leaves a setting unchanged in a request, and means unknown or unset in a reply. `exposure_us`, `gain` and
+    `controls` belong to the camera, `readout_us` says how its shutter works (`Detections`), the rest belongs to
+    `Detector`. `controls` maps names of the driver's controls to values; those that it does not name are unchanged.
+    `mask` lists polygons of three or more [u, v], raw pixels, in which roundels are ignored.
     """
 
     version: int = VERSION
     exposure_us: float | None = None
     gain: float | None = None
+    controls: dict[str, ControlValue] | None = None
+    readout_us: float | None = None
     mask: tuple[tuple[tuple[float, float], ...], ...] | None = None
     inner_ratios: tuple[float, ...] | None = None
     ratio_tolerance: float | None = None
@@ -242,8 +257,20 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """Raise MessageError where no camera can have these settings."""
         if not all(x is None or math.isfinite(x) for x in (self.exposure_us, self.gain)):
             raise MessageError("exposure and gain must be finite")
+        if self.readout_us is not None and not abs(self.readout_us) <= MAX_READOUT_US:
+            raise MessageError(f"readout_us is {self.readout_us}; give a number within {MAX_READOUT_US:g}")
         if self.exposure_us is not None and not 0 < self.exposure_us <= 1e7:
             raise MessageError(f"exposure_us is {self.exposure_us}; give a number in (0, 1e7]")
+        _check_controls(self.controls or {})
+
+
+def _check_controls(controls: dict[str, ControlValue]) -> None:
+    texts = [*controls, *(value for value in controls.values() if isinstance(value, str))]
+    if len(controls) > MAX_CONTROLS or any(len(text) > MAX_CONTROL for text in texts):
+        raise MessageError(f"more than {MAX_CONTROLS} controls, or a name or text of more than {MAX_CONTROL}")
+    numbers = [value for value in controls.values() if not isinstance(value, str)]
+    if not all(math.isfinite(value) and abs(value) < 2**63 for value in numbers):
+        raise MessageError("values of controls must be finite and below 2^63")
 
 
 class ClockReply(msgspec.Struct, frozen=True):

@@ -69,6 +69,7 @@ def describe_truth(scene: Scene, exposures: dict[str, range], epoch_ns: int) -> 
         "robots": {
             "outer_diameter_m": min((body.diameter_m for body in scene.robots.values()), default=None),
             "markers_m": {robot: body.markers for robot, body in scene.robots.items()},
+            "normals": {robot: body.unit_normals.tolist() for robot, body in scene.robots.items()},
             "poses_at_stamps_of_cam0": poses,
         },
     }

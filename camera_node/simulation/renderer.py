@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert
+from camera_node.geometry.pose import invert, rotation_with_z
 from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene, SceneCamera
 
@@ -51,12 +51,9 @@ def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
     """The roundels of a body at T_cam_body (4, 4), visible or not."""
     outer = body.diameter_m / 2
     radii = (outer * body.surround_ratio, outer, outer * body.inner_ratio)
-    discs = []
-    for point in body.points:
-        T = T_cam_body.copy()
-        T[:3, 3] += T_cam_body[:3, :3] @ point
-        discs.append(Disc(T, radii))
-    return discs
+    T_body_disc = np.tile(np.eye(4), (len(body.markers), 1, 1))
+    T_body_disc[:, :3, :3], T_body_disc[:, :3, 3] = rotation_with_z(body.unit_normals), body.points
+    return [Disc(T, radii) for T in T_cam_body @ T_body_disc]
 
 
 class ImageModel:

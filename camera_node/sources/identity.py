@@ -7,7 +7,7 @@ from pathlib import Path
 
 from camera_node.config import is_name
 from camera_node.sources.address import is_url, without_credentials
-from camera_node.sources.v4l2 import SYS, camera_names, find_device
+from camera_node.sources.drivers import driver_of
 
 LABEL = 200  # characters
 
@@ -17,7 +17,7 @@ class SourceIdentity:
     """A source of this machine.
 
     Attributes:
-        driver: the kind of source: sim, folder, video, stream or v4l2.
+        driver: the kind of source: sim, folder, video, stream, or the name of a driver of cameras.
         key: the same for the same source on every start, and for no other source of this machine.
         label: for people.
         name: a name for the camera that its source suggests; empty if it suggests none.
@@ -34,12 +34,11 @@ def is_simulation(text: str) -> bool:
     return text.partition(":")[0] == "sim"
 
 
-def identify(text: str, sys: Path = SYS) -> SourceIdentity:
+def identify(text: str) -> SourceIdentity:
     """The identity of what `--source` names.
 
     Args:
         text: as `open_source` takes it.
-        sys: the folder in which the kernel lists cameras.
 
     Raises:
         CameraError: there is no such camera.
@@ -56,30 +55,6 @@ def identify(text: str, sys: Path = SYS) -> SourceIdentity:
         return SourceIdentity(
             driver, str(path.resolve()), f"{path} on {host}"[:LABEL], name if is_name(name) else ""
         )
-    device = find_device(text, sys)
-    card = camera_names(sys).get(device, "")
-    return SourceIdentity("v4l2", device_key(device, sys), f"{card} ({device}) on {host}"[:LABEL])
-
-
-def device_key(device: Path, sys: Path = SYS) -> str:
-    """Identifies a camera by its serial number, or by its place on the bus if it has none or shares it with another."""
-    serial = _serial(device, sys)
-    twins = [other for other in camera_names(sys) if other != device and _serial(other, sys) == serial]
-    if serial and not twins:
-        return f"usb {serial}"
-    place = sys / device.name / "device"
-    return f"bus {place.resolve()}" if place.exists() else f"device {device}"
-
-
-def _serial(device: Path, sys: Path) -> str:
-    """Vendor, product, serial number and interface of a USB camera; empty without a serial number."""
-    interface = (sys / device.name / "device").resolve()
-    values = [_read(interface.parent / name) for name in ("idVendor", "idProduct", "serial")]
-    return ":".join([*values, _read(interface / "bInterfaceNumber")]) if all(values) else ""
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace").strip()
-    except OSError:
-        return ""
+    driver, camera = driver_of(text)
+    key, label = driver.key(camera)
+    return SourceIdentity(driver.name, key, f"{label} on {host}"[:LABEL])

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.extras import require
-from camera_node.geometry.pose import wxyz_from_rotation
+from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from camera_node.protocol.messages import Preview
 from fusion.model.robots import Robot
 from fusion.protocol.messages import Markers, RobotPose, Vector
@@ -192,13 +192,15 @@ class FoxgloveChannels:
         size = m.Vector3(x=body.diameter_m, y=body.diameter_m, z=THICKNESS_M)
         discs = [
             m.CylinderPrimitive(
-                pose=self._pose(point, (1, 0, 0, 0)),
+                pose=self._pose(point, tuple(wxyz.tolist())),
                 size=size,
                 bottom_scale=1.0,
                 top_scale=1.0,
                 color=self._color(BLACK),
             )
-            for point in body.markers
+            for point, wxyz in zip(
+                body.markers, wxyz_from_rotation(rotation_with_z(body.unit_normals)), strict=True
+            )
         ]
         label = m.TextPrimitive(
             pose=self._pose((0.0, 0.0, body.diameter_m), (1, 0, 0, 0)),

@@ -11,7 +11,7 @@ import zenoh
 from camera_node.config import require_name
 from camera_node.errors import ConfigError
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
-from fusion.model.robots import distances
+from fusion.model.likeness import distances
 from fusion.protocol.messages import Robots, RobotsRequest
 from fusion.protocol.requests import change_robots, request_robots
 

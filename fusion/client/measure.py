@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Measures a new robot: finds stationary unlabeled markers, and makes a constellation of them."""
+"""Measures a new robot: finds stationary unlabeled markers, and makes a constellation of them.
 
+Where the measured normals of the markers differ by 45 degrees or more, the robot has markers on several sides, and each
+marker has the normal of its side.
+"""
+
+import math
 import queue
 import time
 from collections.abc import Sequence
@@ -24,6 +29,7 @@ MAX_SIZE_ERROR = (
     0.1  # between the given diameter and the one that is seen; beyond 0.2 a robot is never acquired
 )
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
+SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
 
 
@@ -104,8 +110,11 @@ def robot_from_markers(
 ) -> Robot:
     """A robot with these markers: its origin is their mean, z is out of the prints, x towards the first marker.
 
+    Of a robot with markers on several sides, z is out of the uppermost side.
+
     Raises:
-        FusionError: there are no markers, they have another diameter, or no robot can have them.
+        FusionError: there are no markers, they have another diameter, no robot can have them, or the normal of one of
+            several sides is unknown.
     """
     if not len(markers.position):
         raise FusionError(
@@ -119,7 +128,8 @@ def robot_from_markers(
             "or correct the lengths in wand.yaml and calibrate again if a ruler confirms it"
         )
     try:
-        return Robot(diameter_m=diameter_m, markers=_in_body(markers), motion=motion)
+        positions, normals = _in_body(markers)
+        return Robot(diameter_m=diameter_m, markers=positions, normals=normals, motion=motion)
     except ValueError as error:
         raise FusionError(f"these markers make no robot: {error}") from None
 
@@ -154,18 +164,59 @@ def _mean_direction(normals: Array) -> Array:
     return total / np.linalg.norm(total) if np.any(total) else np.full(3, np.nan)
 
 
-def _in_body(markers: StationaryMarkers) -> tuple[tuple[float, float, float], ...]:
-    """The positions in the robot's own frame, to a tenth of a millimetre."""
+Rows = tuple[tuple[float, float, float], ...]
+
+
+def _in_body(markers: StationaryMarkers) -> tuple[Rows, Rows]:
+    """Positions, to a tenth of a millimetre, and normals in the robot's own frame; no normals if all are +z."""
     centred = markers.position - markers.position.mean(0)
-    z = _z_axis(centred, markers.normal)
+    normals = _normals_of_sides(centred, markers.normal)
+    z = _z_axis(centred, markers.normal) if normals is None else normals[np.argmax(normals[:, 2])]
     flat = centred - np.outer(centred @ z, z)
     off = np.linalg.norm(flat, axis=1) >= OFF_CENTRE_M
     if not off.any():
-        return ((0.0, 0.0, 0.0),) * len(centred)  # one marker; `Robot` refuses several in one place
+        return ((0.0, 0.0, 0.0),) * len(centred), ()  # one marker; `Robot` refuses several in one place
     x = flat[np.argmax(off)] / np.linalg.norm(flat[np.argmax(off)])
-    body = centred @ np.column_stack([x, np.cross(z, x), z])
-    x, y, z = np.round(body, 4).T.tolist()
+    R_world_body = np.asarray(np.column_stack([x, np.cross(z, x), z]), float)
+    return _rows(centred @ R_world_body), () if normals is None else _rows(normals @ R_world_body)
+
+
+def _rows(vectors: Array) -> Rows:
+    x, y, z = (np.round(vectors, 4) + 0.0).T.tolist()
     return tuple(zip(x, y, z, strict=True))
+
+
+def _normals_of_sides(centred: Array, normals: Array) -> Array | None:
+    """(K, 3) the normals of the sides that the markers are on; None if all markers face one way.
+
+    Three markers or more in one plane show the normal of their side better than their outlines do.
+
+    Raises:
+        FusionError: there are several sides, and a normal is unknown.
+    """
+    is_known = np.isfinite(normals).all(1)
+    known = normals[is_known]
+    if not len(known) or (known @ known.T).min() > math.cos(SIDES_RAD):
+        return None
+    if not is_known.all():
+        raise FusionError(
+            f"the markers are on several sides, and the normals of {int((~is_known).sum())} of {len(normals)} are not "
+            "known: turn the robot, or let more cameras see it, so that two cameras see each marker from different "
+            "directions"
+        )
+    result = np.full_like(normals, np.nan)
+    while len(rows := np.flatnonzero(np.isnan(result[:, 0]))):
+        side = rows[normals[rows] @ normals[rows[0]] > math.cos(SIDES_RAD / 2)]
+        mean = _mean_direction(normals[side])
+        result[side] = _plane_normal(centred[side], mean)
+    return result
+
+
+def _plane_normal(points: Array, facing: Array) -> Array:
+    """(3,) the normal of planar points (N, 3) on the side of the unit vector `facing`; `facing` if they are not."""
+    _, spread, axes = np.linalg.svd(points - points.mean(0))
+    is_plane = len(points) >= 3 and spread[1] > OFF_CENTRE_M and spread[2] < PLANAR_M
+    return axes[2] * np.sign(axes[2] @ facing) if is_plane else facing
 
 
 def _z_axis(centred: Array, normals: Array) -> Array:

@@ -27,16 +27,18 @@ class Exposures:
         camera: (F,) index of the camera.
         tau: (F,) capture time minus the time of the states, seconds.
         tau_sigma: (F,) its standard deviation by the clock, seconds.
+        line_s: (F,) time from one row to the next of a rolling shutter, seconds.
     """
 
     camera: Index
     tau: Array
     tau_sigma: Array
+    line_s: Array
 
     @classmethod
     def exact(cls, camera: Index, tau: Array) -> "Exposures":
         """Frames of exactly known time."""
-        return cls(camera, tau, np.zeros(len(tau)))
+        return cls(camera, tau, *np.zeros((2, len(tau))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,15 +49,18 @@ class Discs:
         frame: (N,) row of the exposures.
         body: (N,) row of the states.
         marker: (N,) row of the marker table; identifies the marker.
-        position: (3, N) centre, body frame.
+        position, normal: (3, N) centre, and unit normal out of the print; body frame.
         radius: (N,) of the black disc, metres.
+        delay: (N,) time from the frame to the capture of the disc's row by a rolling shutter, seconds; None for 0.
     """
 
     frame: Index
     body: Index
     marker: Index
     position: Array
+    normal: Array
     radius: Array
+    delay: Array | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -63,11 +68,13 @@ class Discs:
     @property
     def columns(self) -> _core.DiscColumns:
         """The arrays for the native core."""
-        return _core.DiscColumns(self.frame, self.body, self.position, self.radius)
+        delay = np.zeros(len(self)) if self.delay is None else self.delay
+        return _core.DiscColumns(self.frame, self.body, self.position, self.normal, self.radius, delay)
 
     def select(self, rows: NDArray) -> "Discs":
         """The columns of a mask or an index array."""
-        return Discs(*take_columns(rows, *(getattr(self, name) for name in self.__slots__)))
+        columns = [column for name in self.__slots__ if (column := getattr(self, name)) is not None]
+        return Discs(*take_columns(rows, *columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

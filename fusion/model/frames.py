@@ -26,6 +26,7 @@ class CalibratedFrame:
         sent_ns, received_ns: times of the message; 0 offline.
         exposure_us, detect_us: durations; 0 where unknown.
         clock_sigma_s: standard deviation of `t_ns` by the clock.
+        readout_s: time in which a rolling shutter reads all rows, see `Detections`; `t_ns` is that of the middle.
     """
 
     camera: str
@@ -39,6 +40,7 @@ class CalibratedFrame:
     exposure_us: float = 0.0
     detect_us: float = 0.0
     clock_sigma_s: float = 0.0
+    readout_s: float = 0.0
 
     @classmethod
     def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
@@ -54,6 +56,7 @@ class CalibratedFrame:
             exposure_us=message.exposure_us,
             detect_us=message.detect_us,
             clock_sigma_s=clock_sigma_s(message.clock_error_us),
+            readout_s=camera.readout_s(message.readout_us),
         )
 
     @classmethod
@@ -62,6 +65,10 @@ class CalibratedFrame:
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
         return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **timing)
+
+    def delays(self, lens: Lens) -> Array:
+        """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""
+        return self.readout_s * lens.image_row(self.roundels.uv)
 
 
 def clock_sigma_s(error_us: float) -> float:

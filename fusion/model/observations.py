@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tables of the detections of a frame set, of the markers of all robots, and of the assignments between them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
+from fusion.model.states import States
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +21,7 @@ class DetectionTable:
     Attributes:
         exposures: the frames of the set.
         frame: (N,) row of the exposures.
+        delay: (N,) time from the frame to the capture of the detection's row by a rolling shutter, seconds.
         uv, cov: (2, N) raw pixels and (2, 2, N) their covariances, pixels^2.
         axes_px, angle_rad: (2, N) full axes and (N,) direction of the major axis of the outline, NaN where unknown.
         xy: (2, N) undistorted; NaN where the lens has no inverse.
@@ -28,6 +30,7 @@ class DetectionTable:
 
     exposures: Exposures
     frame: Index
+    delay: Array
     uv: Array
     cov: Array
     axes_px: Array
@@ -46,16 +49,16 @@ class DetectionTable:
     @property
     def tau(self) -> Array:
         """(N,) capture time minus the time of the frame set, seconds."""
-        return self.exposures.tau[self.frame]
+        return self.exposures.tau[self.frame] + self.delay
 
     @property
     def columns(self) -> _core.DetectionColumns:
         """The arrays for the native core."""
-        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0])
+        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay)
 
     def select(self, rows: NDArray) -> "DetectionTable":
         """The columns of a mask or an index array."""
-        arrays = self.frame, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
+        arrays = self.frame, self.delay, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
         return DetectionTable(self.exposures, *take_columns(rows, *arrays))
 
     def conics(self) -> Array:
@@ -80,6 +83,7 @@ class DetectionTable:
             np.array([cameras.index[frame.camera] for frame in frames], np.intp),
             np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
             np.array([frame.clock_sigma_s for frame in frames]),
+            np.array([frame.readout_s / cameras[frame.camera].height for frame in frames]),
         )
         row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
         cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))
@@ -87,6 +91,7 @@ class DetectionTable:
         return cls(
             exposures,
             row,
+            _concatenate([f.delays(cameras[f.camera]) for f in frames], (0,)),
             _concatenate([f.roundels.uv.T for f in frames], (2, 0)),
             cov,
             _concatenate([f.roundels.axes_px.T for f in frames], (2, 0)),
@@ -107,7 +112,7 @@ class MarkerTable:
     Attributes:
         robot: (K,) row of the robot.
         number: (K,) index in the robot.
-        position: (3, K) centre, body frame.
+        position, normal: (3, K) centre, and unit normal out of the print; body frame.
         radius: (K,) of the black disc, metres.
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
@@ -115,6 +120,7 @@ class MarkerTable:
     robot: Index
     number: Index
     position: Array
+    normal: Array
     radius: Array
     first: Index
 
@@ -126,6 +132,7 @@ class MarkerTable:
             np.repeat(np.arange(len(robots)), counts),
             np.concatenate([np.empty(0, np.intp), *(np.arange(n) for n in counts)]).astype(np.intp),
             np.concatenate([np.empty((3, 0)), *(robot.points.T for robot in robots)], axis=1),
+            np.concatenate([np.empty((3, 0)), *(robot.unit_normals.T for robot in robots)], axis=1),
             np.repeat([robot.diameter_m / 2 for robot in robots], counts),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
@@ -135,7 +142,17 @@ class MarkerTable:
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
-        return Discs(frame, self.robot[rows], rows, self.position.take(rows, 1), self.radius[rows])
+        position, normal = take_columns(rows, self.position, self.normal)
+        return Discs(frame, self.robot[rows], rows, position, normal, self.radius[rows])
+
+    def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
+        """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
+
+        Without `body`, the rows of the states are those of the robots.
+        """
+        body = self.robot[rows] if body is None else body
+        position, normal = take_columns(rows, self.position, self.normal)
+        return _core.ExpectedMarkers(states.R, states.P, body, position, normal, self.radius[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,13 +206,13 @@ class MatchedObservations:
         cls, assignments: Assignments, detections: DetectionTable, marker_table: MarkerTable
     ) -> "MatchedObservations":
         """The observations of assignments."""
-        discs = marker_table.discs(assignments.marker, detections.frame[assignments.detection])
-        return cls.of_discs(detections.select(assignments.detection), discs)
+        seen = detections.select(assignments.detection)
+        return cls.of_discs(seen, marker_table.discs(assignments.marker, seen.frame))
 
     @classmethod
     def of_discs(cls, detections: DetectionTable, discs: Discs) -> "MatchedObservations":
-        """Detections of known discs, row by row."""
-        return cls(discs, detections, _whiten(detections))
+        """Detections of known discs, row by row, each captured when the detection was."""
+        return cls(replace(discs, delay=detections.delay), detections, _whiten(detections))
 
     def __len__(self) -> int:
         return len(self.discs)

@@ -24,7 +24,7 @@ def move_origin(robot: Robot, pivot_m: tuple[float, float, float]) -> Robot:
         raise FusionError(
             f"the pivot {pivot_m} is out of range; give metres, within {MAX_PIVOT_M:g} m of the robot"
         )
-    return _with_markers(robot, robot.points - np.array(pivot_m))
+    return _with_markers(robot, robot.points - np.array(pivot_m), robot.unit_normals)
 
 
 def turn_heading(robot: Robot, degrees: float) -> Robot:
@@ -37,9 +37,11 @@ def turn_heading(robot: Robot, degrees: float) -> Robot:
         raise FusionError(f"the angle {degrees} is no number of degrees")
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     R_old_new = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return _with_markers(robot, robot.points @ R_old_new)
+    return _with_markers(robot, robot.points @ R_old_new, robot.unit_normals @ R_old_new)
 
 
-def _with_markers(robot: Robot, points: Array) -> Robot:
-    markers = tuple(map(tuple, (np.round(points, DECIMALS) + 0.0).tolist()))
-    return msgspec.structs.replace(robot, markers=markers)
+def _with_markers(robot: Robot, points: Array, normals: Array) -> Robot:
+    markers, directions = (
+        tuple(map(tuple, (np.round(rows, DECIMALS) + 0.0).tolist())) for rows in (points, normals)
+    )
+    return msgspec.structs.replace(robot, markers=markers, normals=directions)

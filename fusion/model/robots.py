@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robots declared in `robots.yaml`; refuses symmetric constellations and robots that look alike.
-
-The distances between its markers identify a constellation. An ambiguity by mirror reflection is harmless: the
-reflected labeling turns the printed sides away from the cameras.
-"""
+"""Robots declared in `robots.yaml`; refuses symmetric constellations and robots that look alike."""
 
 import math
 from collections import Counter
@@ -15,20 +11,21 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array, Index
 from camera_node.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
-from camera_node.geometry.pose import rigid_motions
 from camera_node.text import printable
 from fusion.errors import FusionError
+from fusion.model.likeness import DISTINCT_M, likeness, sides, symmetry
 
-DISTINCT_M = (
-    0.010  # smallest difference of some distance between two labelings: several sigma of triangulation
-)
 SIZES_DIFFER = 1.25  # smallest ratio of diameters that apparent size distinguishes
 APART_M = 0.6  # between the starts of identical robots: several sigma of manual placement
-MAX_MARKERS = 7  # limits the comparison of labelings at load, and the live acquisition, to milliseconds
+# These limit the comparison of labelings at load, and the live acquisition, to milliseconds.
+MAX_MARKERS, MAX_SIDE_MARKERS = 28, 7
+BACK_COS = 0.5  # between normals, below which discs are on different faces and can't overlap
+BACK_SHARE = (
+    0.6  # of the diameter, between discs on different faces: acquisition takes closer ones for one marker
+)
 MAX_ROBOTS, MAX_ALL_MARKERS = 256, 1024  # of one arena: more than one process follows, or two
 MANOEUVRE_S = 0.1  # duration of an acceleration; converts accelerations to densities of white noise
 
@@ -68,19 +65,36 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.markers) > MAX_MARKERS:
-            raise ValueError(f"{len(self.markers)} markers; a robot has {MAX_MARKERS} at most")
-        for (i, a), (j, b) in combinations(enumerate(self.markers), 2):
-            if math.dist(a, b) < self.diameter_m:
-                raise ValueError(
-                    f"markers {i} and {j} are {math.dist(a, b):.4g} m apart but {self.diameter_m:.4g} m in diameter: "
-                    "their discs overlap; give all lengths in metres"
-                )
+        self._require_few_markers()
+        self._require_apart()
+        if self.is_single and self.normals:
+            raise ValueError("a single marker defines the z axis of its robot: leave its normal out")
         if len(self.markers) > 1 and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2:
             raise ValueError(
                 "two markers, or markers on one line, leave the rotation about the line unknown; "
                 "place a third 20 mm or more off the line, or use a single marker"
             )
+
+    def _require_few_markers(self) -> None:
+        """Raise ValueError for more markers than acquisition can search for."""
+        if len(self.markers) > MAX_MARKERS:
+            raise ValueError(f"{len(self.markers)} markers; a robot has {MAX_MARKERS} at most")
+        if (most := max(map(len, sides(self)))) > MAX_SIDE_MARKERS:
+            raise ValueError(
+                f"{most} markers that face one way; a robot has {MAX_SIDE_MARKERS} at most on a side"
+            )
+
+    def _require_apart(self) -> None:
+        """Raise ValueError where discs overlap, or are back to back at almost one place."""
+        along = self.unit_normals @ self.unit_normals.T
+        for (i, a), (j, b) in combinations(enumerate(self.markers), 2):
+            distance, d = math.dist(a, b), self.diameter_m
+            if distance < (d if along[i, j] > BACK_COS else BACK_SHARE * d):
+                cause = "their discs overlap" if along[i, j] > BACK_COS else "they are taken for one marker"
+                raise ValueError(
+                    f"markers {i} and {j} are {distance:.4g} m apart but {d:.4g} m in diameter: {cause}; "
+                    "give all lengths in metres"
+                )
 
     @property
     def is_single(self) -> bool:
@@ -186,8 +200,8 @@ def require_distinct(robots: dict[str, Robot], where: str = "robots", known: Col
     """
     new = {name: robot for name, robot in robots.items() if name not in known}
     for name, robot in new.items():
-        if fault := _likeness(robot, robot):
-            raise FusionError(f"{where}: robot '{name}' is symmetric under rotation: {fault}")
+        if fault := symmetry(robot):
+            raise FusionError(f"{where}: robot '{name}' is {fault}")
     old = ((name, robots[name]) for name in robots if name in known)
     for (name_a, a), (name_b, b) in chain(combinations(new.items(), 2), product(old, new.items())):
         if fault := _confusion(a, b):
@@ -202,9 +216,9 @@ def _confusion(a: Robot, b: Robot) -> str | None:
         return _lack_of_starts(a, b, f"print one of them {SIZES_DIFFER:g} times as large")
     if a.is_single or b.is_single:
         return None  # acquisition resolves a single marker that belongs to a constellation
-    if a.markers == b.markers and a.diameter_m == b.diameter_m:
+    if a.has_markers_of(b) and a.diameter_m == b.diameter_m:
         return _lack_of_starts(a, b, f"move a marker of one by {DISTINCT_M * 1e3:.0f} mm")
-    fault = _likeness(*sorted((a, b), key=lambda robot: len(robot.markers)))
+    fault = likeness(a, b)
     return fault and f"too alike: {fault}"
 
 
@@ -213,58 +227,3 @@ def _lack_of_starts(a: Robot, b: Robot, remedy: str) -> str | None:
     if a.start_m and b.start_m and math.dist(a.start_m, b.start_m) >= APART_M:
         return None
     return f"identical: give both a start_m, {APART_M:g} m or more apart, or {remedy}"
-
-
-def distances(points: Array) -> Array:
-    """(M, M) distances between points (M, 3)."""
-    return np.linalg.norm(points[:, None] - points[None], axis=2)
-
-
-def align(a: Array, b: Array) -> tuple[Array, Array]:
-    """The rotation (3, 3) and translation (3,) that align points a (M, 3) with b (Kabsch 1976)."""
-    T = rigid_motions(a, b)
-    return T[:3, :3], T[:3, 3]
-
-
-def _likeness(small: Robot, large: Robot) -> str | None:
-    """How the markers of `small` match some of `large`; for the same robot, in another order. None if they don't."""
-    D, E = distances(small.points), distances(large.points)
-    orders = _labelings(D, E)
-    if small is large:
-        orders = orders[(orders != np.arange(len(D))).any(1)]
-    worst = np.abs(D - E[orders[:, :, None], orders[:, None]])  # (labelings, M, M)
-    for k in range(len(orders)):
-        if align(small.points, large.points[orders[k]])[0][2, 2] > 0:
-            return _explain(D, E, orders[k], worst[k])
-    return None
-
-
-def _labelings(D: Array, E: Array) -> Index:
-    """(L, M) the labelings of M markers as some of N under which no distance differs by `DISTINCT_M` or more.
-
-    Marker by marker, so that a labeling ends at its first distance that differs.
-
-    Args:
-        D: (M, M) distances between the markers.
-        E: (N, N) distances between those that they may be.
-    """
-    every = np.arange(len(E))
-    orders = every[:, None]
-    for m in range(1, len(D)):
-        fits = (np.abs(E[orders] - D[m, :m, None]) < DISTINCT_M).all(
-            1
-        )  # (labelings, N) of the first m markers
-        fits &= (orders[:, :, None] != every).all(1)
-        row, added = np.nonzero(fits)
-        orders = np.column_stack([orders[row], added])
-    return orders
-
-
-def _explain(D: Array, E: Array, order: Index, worst: Array) -> str:
-    i, j = np.unravel_index(np.argmax(worst), worst.shape)
-    a, b = sorted((order[i], order[j]))
-    return (
-        f"the distance between markers {i} and {j} ({D[i, j] * 1e3:.1f} mm) and that between {a} and {b} "
-        f"({E[a, b] * 1e3:.1f} mm) differ most, by only {worst[i, j] * 1e3:.1f} mm; move a marker until "
-        f"they differ by {DISTINCT_M * 1e3:.0f} mm or more"
-    )

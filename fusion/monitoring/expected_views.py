@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The markers of tracked robots that a camera is certain to see, and where in its image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,13 @@ class ExpectedViews:
 
     @classmethod
     def of(
-        cls, cameras: CameraArray, name: str, states: States, tau: float, markers: tuple[MarkerTable, Index]
+        cls,
+        cameras: CameraArray,
+        name: str,
+        states: States,
+        tau: float,
+        markers: tuple[MarkerTable, Index],
+        readout_s: float = 0.0,
     ) -> "ExpectedViews":
         """Project markers into a camera; those at the edge of the image or seen edge-on are left out.
 
@@ -39,11 +45,16 @@ class ExpectedViews:
             states: of all robots.
             tau: time of the frame minus that of the states, s.
             markers: the marker table and the rows that are projected.
+            readout_s: of a rolling shutter (`Detections`); a marker is projected when its row is captured.
         """
         table, rows = markers
         camera, lens = cameras.index[name], cameras[name]
         discs = table.discs(rows, np.zeros(len(rows), np.intp))
-        views = cameras.views(states, Exposures.exact(np.array([camera]), np.array([tau])), discs)
+        exposures = Exposures.exact(np.array([camera]), np.array([tau]))
+        views = cameras.views(states, exposures, discs)
+        if readout_s:
+            row = np.nan_to_num(lens.image_row(lens.project(views.q.T))).clip(-0.5, 0.5)
+            views = cameras.views(states, exposures, replace(discs, delay=readout_s * row))
         points = cameras.R_cam_world[camera].T @ views.q + cameras.centres[camera][:, None]
         uv, size = lens.project(views.q.T), np.array([lens.width, lens.height])
         seen = ((uv > MARGIN_PX) & (uv < size - MARGIN_PX)).all(1) & (views.facing > MIN_FACING)

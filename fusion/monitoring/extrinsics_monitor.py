@@ -166,7 +166,7 @@ class ExtrinsicsMonitor:
         markers = np.roll(markers, -self._offset)[:MAX_COMPARED]
         self._offset += MAX_COMPARED + 1
         tau, rows = (frame.t_ns - t_ns) * 1e-9, (scene.marker_table, markers)
-        expected = ExpectedViews.of(scene.cameras, frame.camera, scene.states, tau, rows)
+        expected = ExpectedViews.of(scene.cameras, frame.camera, scene.states, tau, rows, frame.readout_s)
         if len(expected.rows):
             self._note(scene.cameras[frame.camera], ExpectedFrame(frame, expected.points))
 

@@ -7,7 +7,7 @@ not, or not with robots that stand still. See docs/time_offsets.md.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def find_time_shift(
     trajectories = _trajectories(cameras, name, history, markers)
     if trajectories is None or not frames:
         return None
-    votes = _votes(frames, trajectories)
+    votes = _votes(frames, [frame.delays(cameras[name]) for frame in frames], trajectories)
     if len(votes.offset_s) < MIN_VOTES:
         return None
     return _peak(votes)
@@ -132,9 +132,7 @@ def _trajectories(
     body = np.repeat(np.arange(len(history)) * n_robots, len(rows)) + discs.body
     camera = cameras.index[name]
     exposures = Exposures.exact(np.array([camera]), np.zeros(1))
-    views = cameras.views(
-        joined, exposures, type(discs)(discs.frame, body, discs.marker, discs.position, discs.radius)
-    )
+    views = cameras.views(joined, exposures, replace(discs, body=body))
     lens, shape = cameras[name], (len(history), len(rows))
     uv = lens.project(views.q.T).reshape(*shape, 2)
     tracked = np.array([snapshot.tracked for snapshot in history])[:, markers.robot[rows]]
@@ -143,7 +141,8 @@ def _trajectories(
     return _Trajectories(np.array([snapshot.t_ns for snapshot in history]), uv, visible)
 
 
-def _votes(frames: Sequence[CalibratedFrame], trajectories: _Trajectories) -> _Votes:
+def _votes(frames: Sequence[CalibratedFrame], delays: Sequence[Array], trajectories: _Trajectories) -> _Votes:
+    """Of frames whose detections (N,) were captured `delays` (N,) later."""
     t_ns, uv = trajectories.t_ns, trajectories.uv
     begin, along = uv[:-1], np.diff(uv, axis=0)
     dt = np.diff(t_ns)[:, None] * 1e-9
@@ -152,7 +151,7 @@ def _votes(frames: Sequence[CalibratedFrame], trajectories: _Trajectories) -> _V
     s, m = np.nonzero(moving & (dt < 0.2))
     begin, along, length2, dt = begin[s, m], along[s, m], length2[s, m], dt[s, 0]
     offsets, velocities, expected = [], [], np.zeros(_n_bins())
-    for frame in frames:
+    for frame, delay_s in zip(frames, delays, strict=True):
         start_s = np.asarray((t_ns[s] - frame.t_ns) * 1e-9, float)
         off = frame.roundels.uv[None] - begin[:, None]
         share = np.einsum("kdi,ki->kd", off, along) / length2[:, None]
@@ -163,7 +162,7 @@ def _votes(frames: Sequence[CalibratedFrame], trajectories: _Trajectories) -> _V
         k, d = np.nonzero(
             (share >= 0) & (share < 1) & (cross < CROSS_PX) & (np.abs(start_s) < RANGE_S)[:, None]
         )
-        offsets.append(start_s[k] + share[k, d] * dt[k])
+        offsets.append(start_s[k] + share[k, d] * dt[k] - delay_s[d])
         velocities.append(along[k] / dt[k, None])
         expected += _coverage(start_s, dt)
     return _Votes(np.concatenate(offsets), np.concatenate(velocities), expected)

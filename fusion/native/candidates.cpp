@@ -19,7 +19,7 @@ struct Covariance2 {
 };
 
 struct Detection {
-    double x, y;
+    double x, y, delay;
     Covariance2 noise;
     int64_t index;
 };
@@ -58,6 +58,15 @@ Covariance2 noise_of(const Detections& detections, size_t k) {
             per * (s.vx * s.vx * p - 2 * s.vx * s.ux * q + s.ux * s.ux * r)};
 }
 
+/// The predicted view of a marker in one frame, and its covariance.
+struct ExpectedView {
+    DiscView at;
+    double radius;
+    Covariance2 covariance;
+    double log_size_variance;
+    double vx, vy;  // of the image, 1/s: a row captured later shows the marker farther along
+};
+
 /// The detections of one frame, sorted by x for range queries.
 class FrameDetections {
   public:
@@ -65,17 +74,22 @@ class FrameDetections {
         for (size_t k = first; k < last; ++k) {
             const Covariance2 noise = noise_of(detections, k);
             if (!std::isfinite(detections.xy.at(0, k) + noise.xx + noise.yy)) continue;
-            sorted_.push_back({detections.xy.at(0, k), detections.xy.at(1, k), noise, int64_t(k)});
+            sorted_.push_back(
+                {detections.xy.at(0, k), detections.xy.at(1, k), detections.delay[k], noise, int64_t(k)});
             max_xx_ = std::max(max_xx_, noise.xx);
             max_yy_ = std::max(max_yy_, noise.yy);
+            max_delay_ = std::max(max_delay_, std::abs(detections.delay[k]));
         }
         std::sort(sorted_.begin(), sorted_.end(), [](const auto& a, const auto& b) { return a.x < b.x; });
     }
-    /// Calls `visit` for a superset of the detections within the gate of a point.
+    /// Calls `visit` for a superset of the detections within the gate of a moving point.
     template <class Visit>
-    void visit_near(double x, double y, const Covariance2& covariance, const Visit& visit) const {
-        const double reach_x = std::sqrt(kGate * (covariance.xx + max_xx_));
-        const double reach_y = std::sqrt(kGate * (covariance.yy + max_yy_));
+    void visit_near(const ExpectedView& expected, const Visit& visit) const {
+        const double x = expected.at.x, y = expected.at.y;
+        const double reach_x =
+            std::sqrt(kGate * (expected.covariance.xx + max_xx_)) + max_delay_ * std::abs(expected.vx);
+        const double reach_y =
+            std::sqrt(kGate * (expected.covariance.yy + max_yy_)) + max_delay_ * std::abs(expected.vy);
         auto at = std::lower_bound(sorted_.begin(), sorted_.end(), x - reach_x,
                                    [](const Detection& d, double value) { return d.x < value; });
         for (; at != sorted_.end() && at->x < x + reach_x; ++at)
@@ -84,32 +98,26 @@ class FrameDetections {
 
   private:
     std::vector<Detection> sorted_;
-    double max_xx_ = 0, max_yy_ = 0;
+    double max_xx_ = 0, max_yy_ = 0, max_delay_ = 0;
 };
 
 double square(double x) { return x * x; }
 
-/// The predicted view of a marker in one frame, and its covariance.
-struct ExpectedView {
-    DiscView at;
-    double radius;
-    Covariance2 covariance;
-    double log_size_variance;
-};
-
 ExpectedView expect(const ExpectedMarker& marker, const BodyInCamera& body, const Exposure& exposure) {
-    const DiscView at = view_disc(body, marker.position, marker.radius);
+    const DiscView at = view_disc(body, marker.disc);
     const Matrix C = marker.covariance(exposure.tau), &R = exposure.R_cam_world;
     const Vector gx = (1 / at.centre.z) * (R.r0 - at.x * R.r2), gy = (1 / at.centre.z) * (R.r1 - at.y * R.r2);
     const double depth_variance = dot(R.r2 * C, R.r2) / square(at.centre.z);
     const Vector velocity = body.v_cam + cross(body.omega_cam, at.centre - body.t_cam);
-    const double shift =
-        exposure.tau_sigma / at.centre.z;  // the image of the motion in one standard deviation
-    const double sx = shift * (velocity.x - at.x * velocity.z), sy = shift * (velocity.y - at.y * velocity.z);
+    const double vx = (velocity.x - at.x * velocity.z) / at.centre.z;
+    const double vy = (velocity.y - at.y * velocity.z) / at.centre.z;
+    const double sx = exposure.tau_sigma * vx, sy = exposure.tau_sigma * vy;  // in one standard deviation
     return {at,
-            marker.radius,
+            marker.disc.radius,
             {dot(gx * C, gx) + sx * sx, dot(gx * C, gy) + sx * sy, dot(gy * C, gy) + sy * sy},
-            square(kSizeSigma) + depth_variance};
+            square(kSizeSigma) + depth_variance,
+            vx,
+            vy};
 }
 
 double major_axis(const DiscView& view, double radius, const Scale& scale) {
@@ -120,7 +128,8 @@ double major_axis(const DiscView& view, double radius, const Scale& scale) {
 
 /// The cost of a pair; infinity outside the gates.
 double cost(const ExpectedView& expected, const Detection& detection, const Detections& all, double focal) {
-    const double u = detection.x - expected.at.x, v = detection.y - expected.at.y;
+    const double u = detection.x - expected.at.x - detection.delay * expected.vx;
+    const double v = detection.y - expected.at.y - detection.delay * expected.vy;
     const Covariance2 &P = expected.covariance, &N = detection.noise;
     const double xx = P.xx + N.xx, xy = P.xy + N.xy, yy = P.yy + N.yy, det = xx * yy - xy * xy;
     const double d2 = (yy * u * u - 2 * xy * u * v + xx * v * v) / det;
@@ -135,17 +144,12 @@ double cost(const ExpectedView& expected, const Detection& detection, const Dete
 
 }  // namespace
 
-ExpectedMarker ExpectedMarker::of(int64_t body, const Vector& position, double radius, const Matrix& R,
-                                  const double* P) {
+ExpectedMarker ExpectedMarker::of(int64_t body, const DiscOnBody& disc, const Matrix& R, const double* P) {
     constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
-    const Displacement by_pose{R * minus_skew(position), kTheta, kPosition};
-    const Displacement by_rates{minus_skew(R * position), kOmega, kVelocity};
+    const Displacement by_pose{R * minus_skew(disc.position), kTheta, kPosition};
+    const Displacement by_rates{minus_skew(R * disc.position), kOmega, kVelocity};
     const Matrix both = cross_covariance(P, by_pose, by_rates);
-    return {body,
-            position,
-            radius,
-            cross_covariance(P, by_pose, by_pose),
-            both + transposed(both),
+    return {body, disc, cross_covariance(P, by_pose, by_pose), both + transposed(both),
             cross_covariance(P, by_rates, by_rates)};
 }
 
@@ -160,7 +164,7 @@ std::vector<Candidate> find_candidates(const FramePoses& poses, const std::vecto
             const ExpectedView expected =
                 expect(markers[m], poses.at(f, markers[m].body), poses.exposures()[f]);
             if (!(expected.at.facing() > kGrazing) || !std::isfinite(expected.at.x)) continue;
-            of_frame.visit_near(expected.at.x, expected.at.y, expected.covariance, [&](const Detection& d) {
+            of_frame.visit_near(expected, [&](const Detection& d) {
                 const double value = cost(expected, d, detections, focal[f]);
                 if (std::isfinite(value)) found.push_back({int64_t(m), d.index, value});
             });

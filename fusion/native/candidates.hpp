@@ -10,23 +10,22 @@ constexpr double kSlackPx = 0.7;  // calibration error, added to the noise of de
 /// the states is at + tau rate + tau^2 drift.
 struct ExpectedMarker {
     int64_t body;
-    Vector position;  // body frame
-    double radius;
+    DiscOnBody disc;
     Matrix at, rate, drift;
 
     /// From the rotation R and the state covariance P (12 x 12) of its body.
-    static ExpectedMarker of(int64_t body, const Vector& position, double radius, const Matrix& R,
-                             const double* P);
+    static ExpectedMarker of(int64_t body, const DiscOnBody& disc, const Matrix& R, const double* P);
     Matrix covariance(double tau) const { return at + tau * rate + (tau * tau) * drift; }
 };
 
 /// N detections sorted by frame: undistorted centres, Jacobians of raw pixels with respect to them, pixel
-/// covariances, and full major axes (NaN where unknown).
+/// covariances, full major axes (NaN where unknown), and the times from the frame to the capture of the
+/// detection's row by a rolling shutter, seconds.
 struct Detections {
     const int64_t* frame;
     Columns<2> xy;
     Columns<4> scale, cov;
-    const double* major;
+    const double *major, *delay;
 
     size_t size() const { return xy.n; }
 };

@@ -10,26 +10,36 @@ BodyInCamera transform(const Body& body, const Exposure& exposure) {
     return {R * R_world, R_world, R * from_camera, R * body.omega, R * body.v};
 }
 
-DiscView view_disc(const BodyInCamera& body, const Vector& position, double radius) {
-    const Vector c = body.t_cam + body.R_cam * position, n = body.R_cam.column2();
-    const double size = radius * radius / c.z;
+DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc) {
+    const Vector c = body.t_cam + body.R_cam * disc.position, n = body.R_cam * disc.normal;
+    const double size = disc.radius * disc.radius / c.z;
     const Vector q = c + (size * n.z) * n - Vector{0, 0, size};
     const double z = c.z > kNearM ? q.z : std::numeric_limits<double>::quiet_NaN();
     return {c, n, q, q.x / z, q.y / z};
 }
 
 FramePoses::FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures)
-    : n_bodies_(bodies.size()), exposures_(exposures) {
+    : n_bodies_(bodies.size()), bodies_(bodies), exposures_(exposures) {
     poses_.reserve(exposures_.size() * n_bodies_);
     for (const Exposure& exposure : exposures_)
         for (const Body& body : bodies) poses_.push_back(transform(body, exposure));
 }
 
+Exposure FramePoses::exposure(const Discs& discs, size_t k) const {
+    Exposure row = exposures_[discs.frame[k]];
+    row.tau += discs.delay[k];
+    return row;
+}
+
+BodyInCamera FramePoses::at(const Discs& discs, size_t k) const {
+    if (discs.delay[k] == 0) return at(discs.frame[k], discs.body[k]);
+    return transform(bodies_[discs.body[k]], exposure(discs, k));
+}
+
 void view_discs(const FramePoses& poses, const Discs& discs, double* to) {
     const size_t n = discs.size();
     for (size_t k = 0; k < n; ++k) {
-        const DiscView seen =
-            view_disc(poses.at(discs.frame[k], discs.body[k]), discs.position.vector(k), discs.radius[k]);
+        const DiscView seen = view_disc(poses.at(discs, k), discs.at(k));
         double* row = to + k;
         for (const Vector& v : {seen.centre, seen.normal, seen.q})
             for (const double value : {v.x, v.y, v.z}) *row = value, row += n;

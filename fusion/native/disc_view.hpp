@@ -37,6 +37,12 @@ struct BodyInCamera {
 };
 BodyInCamera transform(const Body& body, const Exposure& exposure);
 
+/// Where a disc is on its body: centre and unit normal out of the print, body frame; radius of the disc.
+struct DiscOnBody {
+    Vector position, normal;
+    double radius;
+};
+
 /// A projected disc; see above. `x` and `y` are the centre of the outline, NaN where the disc is behind the
 /// camera.
 struct DiscView {
@@ -46,7 +52,7 @@ struct DiscView {
     /// Cosine between the normal and the direction to the camera: positive where the print is visible.
     double facing() const { return -dot(normal, centre) / std::sqrt(dot(centre, centre)); }
 };
-DiscView view_disc(const BodyInCamera& body, const Vector& position, double radius);
+DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc);
 
 /// The poses of all bodies at the capture times of all exposures.
 class FramePoses {
@@ -56,20 +62,27 @@ class FramePoses {
     size_t n_bodies() const { return n_bodies_; }
     const std::vector<Exposure>& exposures() const { return exposures_; }
     const BodyInCamera& at(size_t frame, size_t body) const { return poses_[frame * n_bodies_ + body]; }
+    /// The pose of the body of disc `k` when its image was captured.
+    BodyInCamera at(const struct Discs& discs, size_t k) const;
+    /// The exposure of the row of disc `k`.
+    Exposure exposure(const struct Discs& discs, size_t k) const;
 
   private:
     size_t n_bodies_;
+    std::vector<Body> bodies_;
     std::vector<Exposure> exposures_;
     std::vector<BodyInCamera> poses_;
 };
 
-/// N discs, each in one frame and on one body. `position` is in the frame of the body.
+/// N discs, each in one frame and on one body. `position` and the unit `normal` are in the frame of the body;
+/// `delay` is the time from the frame to the capture of the disc's row by a rolling shutter, seconds.
 struct Discs {
     const int64_t *frame, *body;
-    Columns<3> position;
-    const double* radius;
+    Columns<3> position, normal;
+    const double *radius, *delay;
 
     size_t size() const { return position.n; }
+    DiscOnBody at(size_t k) const { return {position.vector(k), normal.vector(k), radius[k]}; }
 };
 
 /// Writes 11 rows of N columns: centre, normal, q, x and y of each disc.

@@ -28,10 +28,9 @@ void write(double* to, const Vector& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z;
 
 /// Writes the row of one equation. The derivatives by the velocities are tau times those by the pose.
 void write_row(const DiscDerivatives& by, const BodyInCamera& body, const Exposure& exposure,
-               const Vector& position, double* row) {
-    const Vector h = by.centre * body.R_cam, k = by.normal * body.R_cam, &m = position;
-    // h (w x m) = (m x h) w; the normal is the z axis of the body.
-    const Vector theta{m.y * h.z - m.z * h.y - k.y, m.z * h.x - m.x * h.z + k.x, m.x * h.y - m.y * h.x};
+               const DiscOnBody& disc, double* row) {
+    const Vector h = by.centre * body.R_cam, k = by.normal * body.R_cam;
+    const Vector theta = cross(disc.position, h) + cross(disc.normal, k);  // h (w x m) = (m x h) w
     const Vector by_position = by.centre * exposure.R_cam_world;
     write(row, theta);
     write(row + 3, by_position);
@@ -39,12 +38,26 @@ void write_row(const DiscDerivatives& by, const BodyInCamera& body, const Exposu
     write(row + 9, exposure.tau * by_position);
 }
 
-/// Writes the two equations of a shear, by difference quotients over rotations about the axes x and y.
-void write_shears(const Shear (&at)[3], double sigma, Equations& to) {
+/// Two unit vectors in the plane of a disc, so that (first, second, normal) is right-handed; body frame.
+struct PlaneAxes {
+    Vector first, second;
+
+    static PlaneAxes of(const Vector& normal) {
+        const Vector beside = std::abs(normal.x) < 0.7 ? Vector{1, 0, 0} : Vector{0, 1, 0};
+        const Vector across = cross(normal, beside), second = (1 / std::sqrt(dot(across, across))) * across;
+        return {cross(second, normal), second};
+    }
+};
+
+/// Writes the two equations of a shear, by difference quotients over rotations about the axes of the plane.
+void write_shears(const Shear (&at)[3], const PlaneAxes& about, double sigma, Equations& to) {
     const double weight = 1 / sigma, slope = weight / kStep;
     auto& [along, across] = to.A;
-    along[0] = slope * (at[0].along - at[1].along), along[1] = slope * (at[0].along - at[2].along);
-    across[0] = slope * (at[0].across - at[1].across), across[1] = slope * (at[0].across - at[2].across);
+    const auto slopes = [&](double first, double second) {
+        return slope * (first * about.first + second * about.second);
+    };
+    write(along, slopes(at[0].along - at[1].along, at[0].along - at[2].along));
+    write(across, slopes(at[0].across - at[1].across, at[0].across - at[2].across));
     along[kErrors] = weight * at[0].along, across[kErrors] = weight * at[0].across;
 }
 
@@ -53,17 +66,17 @@ void write_shears(const Shear (&at)[3], double sigma, Equations& to) {
 void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
-        const Vector position = discs.position.vector(k);
-        const DiscView expected = view_disc(body, position, discs.radius[k]);
+        const Exposure exposure = poses.exposure(discs, k);
+        const BodyInCamera body = poses.at(discs, k);
+        const DiscOnBody disc = discs.at(k);
+        const DiscView expected = view_disc(body, disc);
         const double x = observed.xy.at(0, k) - expected.x, y = observed.xy.at(1, k) - expected.y;
         to[k] = {};
         if (!std::isfinite(x + y)) continue;
         for (int a = 0; a < 2; ++a) {
             const double wx = observed.whiten.at(2 * a, k), wy = observed.whiten.at(2 * a + 1, k);
             double* row = to[k].A[a];
-            write_row(differentiate(expected, discs.radius[k], wx, wy), body,
-                      poses.exposures()[discs.frame[k]], position, row);
+            write_row(differentiate(expected, disc.radius, wx, wy), body, exposure, disc, row);
             if (observed.single[discs.body[k]]) write(row + 6, {0, 0, 0});
             row[kErrors] = wx * x + wy * y;
         }
@@ -73,8 +86,8 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
 void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera& body = poses.at(discs.frame[k], discs.body[k]);
-        const DiscView expected = view_disc(body, discs.position.vector(k), discs.radius[k]);
+        const BodyInCamera body = poses.at(discs, k);
+        const DiscView expected = view_disc(body, discs.at(k));
         to[k] = {};
         const Shape measured =
             measured_outline(observed.axes.at(0, k), observed.axes.at(1, k), observed.angle[k]);
@@ -83,11 +96,13 @@ void linearize(const FramePoses& poses, const OutlineObservations& observed, Equ
             return shear(measured, outline(expected.centre, normal, discs.radius[k], scale));
         };
         const Vector n = expected.normal;
-        const Shear at[] = {shear_at(n), shear_at(n - kStep * body.R_cam.column1()),
-                            shear_at(n + kStep * body.R_cam.column0())};
+        const PlaneAxes about =
+            PlaneAxes::of(discs.normal.vector(k));  // a rotation about one moves n by the other
+        const Shear at[] = {shear_at(n), shear_at(n - kStep * (body.R_cam * about.second)),
+                            shear_at(n + kStep * (body.R_cam * about.first))};
         const double sum = at[0].along + at[0].across + at[1].along + at[2].along;
         if (!std::isfinite(sum + expected.x)) continue;  // behind the camera, or seen edge-on
-        write_shears(at, observed.sigma[k], to[k]);
+        write_shears(at, about, observed.sigma[k], to[k]);
     }
 }
 

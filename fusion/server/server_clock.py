@@ -8,8 +8,8 @@ import time
 
 import zenoh
 
+from camera_node.clocks.host_clock import clock_id, unix_ahead_ns
 from camera_node.node.clock_sync import ClockSync
-from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys
 from fusion.protocol.shards import Shard
 

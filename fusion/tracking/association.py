@@ -86,8 +86,7 @@ class Association:
             floor_px: see `DetectionTable.of`.
         """
         rows = np.flatnonzero(tracked[marker_table.robot])
-        bodies, positions = marker_table.robot[rows], marker_table.position.take(rows, 1)
-        expected = _core.ExpectedMarkers(states.R, states.P, bodies, positions, marker_table.radius[rows])
+        expected = marker_table.expected(rows, states)
         return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns, floor_px)
 
     def pending(self, frames: Sequence[CalibratedFrame]) -> tuple[CalibratedFrame, ...]:

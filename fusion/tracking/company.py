@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Mask
-from fusion.model.robots import distances
+from fusion.model.likeness import distances
 
 MOVED_M = 0.05  # since the anchor: far above the noise
 CONCLUSIVE_M = (

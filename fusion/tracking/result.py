@@ -189,7 +189,7 @@ def markers_message(
         camera_names=cameras.names,
         position=_column("<f8", states.p[owner] + arm, unlabeled.position),
         covariance=_column("<f4", covariance, unlabeled.covariance),
-        normal=_column("<f4", states.R[owner][:, :, 2], unlabeled.normal),
+        normal=_column("<f4", table.marker_normals(rows), unlabeled.normal),
         velocity=_column("<f4", states.v[owner] + by_rotation, unlabeled.velocity),
         diameter=_column(
             "<f4", np.full(len(rows), np.nan), np.array([m.diameter_m for m in unlabeled.markers])

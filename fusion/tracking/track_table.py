@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from camera_node.arrays import Array, Index, Mask
-from fusion._core import ExpectedMarkers
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
@@ -63,7 +62,7 @@ class TrackTable:
         old_rows = {renamed.get(name, name): k for k, name in enumerate(old.names)}
         for row, (name, robot) in enumerate(zip(self.names, self.robots, strict=True)):
             k = old_rows.get(name)
-            if k is None or old.robots[k].markers != robot.markers:
+            if k is None or not robot.has_markers_of(old.robots[k]):
                 continue
             self.states = self.states.with_rows(np.array([row]), old.states.select(np.array([k])))
             self.status[row], self._seen_ns[row] = old.status[k], old._seen_ns[k]
@@ -119,8 +118,12 @@ class TrackTable:
     def marker_positions(self, rows: Index) -> tuple[Array, Array]:
         """Of markers `rows`: arms (K, 3) from the robot's origin and position covariances (K, 3, 3), world frame."""
         owner, positions = self.markers.robot[rows], self.markers.position.take(rows, 1)
-        expected = ExpectedMarkers(self.states.R, self.states.P, owner, positions, self.markers.radius[rows])
-        return np.einsum("nij,jn->ni", self.states.R[owner], positions), expected.covariances(0.0)
+        covariances = self.markers.expected(rows, self.states).covariances(0.0)
+        return np.einsum("nij,jn->ni", self.states.R[owner], positions), covariances
+
+    def marker_normals(self, rows: Index) -> Array:
+        """(K, 3) unit normals of markers `rows`, world frame."""
+        return np.einsum("nij,jn->ni", self.states.R[self.markers.robot[rows]], self.markers.normal[:, rows])
 
     def alive_markers(self) -> tuple[Array, Array]:
         """Positions (K, 3) and covariances (K, 3, 3) of all markers of tracked and coasting robots."""

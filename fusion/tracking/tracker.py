@@ -23,6 +23,7 @@ from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.identity.own_detections import OwnDetections
 from fusion.tracking.multiview import Marker
 from fusion.tracking.result import (
     FilterStep,
@@ -109,6 +110,7 @@ class Tracker:
             -1, 2
         )  # without robots too
         self.estimator = Estimator(self.cameras, densities, self.table.single)
+        self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
         self.robust = RobustUpdate(self.estimator, self.table.markers)
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
@@ -177,7 +179,7 @@ class Tracker:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
         detections, all_assigned = self._collect(associated, self.monitors.used(frame_set))
-        assignments = self._update_states(associated.prediction, detections, all_assigned)
+        assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         self.geometry.note(summary.mean_px2)
@@ -270,11 +272,16 @@ class Tracker:
         return ObservationSummary.of(self.cameras, table.markers, len(table.robots), detections, assignments)
 
     def _update_states(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
+        self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments
     ) -> Assignments:
         """Update the states of owned robots; returns the assignments that fit, with residuals."""
-        own = self.table.owned[self.table.markers.robot[assignments.marker]]
-        others, assignments = assignments.select(~own), assignments.select(own)
+        prediction, tracked = associated.prediction, associated.tracked
+        given = AssignedFrames(
+            associated.association.t_ns, prediction.states, tracked, detections, assignments
+        )
+        are_own = self.own.are_own(given)
+        of_shard = self.table.owned[self.table.markers.robot[assignments.marker]]
+        others, assignments = assignments.select(~of_shard), assignments.select(of_shard & are_own)
         fitted = self.robust.update(prediction, detections, assignments)
         self.table.states = fitted.states
         return fitted.assignments.joined(others)

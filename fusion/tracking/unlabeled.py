@@ -233,8 +233,8 @@ class UnlabeledTracker:
             return before, np.zeros(0, bool)
         rows = np.concatenate([marker.detections for marker in markers])
         body = np.repeat(np.arange(n), [len(marker.detections) for marker in markers])
-        centres = np.zeros((3, len(rows)))
-        discs = Discs(detections.frame[rows], body, body, centres, tracks.radius[seen][body])
+        centres, up = np.zeros((3, len(rows))), np.tile([[0.0], [0.0], [1.0]], len(rows))
+        discs = Discs(detections.frame[rows], body, body, centres, up, tracks.radius[seen][body])
         observations = MatchedObservations.of_discs(detections.select(rows), discs)
         states, residuals = self._estimator(n).update(Prediction.without_motion(before), observations)
         return states, mean_by_body(misfit(observations, residuals), body, n) < MAX_CHI2

@@ -8,10 +8,10 @@ import numpy as np
 
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
-from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
+from tests.fusion.known_filter import KnownFilter
 
 LIMITS = Limits(sigma_floor_px=1e-3)
 START = 20  # frame sets for acquisition and for the velocities to converge
@@ -34,7 +34,7 @@ class Accuracy:
 def accuracy(load: Load, seconds: float) -> Accuracy:
     """Of all robots in all frame sets after the start."""
     tracker = Tracker(load.rig, load.bodies, LIMITS)
-    known = _KnownFilter(load)
+    known = KnownFilter(load.rig, load.bodies, LIMITS, lambda t_ns: load.paths.at((t_ns - START_NS) * 1e-9))
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
     for k, frame_set in enumerate(frame_sets(load, seconds)):
         tracker.track(frame_set)
@@ -64,32 +64,6 @@ def frame_sets(load: Load, seconds: float) -> Iterator[FrameSet]:
             if not first:
                 yield frame_set
             first = False
-
-
-class _KnownFilter:
-    """The tracker's filter, started at the truth, with associations from the `id` of each detection."""
-
-    def __init__(self, load: Load) -> None:
-        tracker = Tracker(load.rig, load.bodies, LIMITS)
-        self._tracker, self._load = tracker, load
-        self._t_ns: int | None = None
-        self.states = tracker.table.states
-
-    def update(self, frame_set: FrameSet) -> None:
-        """Predict and update."""
-        tracker = self._tracker
-        if self._t_ns is None:
-            truth = self._load.paths.at((frame_set.t_ns - START_NS) * 1e-9)
-            self.states = type(truth)(truth.R, truth.p, truth.omega, truth.v, tracker.table.states.P)
-        dt = 1e-3 if self._t_ns is None else (frame_set.t_ns - self._t_ns) * 1e-9
-        self._t_ns = frame_set.t_ns
-        prediction = tracker.estimator.predict(self.states, np.full(len(self.states), dt))
-        detections = DetectionTable.of(frame_set, tracker.cameras, LIMITS.sigma_floor_px)
-        number = np.concatenate([frame.roundels.id for frame in frame_set.frames])
-        rows = np.flatnonzero(number >= 0)
-        assignments = Assignments.of(rows, number[rows].astype(np.intp))
-        observations = MatchedObservations.of(assignments, detections, tracker.table.markers)
-        self.states, _ = tracker.estimator.update(prediction, observations)
 
 
 def _mahalanobis(R: np.ndarray, truth: np.ndarray, error: np.ndarray, P: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from camera_node.geometry.body import Body
         ("diameter_m: 0.1\nmarkers: [[0, 0]]", r"\$\.markers\[0\]"),
         ("diameter_m: -1", "diameter"),
         ("diameter_m: 0.1\nmarker: [[0, 0, 0]]", "did you mean `markers`"),
-        ("diameter_m: 0.1\nzzz: 1", "diameter_m, markers, inner_ratio, surround_ratio"),
+        ("diameter_m: 0.1\nzzz: 1", "diameter_m, markers, normals, inner_ratio, surround_ratio"),
         ("{}", "diameter_m"),
         ("[1, 2", "not valid YAML"),
         ("diameter_m: 1\ndiameter_m: 2", "'diameter_m' .*twice, in lines 1 and 2"),

@@ -70,7 +70,8 @@ def view(poses: Poses, discs: Discs) -> Views:
     """See `Views`."""
     at = poses.columns(discs)
     R = _take(poses.R_cam, at)
-    c, n = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.position), R[:, 2]
+    c = _take(poses.t_cam, at) + np.einsum("ijn,jn->in", R, discs.position)
+    n = np.einsum("ijn,jn->in", R, discs.normal)
     q = n * (n[2] * discs.radius**2 / c[2])
     q[2] -= discs.radius**2 / c[2]
     q += c
@@ -90,12 +91,8 @@ def derive(
     R = _take(poses.R_cam, at)
     h, k = np.einsum("ain,ijn->ajn", by_centre, R), np.einsum("ain,ijn->ajn", by_normal, R)
     J = np.empty((2, 12, len(at)))
-    x, y, z = discs.position
-    J[:, 0] = y * h[:, 2] - z * h[:, 1]  # h (w x m) = (m x h) w
-    J[:, 1] = z * h[:, 0] - x * h[:, 2]
-    J[:, 2] = x * h[:, 1] - y * h[:, 0]
-    J[:, 0] -= k[:, 1]
-    J[:, 1] += k[:, 0]
+    J[:, THETA] = np.cross(discs.position, h, axisb=1, axisa=0, axisc=1)  # h (w x m) = (m x h) w
+    J[:, THETA] += np.cross(discs.normal, k, axisb=1, axisa=0, axisc=1)
     R_cw = _take(_rotations(cameras.R_cam_world), exposures.camera[discs.frame])
     J[:, POSITION] = np.einsum("ain,ijn->ajn", by_centre, R_cw)
     J[:, OMEGA] = tau * np.einsum("ain,jin->ajn", J[:, THETA], _take(poses.R_world, at))
@@ -168,13 +165,25 @@ def shape_rows(
     seen = observations.detections
     R = poses.R_cam[..., poses.columns(discs)]
     measured = measured_outlines(seen.axes_px, seen.angle_rad)
-    turned = (views.normal, views.normal - STEP * R[:, 1], views.normal + STEP * R[:, 0])
-    at, about_x, about_y = (
+    first, second = plane_axes(discs.normal)
+    across, along = np.einsum("ijn,jn->in", R, second), np.einsum("ijn,jn->in", R, first)
+    turned = (views.normal, views.normal - STEP * across, views.normal + STEP * along)
+    at, about_first, about_second = (
         shears(measured, outlines(views.centre, normal, discs.radius, seen.scale)) for normal in turned
     )
     rows = np.zeros((2, 13, len(discs)))
-    rows[:, 0], rows[:, 1], rows[:, 12] = (at - about_x) / STEP, (at - about_y) / STEP, at
+    rows[:, THETA] = ((at - about_first)[:, None] * first + (at - about_second)[:, None] * second) / STEP
+    rows[:, 12] = at
     return (rows / sigma).transpose(2, 0, 1)
+
+
+def plane_axes(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors (3, N) that make right-handed axes with unit normals (3, N): first, second, normal."""
+    x, y = np.eye(3)[:2]
+    beside = np.where(np.abs(normal[0]) < 0.7, x[:, None], y[:, None])
+    second = np.cross(normal, beside, axis=0)
+    second /= np.linalg.norm(second, axis=0)
+    return np.asarray(np.cross(second, normal, axis=0), float), second
 
 
 def reweigh(

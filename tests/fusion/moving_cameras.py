@@ -12,8 +12,8 @@ import time
 
 import numpy as np
 
+from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.node.clock_sync import ClockSync
-from camera_node.protocol.host_clock import unix_ahead_ns
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, circle

@@ -10,7 +10,6 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot
@@ -18,6 +17,7 @@ from tests.fusion.equations import outlines
 
 PERIOD_NS = 33_333_333
 START_NS = 1_000_000_000_000
+ROW_STEPS, STEP_S = 4, 1e-4  # of the iteration for the rows of markers; of a difference quotient
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 TRIANGLE = Robot(diameter_m=0.12, markers=((0.15, 0.0, 0.0), (-0.13, 0.14, 0.0), (-0.03, -0.14, 0.0)))
@@ -25,10 +25,14 @@ WIDE = Robot(diameter_m=0.12, markers=((-0.13, 0.07, 0.0), (-0.08, -0.18, 0.0), 
 SINGLE = Robot(diameter_m=0.12)
 
 
-def ring(n: int = 4, distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0)) -> dict[str, Camera]:
-    """`n` cameras around the arena at a height of 3 m, directed at its centre."""
+def ring(
+    n: int = 4,
+    distortion: tuple[float, ...] = (-0.1, 0.02, 0.0003, -0.0002, 0.0),
+    height_m: float = 3.0,
+) -> dict[str, Camera]:
+    """`n` cameras around the arena, directed at its centre."""
     angles = 0.3 + 2 * np.pi * np.arange(n) / n
-    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), 3.0], [0.0, 0.0, 0.2]) for a in angles]
+    poses = [look_at([2.5 * np.cos(a), 2.5 * np.sin(a), height_m], [0.0, 0.0, 0.2]) for a in angles]
     lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
     return {
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
@@ -59,11 +63,26 @@ def circle(turn_s: float, radius_m: float, height_m: float = 0.2) -> Motion:
     return at
 
 
+def drive(radius_m: float, speed_m_s: float) -> Motion:
+    """A drive in a circle from rest; the speed is reached after a second."""
+
+    def at(t: float) -> tuple[np.ndarray, np.ndarray]:
+        way = speed_m_s * (t**2 / 2 if 0 < t < 1 else max(t - 0.5, 0.0))
+        c, s = np.cos(way / radius_m), np.sin(way / radius_m)
+        return np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 1.0]]), np.array(
+            [radius_m * c, radius_m * s, 0.2]
+        )
+
+    return at
+
+
 @dataclass
 class Arena:
     """Robots and their motions; `frames` renders what each camera detects.
 
-    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers.
+    `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. A print is
+    detected if the cosine of its slant is above `min_facing`. Cameras read all rows in `readout_s`; each marker is seen
+    when its row is read.
     """
 
     robots: dict[str, Robot]
@@ -71,9 +90,11 @@ class Arena:
     cameras: dict[str, Camera] = field(default_factory=ring)
     phases: tuple[float, ...] = (0.0, 0.27, -0.41, 0.38)
     sigma_px: float = 0.0
+    readout_s: float = 0.0
     distractors: int = 0
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
+    min_facing: float = 0.0
 
     def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
@@ -85,7 +106,11 @@ class Arena:
         )
         return [
             CalibratedFrame.measure(
-                name, t_ns, self.detect(name, (t_ns - START_NS) * 1e-9, rng), self.cameras[name]
+                name,
+                t_ns,
+                self.detect(name, (t_ns - START_NS) * 1e-9, rng),
+                self.cameras[name],
+                readout_s=self.readout_s,
             )
             for t_ns, name in times
         ]
@@ -93,7 +118,15 @@ class Arena:
     def messages(self, n: int) -> list[Detections]:
         """The same as messages of the cameras."""
         return [
-            Detections.pack(f.roundels, camera=f.camera, seq=k, t_ns=f.t_ns, width=800, height=600)
+            Detections.pack(
+                f.roundels,
+                camera=f.camera,
+                seq=k,
+                t_ns=f.t_ns,
+                width=800,
+                height=600,
+                readout_us=1e6 * self.readout_s,
+            )
             for k, f in enumerate(self.frames(n))
         ]
 
@@ -107,30 +140,53 @@ class Arena:
         return self.motions[robot]((t_ns - START_NS) * 1e-9)
 
     def detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
-        """What a camera detects at t seconds."""
-        cameras = CameraArray({name: self.cameras[name]})
+        """What a camera detects in a frame whose middle is read at t seconds."""
+        camera = self.cameras[name]
         marker_table = MarkerTable.of(list(self.robots.values()))
-        seen = [
-            k
-            for k, (r, m) in enumerate(zip(marker_table.robot, marker_table.number, strict=True))
-            if not self.hidden(list(self.robots)[r], int(m), t)
-        ]
-        poses = [self.motions[robot](t) for robot in self.robots]
-        R = np.array([pose[0] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3, 3)
-        p = np.array([pose[1] for pose in poses])[marker_table.robot[seen]].reshape(-1, 3)
-        centre = p + np.einsum("nij,jn->ni", R, marker_table.position[:, seen])
-        return self._roundels(cameras, centre, R[:, :, 2], marker_table.radius[seen], rng)
+        robots = list(self.robots)
+        owners = zip(marker_table.robot, marker_table.number, strict=True)
+        hidden = [self.hidden(robots[r], int(m), t) for r, m in owners]
+        seen = np.flatnonzero(~np.array(hidden, bool)).astype(np.int32)
+        t_s = np.full(len(seen), t)
+        for _ in range(ROW_STEPS if self.readout_s else 0):
+            uv = camera.project_world(self._place(marker_table, seen, t_s)[0])
+            t_s = t + self.readout_s * np.nan_to_num(camera.image_row(uv)).clip(-0.5, 0.5)
+        (centre, normal), (later, _) = (self._place(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S))
+        speed = (camera.project_world(later) - camera.project_world(centre)) / STEP_S
+        shear = speed * self.readout_s / camera.height
+        return self._roundels(camera, (seen, centre, normal, marker_table.radius[seen], shear), rng)
 
-    def _roundels(self, cameras: CameraArray, centre, normal, radius, rng: np.random.Generator) -> Roundels:
-        """Outlines of discs. The centres come from sampled circles, independently of the model under test."""
-        camera = cameras[cameras.names[0]]
-        facing = np.einsum("ni,ni->n", normal, cameras.centres[0] - centre) > 0.0
-        centre, normal, radius = centre[facing], normal[facing], radius[facing]
-        uv = np.array([outline_centre(camera, *disc) for disc in zip(centre, normal, radius, strict=True)])
+    def _place(
+        self, markers: MarkerTable, rows: np.ndarray, t_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Centres and normals (N, 3) of markers, each at its own time (N,)."""
+        robots = list(self.robots)
+        poses = [self.motions[robots[markers.robot[k]]](t) for k, t in zip(rows, t_s, strict=True)]
+        R = np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)
+        p = np.array([pose[1] for pose in poses]).reshape(-1, 3)
+        centre = p + np.einsum("nij,jn->ni", R, markers.position[:, rows])
+        return centre, np.einsum("nij,jn->ni", R, markers.normal[:, rows])
+
+    def _roundels(self, camera: Camera, discs: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:
+        """Outlines of discs; `id` is the row of the marker table, -1 for distractors.
+
+        The centres come from sampled circles, independently of the model under test.
+
+        Args:
+            camera: that sees them.
+            discs: rows of the marker table (N,), centres and normals (N, 3), radii (N,), and the motion of the image
+                from one row to the next (N, 2), pixels.
+            rng: of noise, distractors and order.
+        """
+        to = camera.matrix()[:3, 3] - discs[1]
+        facing = np.einsum("ni,ni->n", discs[2], to) > self.min_facing * np.linalg.norm(to, axis=1)
+        discs = tuple(column[facing] for column in discs)
+        uv = np.array([outline_centre(camera, *disc) for disc in zip(*discs[1:4], strict=True)])
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, centre, normal, radius = uv[inside], centre[inside], normal[inside], radius[inside]
-        shape = self._outlines(camera, centre, normal, radius)
+        uv, (number, centre, normal, radius, shear) = uv[inside], (column[inside] for column in discs)
+        S = np.linalg.inv(np.eye(2) - shear[:, :, None] * [0.0, 1.0])
+        shape = S @ self._outlines(camera, centre, normal, radius) @ S.transpose(0, 2, 1)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
         axes = 2 * np.sqrt(values[:, ::-1])
         angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
@@ -143,7 +199,8 @@ class Arena:
         n, order = len(uv), rng.permutation(len(uv))
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
-        return Roundels(uv, cov, axes, angle, level, 200 * level, none, none).select(order)
+        number = np.concatenate([number, np.full(extra, -1, np.int32)])
+        return Roundels(uv, cov, axes, angle, level, 200 * level, number, none).select(order)
 
     def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
         """(N, 2, 2) shape matrices."""

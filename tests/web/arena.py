@@ -46,15 +46,20 @@ class ArenaMessages:
         )
         self.put(self.keys.robot_pose(key or robot), encode(message))
 
-    def markers(self, positions: list[tuple[float, float, float]]) -> None:
+    def markers(
+        self,
+        positions: list[tuple[float, float, float]],
+        normals: list[tuple[float, float, float]] | None = None,
+    ) -> None:
         n = len(positions)
+        unknown = [(np.nan, np.nan, np.nan)] * n
         message = Markers(
             t_ns=time.time_ns(),
             robots=("rover",),
             camera_names=("north",),
             position=np.array(positions, "<f8").tobytes(),
             covariance=np.zeros((n, 9), "<f4").tobytes(),
-            normal=np.full((n, 3), np.nan, "<f4").tobytes(),
+            normal=np.array(normals or unknown, "<f4").tobytes(),
             robot=np.array([0] * min(n, 1) + [-1] * (n - 1), "<i4").tobytes(),
             marker=np.array([0] * min(n, 1) + [-1] * (n - 1), "<i4").tobytes(),
             cameras=np.ones(n, "<u8").tobytes(),

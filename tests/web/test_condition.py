@@ -9,7 +9,7 @@ from fusion.protocol.messages import FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import own_colours, robot_colour
-from web.condition import CONNECT_S, assess, next_step
+from web.condition import CONNECT_S, Condition, assess, next_step
 from web.feed import ArenaState, Feed, TimedMessage
 
 ENDPOINT = "tcp/lab:7447"
@@ -73,6 +73,19 @@ def test_the_absence_of_a_server_is_a_fault_after_a_while():
     late = assess(ArenaState(now_s=CONNECT_S + 1), ENDPOINT)
     assert late.level == "bad"
     assert ENDPOINT in late.text
+
+
+def test_cameras_that_locate_by_themselves_need_no_server():
+    """A server that was seen is missed all the same, and a camera that went silent is red."""
+    located = TimedMessage(None, 9.5)
+    state = ArenaState(now_s=10.0, relative={"scout": located, "mule": located})
+    condition = assess(state, ENDPOINT)
+    assert condition == Condition("ok", "2 cameras locate roundels relative to themselves, without a server")
+    assert next_step(state) == "run"
+    state.cameras["mule"] = TimedMessage(None, 6.0)
+    assert assess(state, ENDPOINT).text.startswith("camera mule silent for 4 s")
+    state.relative = {"scout": TimedMessage(None, 1.0)}
+    assert assess(state, ENDPOINT).text.startswith("no server at")
 
 
 def test_the_steps_are_in_the_order_of_the_work(arena: LiveArena, feed: Feed):

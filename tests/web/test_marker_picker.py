@@ -103,7 +103,7 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
 
 
 def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
-    """No marker selected; a marker deselected; one that is not there; another diameter; two markers; an invalid name."""
+    """No marker selected; a marker deselected; one that is not there; another diameter; two markers; a bad name."""
     _, _, picker = arena
     refused(picker, "no marker")
     picker._toggle()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
+from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import encode
 from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
@@ -115,6 +116,27 @@ def test_drawing_follows_a_changing_arena(arena: LiveArena, feed: Feed):
     view.close()
     queryable.undeclare()
     token.undeclare()
+
+
+def test_discs_face_the_directions_of_their_prints(arena: LiveArena, feed: Feed):
+    """One of three markers has no normal, and no disc. The batch grows from 16 to 40 discs, and empties."""
+    view = View(feed, loopback())
+    directions = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8)] * 10
+    for n in (3, 40, 0):
+        known = directions[:n]
+        points = [(0.1 * k, 0.0, 0.0) for k in range(n + 1)]
+        arena.markers(points, [*known, (np.nan, np.nan, np.nan)])
+        wait_for(lambda n=n: (timed := feed.state().markers) and len(timed.message) == n + 1)
+        view.update()
+        assert view.discs.count == n
+        shown = view.discs.batch.batched_scales > 0.5
+        assert shown.sum() == n
+        R = rotation_from_wxyz(view.discs.batch.batched_wxyzs[shown])
+        np.testing.assert_allclose(R[:, :, 2], np.reshape(known, (-1, 3)), atol=1e-6)
+        np.testing.assert_allclose(
+            view.discs.batch.batched_positions[shown], points[:n] or np.empty((0, 3)), atol=1e-6
+        )
+    view.close()
 
 
 def test_true_positions_appear_and_disappear(arena: LiveArena, feed: Feed):

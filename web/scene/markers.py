@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Draws markers and the demo's true positions as point clouds."""
+"""Draws markers as points, with discs where their normals are known, and the demo's true positions as points."""
 
 from typing import Any
 
 import numpy as np
 import viser
 
+from camera_node.arrays import Array
+from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from web.colours import LABELED, TRUE_POINT, UNLABELED
 from web.feed import ArenaState
+from web.scene.robots import cylinder_mesh
 
 MARKERS_S = 0.5  # markers disappear after so long without a message
+DISC_RADIUS_M, DISC_HEIGHT_M = 0.03, 0.002
+DISC_SIDES = 16
+MIN_DISCS = 16  # of a batch, which has a fixed number of discs; the others have no size
+NO_SIZE = 1e-6
 TRUE_POINTS_S = 1.0  # true positions disappear after so long without a message
 
 
@@ -37,6 +44,48 @@ class MarkerCloud:
             labeled = timed.message.robot_index() >= 0
             self._cloud.points = points.astype(np.float32)
             self._cloud.colors = np.where(labeled[:, None], LABELED, UNLABELED).astype(np.uint8)
+
+
+class MarkerDiscs:
+    """Discs at the markers with a known normal, printed side outwards: one batch for all."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self.batch: Any = None
+        self._capacity = self.count = 0  # discs of the batch, and those that are drawn
+
+    def draw(self, state: ArenaState) -> None:
+        """Draw the latest markers, if they are recent."""
+        timed = state.markers
+        positions, normals = np.empty((2, 0, 3))
+        if timed is not None and state.age_s(timed) < MARKERS_S:
+            positions, normals = timed.message.positions(), timed.message.normals().astype(float)
+            is_known = np.isfinite(positions).all(1) & np.isfinite(normals).all(1)
+            positions, normals = positions[is_known], normals[is_known]
+        if not len(positions) and not self.count:
+            return
+        self.count = len(positions)
+        self._move(
+            positions, wxyz_from_rotation(rotation_with_z(normals)) if self.count else np.empty((0, 4))
+        )
+
+    def _move(self, positions: Array, wxyzs: Array) -> None:
+        n = len(positions)
+        if n > self._capacity:
+            self._capacity = max(MIN_DISCS, 2 * n)
+            self.batch = None
+        rest = self._capacity - n
+        scales = np.concatenate([np.ones(n), np.full(rest, NO_SIZE)]).astype(np.float32)
+        at = np.concatenate([positions, np.zeros((rest, 3))]).astype(np.float32)
+        turned = np.concatenate([wxyzs, np.tile([1.0, 0.0, 0.0, 0.0], (rest, 1))]).astype(np.float32)
+        if self.batch is None:
+            mesh = cylinder_mesh(DISC_RADIUS_M, DISC_HEIGHT_M, DISC_SIDES)
+            self.batch = self._scene.add_batched_meshes_simple(
+                "/discs", *mesh, turned, at, batched_scales=scales, batched_colors=LABELED
+            )
+            return
+        self.batch.batched_positions, self.batch.batched_wxyzs = at, turned
+        self.batch.batched_scales = scales
 
 
 class TruePoints:

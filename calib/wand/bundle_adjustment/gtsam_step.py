@@ -6,15 +6,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from calib.rig.camera import LENS, PER_CAMERA
+from calib.rig.camera import PER_CAMERA, READOUT
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem
 from camera_node.arrays import Array, Index
 
 GROUP_SIZE = 24  # scalars in one variable, at least: few large factors are faster, though mostly zero
 
-# Information that fixes the gauge at the first camera and its clock: about the information of the observations.
-ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * len(LENS))
+# Information that fixes the gauge at the first camera and its clock: about the information of the observations. Readout
+# times and lenses are no part of the gauge.
+ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * (PER_CAMERA - READOUT[0]))
 # Damping of a knot's position and velocity, of the information in the best observed direction of each: GTSAM takes
 # pivots that are 2^12 apart for singular.
 MIN_RELATIVE_INFORMATION = 2.0**-22

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig.camera import PER_CAMERA, pixel_jacobians
+from calib.rig.camera import LENS, PER_CAMERA, pixel_jacobians
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import (
     LENGTH_SIGMA_M,
@@ -104,9 +104,10 @@ def reprojection_jacobians(
         J, J_pose, J_lens = (np.nan_to_num(part) for part in parts)
         error[rows] = np.nan_to_num(observations.uv[rows] - uv)
         J_point[rows] = J @ T[:3, :3].T
-        J_camera[rows, :, :6], J_camera[rows, :, 8:] = J_pose, J_lens
+        J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens
     J_camera[:, :, 6] = (J_point @ velocity[:, :, None])[:, :, 0]
     J_camera[:, :, 7] = J_camera[:, :, 6] * since[:, None]
+    J_camera[:, :, 8] = J_camera[:, :, 6] * observations.image_row[:, None]
     return error, J_camera[:, :, list(problem.free)], J_point
 
 

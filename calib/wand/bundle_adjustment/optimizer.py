@@ -5,7 +5,7 @@ A rough start is optimized robustly by iteratively reweighted least squares: Cau
 residuals give. The final estimate is plain least squares without the observations that the statistics reject.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,6 +86,16 @@ def adjust(
         scores=cameras.scores,
         iterations=optimum.iterations,
     )
+
+
+def with_information(adjusted: Adjusted, problem: Problem, observations: WandObservations) -> Adjusted:
+    """The adjustment with the information on the free parameters of another problem, at the same state."""
+    state, used = adjusted.state, adjusted.used
+    weights = find_weights(problem, observations, state)
+    interrupted = error_norms(problem, observations, state, weights).interval > INTERRUPTED
+    inliers = observations.select(used)
+    cameras = eliminate_motion(linearize(problem, inliers, state, weights.select(used, interrupted)))
+    return replace(adjusted, problem=problem, information=cameras.information, scores=cameras.scores)
 
 
 def optimize(problem: Problem, observations: WandObservations, start: State) -> State:

@@ -2,6 +2,7 @@
 """The data of the wand's bundle adjustment: observations, unknowns (`State`) and constants (`Problem`)."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
 # Prior standard deviations: of the pose, and of the time offset (s).
 POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]
+READOUT_SIGMA = 0.02  # of the readout time, beside what is given, s: rolling shutters take 5 to 40 ms
 # And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
 SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
@@ -29,6 +31,7 @@ class WandObservations:
         knot: (n,) index of the frame set, and of its knot.
         label: (n,) marker of the wand.
         t_s, stamp_sigma_s: (n,) stamp, seconds, and its standard deviation beside the offset of the camera's clock.
+        image_row: (n,) height in the image, -1/2 to 1/2 (`Lens.image_row`).
         uv: (n, 2) raw pixels of the disc's own centre.
         cov: (n, 2, 2) covariance of `uv`, square pixels.
         axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where unknown.
@@ -40,6 +43,7 @@ class WandObservations:
     label: Index
     t_s: Array
     stamp_sigma_s: Array
+    image_row: Array
     uv: Array
     cov: Array
     axes_px: Array
@@ -53,13 +57,24 @@ class WandObservations:
         return WandObservations(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
+class TimedRows(Protocol):
+    """Observations or detections with their cameras, stamps and heights in the image, (n,) each."""
+
+    @property
+    def camera(self) -> Index: ...
+    @property
+    def t_s(self) -> Array: ...
+    @property
+    def image_row(self) -> Array: ...
+
+
 @dataclass(frozen=True, slots=True)
 class State:
     """The unknowns.
 
     Attributes:
         cameras: (C, 4, 4) T_world_cam.
-        clocks: (C, 2) time offset, s, and drift, s/s: true time = stamp + offset + drift (stamp - middle).
+        clocks: (C, 3) time offset, s, drift, s/s, and readout time beside the given one, s (`true_times`).
         lenses: (C, 9) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
         motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
     """
@@ -72,17 +87,23 @@ class State:
     @classmethod
     def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
         """The state with these cameras, time offsets and motion; no drift, and no correction of the lenses."""
-        clocks = np.column_stack([offset_s, np.zeros(len(cameras))])
+        clocks = np.column_stack([offset_s, np.zeros((len(cameras), 2))])
         return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion)
 
     def retract(self, camera_step: Array, motion_step: Array) -> "State":
-        """Add a step: (C, 17) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
+        """Add a step: (C, 18) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
-        clocks, lenses = self.clocks + camera_step[:, 6:8], self.lenses + camera_step[:, 8:]
+        clocks, lenses = self.clocks + camera_step[:, 6:9], self.lenses + camera_step[:, 9:]
         return State(cameras, clocks, lenses, self.motion + motion_step.reshape(self.motion.shape))
+
+    def true_times(self, observations: "TimedRows", middle_s: float) -> Array:
+        """(n,) true capture times: stamp + offset + drift (stamp - `middle_s`) + readout time x height in the image."""
+        offset, drift, readout = self.clocks[observations.camera].T
+        t_s = observations.t_s
+        return t_s + offset + drift * (t_s - middle_s) + readout * observations.image_row
 
     def lens(self, camera: int, lens: Lens) -> Lens:
         """The given lens of a camera with this state's correction."""
@@ -110,6 +131,7 @@ class Problem:
         density: power spectral density of the wand's acceleration, m^2/s^3.
         middle_s: stamp at which time offsets are defined.
         lens_sigma: (C, 9) prior standard deviations of the lenses' parameters in the estimate.
+        readout_s: (C,) given readout times, which the stamps of observations contain.
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
         estimated: cameras that are estimated, the others are fixed; None for all.
@@ -124,6 +146,7 @@ class Problem:
     density: float
     middle_s: float
     lens_sigma: Array
+    readout_s: Array
     free: tuple[int, ...] = POSE
     fixed_distance: tuple[int, int, float] | None = None
     estimated: tuple[int, ...] | None = None
@@ -141,7 +164,8 @@ class Problem:
         )
 
     def _prior_sigma(self, lens_sigma: Array) -> Array:
-        others = np.tile(POSE_SIGMA + OFFSET_SIGMA + [self.drift_sigma], (len(self.lenses), 1))
+        clocks = [*OFFSET_SIGMA, self.drift_sigma, READOUT_SIGMA]
+        others = np.tile(POSE_SIGMA + clocks, (len(self.lenses), 1))
         return np.concatenate([others, lens_sigma], axis=1)[:, self.free]
 
     def estimated_cameras(self) -> tuple[int, ...]:

@@ -35,6 +35,7 @@ class LabeledRecording:
         wand: that was recorded.
         timing: how their frames are related in time.
         middle_s: stamp in the middle of the recording, at which time offsets are defined.
+        readout_s: (C,) given readout times, which the times of detections contain.
     """
 
     detections: WandDetections
@@ -44,6 +45,7 @@ class LabeledRecording:
     wand: Body
     timing: Timing
     middle_s: float
+    readout_s: Array
 
     @classmethod
     def of(
@@ -53,7 +55,8 @@ class LabeledRecording:
         number = np.full(len(recording.names), -1)
         number[placed] = np.arange(len(placed))
         detections = recording.detections.select(number[recording.detections.camera] >= 0)
-        t_s = recording.frames.t_s
+        t_s, given_s = recording.frames.t_s, recording.frames.readout_s
+        last = np.searchsorted(recording.frames.camera, placed, side="right") - 1
         return cls(
             replace(detections, camera=number[detections.camera]),
             [recording.names[k] for k in placed],
@@ -62,6 +65,7 @@ class LabeledRecording:
             pairs.wand,
             recording.timing,
             float(t_s.min() + t_s.max()) / 2,
+            given_s[last],
         )
 
     def with_centres(self, rows: Index, uv: Array) -> "LabeledRecording":
@@ -70,6 +74,12 @@ class LabeledRecording:
         changed[rows] = uv
         xy = normalise(self.lenses, self.detections.camera, changed)
         return self._with(replace(self.detections, uv=changed, xy=xy))
+
+    def with_row_times(self, readout_s: Array) -> "LabeledRecording":
+        """The recording with stamps of rows for readout times (C,) that are longer by this."""
+        detections = self.detections
+        later = readout_s[detections.camera] * detections.image_row
+        return self._with(replace(detections, t_s=detections.t_s + later))
 
     def select(self, rows: Mask) -> "LabeledRecording":
         """The recording with some of its detections (n,) only."""
@@ -118,7 +128,16 @@ def build_problem(
     knot_s, basis = knot_s[known], basis[known]
     density = acceleration_density(knot_s, basis, gap_s)
     lens_sigma = np.array([coarse_sigma(lens) for lens in recording.lenses])
-    problem = Problem(list(recording.lenses), wand, knot_s, gap_s, density, recording.middle_s, lens_sigma)
+    problem = Problem(
+        lenses=list(recording.lenses),
+        wand=wand,
+        knot_s=knot_s,
+        gap_s=gap_s,
+        density=density,
+        middle_s=recording.middle_s,
+        lens_sigma=lens_sigma,
+        readout_s=recording.readout_s,
+    )
     motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
     return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
 
@@ -169,6 +188,7 @@ def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> Wand
         label=detections.label,
         t_s=detections.t_s,
         stamp_sigma_s=detections.stamp_sigma_s,
+        image_row=detections.image_row,
         uv=detections.uv,
         cov=detections.cov + MIN_SIGMA_PX**2 * np.eye(2),
         axes_px=detections.axes_px,

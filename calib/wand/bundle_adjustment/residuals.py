@@ -100,8 +100,8 @@ class MarkerMotion:
 
 def predict_markers(problem: Problem, observations: WandObservations, state: State) -> MarkerMotion:
     """Evaluate the trajectory for every observation, at its true capture time."""
-    clocks, knot_s, motion = state.clocks[observations.camera], problem.knot_s, state.motion
-    t_s = observations.t_s + clocks[:, 0] + clocks[:, 1] * (observations.t_s - problem.middle_s)
+    knot_s, motion = problem.knot_s, state.motion
+    t_s = state.true_times(observations, problem.middle_s)
     location = locate(knot_s, t_s, problem.gap_s)
     ends = np.concatenate([motion[location.interval], motion[location.interval + 1]], axis=1)
     weights = problem.wand.weights[observations.label]

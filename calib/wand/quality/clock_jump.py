@@ -47,7 +47,7 @@ def find_jump(names: Sequence[str], adjusted: Adjusted, observations: WandObserv
     if adjusted.problem.gap_s == 0 or not _is_suspicious(adjusted, observations):
         return None  # synchronous cameras have no clocks
     problem = adjusted.problem.with_free(POSE, OFFSET, LENS)  # a drift would absorb half of a jump
-    steady = replace(adjusted.state, clocks=adjusted.state.clocks * [1.0, 0.0])
+    steady = replace(adjusted.state, clocks=adjusted.state.clocks * [1.0, 0.0, 1.0])
     state = optimize_robustly(problem, observations, steady)
     changes = [_find_change(problem, observations, state, camera) for camera in problem.estimated_cameras()]
     change = max(changes, key=lambda change: change.gain)
@@ -160,4 +160,4 @@ def _clock_difference(adjusted: Adjusted, camera: int, at_s: float) -> tuple[flo
     ends, by_clock = [camera, len(adjusted.problem.lenses) - 1], np.array([since, -since]).ravel()
     joint = camera_covariance(adjusted).of((*OFFSET, *DRIFT))
     covariance = joint[np.ix_(ends, range(2), ends, range(2))].reshape(4, 4)
-    return float(by_clock @ adjusted.state.clocks[ends].ravel()), float(by_clock @ covariance @ by_clock)
+    return float(by_clock @ adjusted.state.clocks[ends, :2].ravel()), float(by_clock @ covariance @ by_clock)

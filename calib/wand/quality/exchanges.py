@@ -104,8 +104,7 @@ def _interpolate_motion(adjusted: Adjusted, observations: WandObservations, of: 
     views = np.zeros((len(problem.knot_s), len(problem.lenses)), bool)
     views[observations.knot[used], observations.camera[used]] = True
     known = views.sum(axis=1) >= 2
-    clocks = adjusted.state.clocks[of.camera]
-    t_s = of.t_s + clocks[:, 0] + clocks[:, 1] * (of.t_s - problem.middle_s)
+    t_s = adjusted.state.true_times(of, problem.middle_s)
     positions = adjusted.state.motion[known, 0].reshape(int(known.sum()), -1)
     basis = np.column_stack([np.interp(t_s, problem.knot_s[known], column) for column in positions.T])
     return np.einsum("nb,nbx->nx", problem.wand.weights[of.label], basis.reshape(len(t_s), -1, 3))

@@ -59,7 +59,8 @@ def triangulated_residuals(recording: LabeledRecording, state: State) -> Triangu
         state: poses, clocks and lenses of these cameras.
     """
     lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
-    recording, count = recording.undistort_tracks(lenses), len(recording.detections)
+    recording = recording.with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
+    count = len(recording.detections)
     pixels, range_m, focal_px = np.full((count, 2), np.nan), np.full(count, np.nan), np.empty(count)
     for camera, lens in enumerate(lenses):
         rows, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
@@ -78,7 +79,7 @@ def _triangulate_rows(
     since = detections.t_s - recording.middle_s
     xy = np.full((len(recording.lenses), len(rows), 2), np.nan)
     for other, tracks in enumerate(recording.tracks):
-        offset, drift = state.clocks[camera] - state.clocks[other]
+        offset, drift = state.clocks[camera, :2] - state.clocks[other, :2]
         stamp_s = detections.t_s + offset + drift * since
         xy[other] = interpolate(tracks, detections.label, stamp_s, recording.timing.gap_s)
     xy[camera] = lens.normalise(detections.uv)

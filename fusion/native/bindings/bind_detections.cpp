@@ -15,31 +15,32 @@ struct DetectionColumns {
     Index frame;
     Pairs xy;
     Matrices2 scale, cov;
-    Numbers major;
+    Numbers major, delay;
 
     DetectionColumns(const Index& frames, const Pairs& xys, const Matrices2& scales, const Matrices2& covs,
-                     const Numbers& majors)
-        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors) {
-        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size()});
+                     const Numbers& majors, const Numbers& delays)
+        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors), delay(delays) {
+        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), delay.size()});
     }
 
     Detections view() const {
         const size_t n = frame.size();
-        return {frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n), major.data()};
+        return {frame.data(),       columns<2>(xy, n), columns<4>(scale, n),
+                columns<4>(cov, n), major.data(),      delay.data()};
     }
 };
 
-/// R and P are by body; `body`, `position` and `radius` are by marker.
+/// R and P are by body; `body`, `position`, `normal` and `radius` are by marker.
 void make_expected(Markers* self, const Rotations& R, const Covariances& P, const Index& body,
-                   const Vectors& position, const Numbers& radius) {
+                   const Vectors& position, const Vectors& normal, const Numbers& radius) {
     const size_t n = body.size();
     require_equal(R.shape(0), {P.shape(0)});
     require_equal(n, {radius.size()});
     below(R.shape(0), body);
-    const auto positions = columns<3>(position, n);
+    const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
     Markers markers;
     for (size_t k = 0; k < n; ++k)
-        markers.push_back(ExpectedMarker::of(body(k), positions.vector(k), radius(k),
+        markers.push_back(ExpectedMarker::of(body(k), {positions.vector(k), normals.vector(k), radius(k)},
                                              matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
     new (self) Markers(std::move(markers));
 }
@@ -84,7 +85,8 @@ auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const I
 void bind_detections(nb::module_& m) {
     m.attr("SLACK_PX") = kSlackPx;
     nb::class_<DetectionColumns>(m, "DetectionColumns")
-        .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&>());
+        .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&,
+                      const Numbers&>());
     nb::class_<Markers>(m, "ExpectedMarkers")
         .def("__init__", &make_expected)
         .def("covariances", &covariances)

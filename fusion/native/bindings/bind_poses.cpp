@@ -8,12 +8,14 @@ namespace {
 /// The arrays of N discs. Their indices are checked where the numbers of frames and bodies are known.
 struct DiscColumns {
     Index frame, body;
-    Vectors position;
-    Numbers radius;
+    Vectors position, normal;
+    Numbers radius, delay;
 
-    DiscColumns(const Index& frames, const Index& bodies, const Vectors& positions, const Numbers& radii)
-        : frame(frames), body(bodies), position(positions), radius(radii) {
-        require_equal(frame.size(), {body.size(), position.shape(1), radius.size()});
+    DiscColumns(const Index& frames, const Index& bodies, const Vectors& positions, const Vectors& normals,
+                const Numbers& radii, const Numbers& delays)
+        : frame(frames), body(bodies), position(positions), normal(normals), radius(radii), delay(delays) {
+        require_equal(frame.size(),
+                      {body.size(), position.shape(1), normal.shape(1), radius.size(), delay.size()});
     }
 };
 
@@ -38,8 +40,13 @@ void make_exposures(CameraExposures* self, const Rotations& R_cam_world, const P
 }
 
 Discs discs_of(const FramePoses& poses, const DiscColumns& discs) {
-    return {below(poses.exposures().size(), discs.frame), below(poses.n_bodies(), discs.body),
-            columns<3>(discs.position, discs.frame.size()), discs.radius.data()};
+    const size_t n = discs.frame.size();
+    return {below(poses.exposures().size(), discs.frame),
+            below(poses.n_bodies(), discs.body),
+            columns<3>(discs.position, n),
+            columns<3>(discs.normal, n),
+            discs.radius.data(),
+            discs.delay.data()};
 }
 
 Out views_of(const FramePoses& poses, const DiscColumns& columns_of) {
@@ -93,7 +100,8 @@ void bind_poses(nb::module_& m) {
     nb::class_<BodyStates>(m, "BodyStates").def("__init__", &make_bodies);
     nb::class_<CameraExposures>(m, "CameraExposures").def("__init__", &make_exposures);
     nb::class_<DiscColumns>(m, "DiscColumns")
-        .def(nb::init<const Index&, const Index&, const Vectors&, const Numbers&>());
+        .def(nb::init<const Index&, const Index&, const Vectors&, const Vectors&, const Numbers&,
+                      const Numbers&>());
     nb::class_<FramePoses>(m, "FramePoses")
         .def(nb::init<const BodyStates&, const CameraExposures&>())
         .def("views", &views_of)

@@ -11,12 +11,14 @@ import msgspec
 import zenoh
 
 from camera_node.errors import RoundelError
-from camera_node.protocol.requests import payload_of, sender_of
+from camera_node.protocol.requests import RequestSource, payload_of, sender_of
+from camera_node.text import printable
 
 log = logging.getLogger("fusion.audit")
 Answer = Callable[[zenoh.Query], bytes]
 MAX_ENTRIES = 32  # of each list or map in a request that a line quotes
 MAX_TEXT = 64
+MAX_SOURCE_TEXT = 200  # of a claimed source in the log
 DEPTH = 2  # of a request that a line quotes
 
 
@@ -64,7 +66,8 @@ class AuditLog:
             "claimed_source": source,
         }
         proven = entry["certificate"] or entry["address"] or "an unknown session"
-        log.info("%s by %s (claims to be %s): %s", change, proven, source or sender or "unknown", outcome)
+        claimed = _describe_source(source) or sender or "unknown"
+        log.info("%s by %s (claims to be %s): %s", change, proven, claimed, outcome)
         self._append(msgspec.json.encode(entry))
 
     def _append(self, line: bytes) -> None:
@@ -80,6 +83,14 @@ class AuditLog:
                 os.close(handle)
         except OSError as error:
             log.warning("the audit file %s can't be written: %s", self._path, error.strerror)
+
+
+def _describe_source(source: Any) -> str:
+    """The claimed source of a request in words; empty where it is none."""
+    try:
+        return printable(msgspec.convert(source, RequestSource), MAX_SOURCE_TEXT)
+    except msgspec.ValidationError:
+        return ""
 
 
 def quote(payload: bytes) -> Any:

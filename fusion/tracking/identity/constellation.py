@@ -10,13 +10,13 @@ from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rigid_motions
 from fusion import _core
 from fusion.model.camera_array import CameraArray
-from fusion.model.robots import Robot, distances
+from fusion.model.likeness import MIN_MARKERS, distances
+from fusion.model.robots import Robot
 from fusion.tracking.gating import DIAMETER_TOLERANCE
 from fusion.tracking.multiview import Marker
 
 SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand
-MIN_MARKERS = 3  # of an identified constellation
 # Limits of one robot: steps of the search, and mappings with one number of markers. Above them, as where late frames
 # make distances uncertain by decimetres, the shape is not distinctive.
 MAX_STEPS, MAX_MAPPINGS = 500_000, 1_000
@@ -120,32 +120,45 @@ def search(robots: dict[int, Robot], scene: TriangulatedMarkers) -> Candidates:
     if len(scene) < MIN_MARKERS or not robots:
         return Candidates({}, frozenset())
     reach_m = max(float(distances(robot.points).max()) for robot in robots.values())
-    cloud = _core.MarkerCloud(scene.position, scene.covariance, SLACK_M, SIGMAS, reach_m)
+    flat = not any(robot.normals for robot in robots.values())
+    to_cameras = scene.to_cameras[:, :0] if flat else scene.to_cameras  # `fit` compares these too
+    views = np.ascontiguousarray(to_cameras)
+    cloud = _core.MarkerCloud(scene.position, scene.covariance, views, SLACK_M, SIGMAS, reach_m)
     tables, crowded = {}, set()
     for row, robot in robots.items():
         usable = scene.with_diameter(robot.diameter_m)
-        tables[row], complete = cloud.mappings(distances(robot.points), usable, MAX_STEPS, MAX_MAPPINGS)
+        shape = distances(robot.points), _angles(robot)
+        tables[row], complete = cloud.mappings(*shape, usable, MAX_STEPS, MAX_MAPPINGS)
         if not complete:
             crowded.add(row)
     return Candidates(tables, frozenset(crowded))
 
 
+def _angles(robot: Robot) -> Array:
+    """(M, M) angles between the normal of each marker (row) and the directions to the others (column), rad."""
+    between = robot.points - robot.points[:, None]
+    along = np.einsum("mki,mi->mk", between, robot.unit_normals)
+    return np.arccos(np.clip(along / np.maximum(np.linalg.norm(between, axis=2), 1e-9), -1, 1))
+
+
 def fit(mappings: Mappings, robots: dict[int, Robot], scene: TriangulatedMarkers) -> Fits:
     """The best poses of mappings in which all prints face the cameras that saw them."""
-    body = _body_points(mappings, robots)
+    body, normals = _body_markers(mappings, robots)
     T = rigid_motions(body, scene.position[mappings.points])
-    along = np.einsum("klcj,kj->klc", scene.to_cameras[mappings.points], T[:, :3, 2])
+    normals = np.einsum("kij,klj->kli", T[:, :3, :3], normals)
+    along = np.einsum("klcj,klj->klc", scene.to_cameras[mappings.points], normals)
     faces = ~(along <= 0).any((1, 2))  # NaN for cameras that did not see the marker
     return Fits(mappings.select(faces), T[faces, :3, :3], T[faces, :3, 3])
 
 
-def _body_points(mappings: Mappings, robots: dict[int, Robot]) -> Array:
-    """(K, L, 3) the mapped markers in the frames of their robots."""
+def _body_markers(mappings: Mappings, robots: dict[int, Robot]) -> tuple[Array, Array]:
+    """(K, L, 3) the mapped markers in the frames of their robots, and (K, L, 3) their normals."""
     used = np.unique(mappings.robot).tolist()
     first = dict(zip(used, np.cumsum([0, *(len(robots[k].markers) for k in used)]).tolist(), strict=False))
     points = np.concatenate([np.empty((0, 3)), *(robots[k].points for k in used)])
-    starts = np.array([first[k] for k in mappings.robot.tolist()], np.intp)
-    return points[starts[:, None] + mappings.numbers]
+    normals = np.concatenate([np.empty((0, 3)), *(robots[k].unit_normals for k in used)])
+    rows = np.array([first[k] for k in mappings.robot.tolist()], np.intp)[:, None] + mappings.numbers
+    return points[rows], normals[rows]
 
 
 def _with_markers(robot: int, table: Index, count: int) -> Mappings:

@@ -12,6 +12,10 @@ Three markers of a larger robot are weak evidence: somewhere three of different 
 whose own markers are covered. So are three markers with fewer than `STRONG_DETECTIONS`. Such a fit is accepted at once
 where the robot was last; elsewhere it must win in several frame sets too.
 
+A robot with markers on several sides has so many distances that three or four markers fit some of them by chance. Such
+a fit is refused unless the cameras detect most of the other markers that they should see, and weak unless they detect
+almost all of them.
+
 All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
 """
 
@@ -33,6 +37,7 @@ from fusion.tracking.identity.constellation import (
     TriangulatedMarkers,
     fit,
 )
+from fusion.tracking.identity.verification import EVIDENT, MIN_EXPLAINED
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
@@ -52,6 +57,8 @@ class RefinedFits:
         chi2: (K,) of the detections, and of the position relative to the last one.
         misfit: (K,) mean squared residual of a detection in standard deviations.
         is_expected: (K,) fits where the robot was last, or starts.
+        explained: (K,) shares of the expected views that are detected, of robots with markers on several sides; NaN
+            for others.
         assignments, body: detections, and the fit of each.
     """
 
@@ -60,6 +67,7 @@ class RefinedFits:
     chi2: Array
     misfit: Array
     is_expected: Mask
+    explained: Array
     assignments: Assignments
     body: Index
 
@@ -75,6 +83,7 @@ class RefinedFits:
             self.chi2[rows],
             self.misfit[rows],
             self.is_expected[rows],
+            self.explained[rows],
             self.assignments.select(used),
             number[self.body[used]],
         )
@@ -202,16 +211,21 @@ class _Decisions:
         """Refine mappings and compare those that the detections allow."""
         fits = fit(mappings, self._question.robots, self._question.scene)
         refined = refine(fits)
-        is_plausible = refined.misfit < MAX_CHI2
+        is_plausible = (refined.misfit < MAX_CHI2) & ~(refined.explained < MIN_EXPLAINED)
         fits, refined = fits.select(is_plausible), refined.select(is_plausible)
         return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 
     def _is_evident(self, level: _Level) -> Mask:
-        """(K,) fits with more than three markers, or with all three of a robot and enough detections."""
+        """(K,) fits with more than three markers, or with all three of a robot and enough detections.
+
+        Of a robot with several sides, those whose expected views are detected.
+        """
         mappings = level.fits.mappings
         n_detections = np.bincount(level.refined.body, minlength=len(mappings))
         is_whole = self._has_all(mappings) & (n_detections >= STRONG_DETECTIONS)
-        return is_whole | (mappings.points.shape[1] > MIN_MARKERS)
+        explained = level.refined.explained
+        many = is_whole | (mappings.points.shape[1] > MIN_MARKERS)
+        return np.where(np.isnan(explained), many, explained >= EVIDENT)
 
     def _has_all(self, mappings: Mappings) -> Mask:
         """(K,) mappings of all markers of a robot."""

@@ -21,6 +21,7 @@ from fusion.tracking.gating import (
 from fusion.tracking.identity.constellation import Fits
 from fusion.tracking.identity.identification import RefinedFits
 from fusion.tracking.identity.single_markers import history_chi2, is_local
+from fusion.tracking.identity.verification import explained_shares
 from fusion.tracking.multiview import Marker
 from fusion.tracking.track_table import TrackTable
 
@@ -86,6 +87,7 @@ def refine(
         np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
         mean_by_body(d2, body, n),
         is_expected,
+        explained_shares(estimator.cameras, table.markers, detections, starts.robot, states),
         starts.assignments.with_residuals(residuals),
         body,
     )

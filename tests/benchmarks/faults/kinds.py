@@ -209,7 +209,7 @@ def carried_robot(arena: LiveArena, rng: random.Random) -> Fault:
 
 def carried(arena: LiveArena, rng: random.Random, moved_m: float) -> Fault:
     """A robot is covered for some seconds, and carried to another place during that time."""
-    name, seconds = rng.choice(arena.world.names), rng.uniform(0.8, 3.0)
+    name, seconds = rng.choice(arena.world.names), rng.uniform(1.5, 3.0)  # a status is sent every second
 
     def begin() -> None:
         old, now_ns = arena.world.events.get(name), arena.clock.now_ns()

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from camera_node.clocks.host_clock import clock_id, unix_ahead_ns
 from camera_node.node.clock_sync import ClockSync
-from camera_node.protocol.host_clock import clock_id, unix_ahead_ns
 from camera_node.protocol.messages import ClockReply, Keys, encode
 
 KEYS = Keys("test")

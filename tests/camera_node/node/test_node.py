@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera node over Zenoh: its publications, its replies, and its end."""
 
+import logging
 import signal
 import subprocess
 import sys
@@ -88,9 +89,11 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
 
 
 def test_the_status_is_published_once_a_second_and_the_token_ends_with_the_node(
-    network, inbox, running, slow
+    network, inbox, running, slow, caplog: pytest.LogCaptureFixture
 ):
-    """10 frames are sent per second; on a loaded machine a few of them may be sent in the next second."""
+    """10 frames are sent per second; on a loaded machine a few of them may be sent in the next second. The log names
+    the rate of the first full second."""
+    caplog.set_level(logging.INFO, "camera_node")
     router, alive = network.router(), inbox()
     statuses = subscribe(router, KEYS.camera_status(), CameraStatus, inbox)
     subscribe(router, KEYS.detections(), Detections, inbox)
@@ -105,6 +108,8 @@ def test_the_status_is_published_once_a_second_and_the_token_ends_with_the_node(
     assert 4 <= status.fps <= 16
     assert status.clock_offset_ms is None
     node.close()
+    (announced,) = [line for line in caplog.messages if "publishes" in line]
+    assert f"publishes {statuses.items[1].fps:.1f} frames/s of 320 x 240 pixels" in announced
     assert alive.until(lambda samples: len(samples) == 2)
     assert [sample.kind for sample in alive.items] == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE]
 

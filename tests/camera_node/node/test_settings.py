@@ -3,8 +3,6 @@
 
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
@@ -12,21 +10,21 @@ from camera_node.errors import ConfigError
 from camera_node.node.settings import apply_settings, read_settings
 from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import SourceSettings
+from camera_node.sources.live import LiveSource
 from camera_node.sources.replay import PacedSource
-from camera_node.sources.v4l2 import V4l2Source
+from tests.camera_node.sources.video_camera import VideoCamera, write_video
 
 
 def test_exposure_and_detector_settings_are_applied_together(tmp_path: Path):
-    """The camera is a video file that OpenCV opens like a camera."""
-    path = tmp_path / "camera.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
-    writer.write(np.zeros((48, 64, 3), np.uint8))
-    writer.release()
-    source = V4l2Source(path, SourceSettings(gain=2.0), lambda p, _: cv2.VideoCapture(str(p)), reopen_s=100)
-    changed = apply_settings(Settings(exposure_us=500.0, min_contrast=40.0), source, Detector())
+    """The camera is a stand-in that accepts exposure, gain and controls."""
+    path = write_video(tmp_path / "camera.avi")
+    source = LiveSource(lambda settings, controls: VideoCamera(path), SourceSettings(gain=2.0), reopen_s=100)
+    wanted = Settings(exposure_us=500.0, min_contrast=40.0, controls={"focus": 30})
+    changed = apply_settings(wanted, source, Detector())
     source.close()
     settings = read_settings(source, changed)
     assert (settings.exposure_us, settings.gain, settings.min_contrast) == (500.0, 2.0, 40.0)
+    assert settings.controls == {"focus": 30}
     assert settings.ratio_tolerance == Detector().settings["ratio_tolerance"]
 
 

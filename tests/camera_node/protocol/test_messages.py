@@ -107,6 +107,8 @@ def test_columns_of_other_lengths_are_refused(column: str):
         {"exposure_us": math.nan},
         {"detect_us": math.inf},
         {"clock_error_us": -1.0},
+        {"readout_us": math.nan},
+        {"readout_us": -1.1e6},
         {"clock_error_us": math.inf},
         {"camera": ""},
         {"version": 2},

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera_node.clocks.arrival_clock import LEAST_US, UNKNOWN_US, ArrivalClock
 from camera_node.commands.publish import open_source
 from camera_node.errors import CameraAbsentError, ConfigError
-from camera_node.sources.arrival_clock import LEAST_US, UNKNOWN_US, ArrivalClock
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.stream import StreamSource
+from camera_node.sources.stream import open_stream
 from fusion.model.frames import clock_sigma_s
 from tests.camera_node.sources.mjpeg_server import SHAPE, MjpegServer
 from tests.conftest import free_port
@@ -57,7 +57,7 @@ def test_frames_of_an_mjpeg_stream_arrive_in_order_with_their_times():
 
 def test_a_reader_that_is_slow_gets_the_newest_frame():
     with MjpegServer(free_port()) as server:
-        source = StreamSource(server.url)
+        source = open_stream(server.url)
         iterator = iter(source)
         first, before = next(iterator), source.dropped
         wait_for(lambda: source.dropped >= before + 10)
@@ -68,7 +68,7 @@ def test_a_reader_that_is_slow_gets_the_newest_frame():
 
 def test_a_stream_is_read_again_when_its_server_returns(caplog: pytest.LogCaptureFixture):
     with MjpegServer(free_port()) as server, caplog.at_level(logging.INFO):
-        source = StreamSource(server.url, reopen_s=0.1)
+        source = open_stream(server.url, reopen_s=0.1)
         iterator = iter(source)
         next(iterator)
         server.stop()
@@ -94,14 +94,14 @@ def test_a_stream_that_does_not_open_is_reported_without_credentials(state: str)
         with pytest.raises(
             CameraAbsentError, match=r"\*\*\*@127.0.0.1.* does not open \(.*check address"
         ) as caught:
-            StreamSource(url)
+            open_stream(url)
     assert not any(secret in str(caught.value) for secret in ("admin", "wr0ng"))
 
 
 def test_other_protocols_of_ffmpeg_are_refused():
     for url in ("file:///etc/passwd", "concat://a", "udp://127.0.0.1:1"):
         with pytest.raises(ConfigError, match="give rtsp://"):
-            StreamSource(url)
+            open_stream(url)
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def rtsp_server(tmp_path: Path) -> Iterator[str]:
 
 
 def test_an_rtsp_stream_has_the_senders_times(rtsp_server: str):
-    source = StreamSource(rtsp_server)
+    source = open_stream(rtsp_server)
     frames = list(islice(source, 60))
     source.close()
     assert {frame.image.shape for frame in frames} == {(240, 320)}

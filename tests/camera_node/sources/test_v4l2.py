@@ -1,27 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Video4Linux cameras without hardware: names, settings, capture times, and a source that fails.
+"""Video4Linux cameras without hardware: names, settings and capture times."""
 
-A short video file, opened by OpenCV like a camera, simulates a camera that stops delivering after its last frame.
-"""
-
-import logging
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from camera_node.commands.publish import open_source
 from camera_node.errors import CameraError
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.v4l2 import (
-    V4l2Source,
-    camera_names,
-    capture_time,
-    find_device,
-    open_capture,
-    properties,
-)
+from camera_node.sources.v4l2.devices import camera_names, find_device
+from camera_node.sources.v4l2.source import capture_time, open_capture, properties
 
 
 @pytest.fixture
@@ -66,21 +55,17 @@ def test_an_error_names_the_missing_device():
 
 
 def test_settings_become_properties_in_the_order_that_v4l2_needs():
-    """The format comes before the size and the rate; exposures are in units of 100 us, in manual mode (1)."""
-    settings = SourceSettings(width=1280, height=720, fps=60, exposure_us=1520, gain=8, fourcc="MJPG")
+    """The format comes before the size and the rate."""
+    settings = SourceSettings(width=1280, height=720, fps=60, fourcc="MJPG")
     assert properties(settings) == [
         (cv2.CAP_PROP_FOURCC, 0x47504A4D),
         (cv2.CAP_PROP_FRAME_WIDTH, 1280),
         (cv2.CAP_PROP_FRAME_HEIGHT, 720),
         (cv2.CAP_PROP_FPS, 60),
-        (cv2.CAP_PROP_AUTO_EXPOSURE, 1),
-        (cv2.CAP_PROP_EXPOSURE, 15),
-        (cv2.CAP_PROP_GAIN, 8),
     ]
     assert properties(SourceSettings()) == []
     raw = [(cv2.CAP_PROP_FOURCC, 0x20303159), (cv2.CAP_PROP_CONVERT_RGB, 0)]
     assert properties(SourceSettings(fourcc="Y10 ")) == raw
-    assert properties(SourceSettings(exposure_us=1))[1] == (cv2.CAP_PROP_EXPOSURE, 1)
 
 
 UNIX, MONOTONIC, MS = 1_700_000_000_000_000_000, 5_000_000_000_000, 1_000_000
@@ -100,46 +85,3 @@ UNIX, MONOTONIC, MS = 1_700_000_000_000_000_000, 5_000_000_000_000, 1_000_000
 def test_buffer_stamps_become_unix_times(stamp_ms: float, exposure_us: float, expected: int):
     """The spacing of doubles of this size is 256 ns."""
     assert abs(capture_time(stamp_ms, MONOTONIC, UNIX, exposure_us) - expected) <= 256
-
-
-@pytest.fixture
-def video(tmp_path: Path) -> Path:
-    path = tmp_path / "camera.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
-    for level in (50, 100, 150):
-        writer.write(np.full((48, 64, 3), level, np.uint8))
-    writer.release()
-    return path
-
-
-def test_a_camera_that_stops_is_reopened_and_logged_once(video: Path, caplog):
-    """One opening in three fails, as for a camera that is plugged in again; the frames arrive nevertheless."""
-    caplog.set_level(logging.WARNING, "camera_node.sources.v4l2")
-    openings = iter(range(1000))
-
-    def open_video(path: Path, settings: SourceSettings) -> cv2.VideoCapture:
-        if next(openings) % 3 == 1:
-            raise CameraError("not yet")
-        return cv2.VideoCapture(str(path))
-
-    source = V4l2Source(video, SourceSettings(), open_video, reopen_s=0.01)
-    frames = []
-    for frame in source:
-        frames.append(frame)
-        if len(caplog.records) >= 4:
-            source.close()
-    assert {frame.image.shape for frame in frames} == {(48, 64)}
-    assert [frame.t_ns for frame in frames] == sorted(frame.t_ns for frame in frames)
-    lines = [record.getMessage() for record in caplog.records]
-    assert all("stopped" in line for line in lines[::2])
-    assert all("again" in line for line in lines[1::2])
-
-
-def test_the_newest_frame_is_delivered_and_others_are_counted(video: Path, eventually):
-    """A reader that comes late gets the last frame; the two frames before it are counted as dropped."""
-    source = V4l2Source(video, SourceSettings(), lambda path, _: cv2.VideoCapture(str(path)), reopen_s=100)
-    assert eventually(lambda: source.dropped == 2)
-    frame = next(iter(source))
-    assert abs(int(frame.image[0, 0]) - 150) <= 3  # JPEG
-    source.close()
-    assert list(source) == []

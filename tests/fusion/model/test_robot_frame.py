@@ -13,9 +13,12 @@ from camera_node.errors import ConfigError
 from fusion.commands.robots import robots
 from fusion.errors import FusionError
 from fusion.model.robot_frame import DECIMALS, MAX_PIVOT_M, move_origin, turn_heading
+from fusion.model.robots import load_robots
+from tests.conftest import ROOT
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE
 
+CUBE = load_robots(ROOT / "configs" / "robots_cube.yaml")["cube"]
 ROUNDING_M = 2 * 10**-DECIMALS
 METRES = st.floats(-MAX_PIVOT_M, MAX_PIVOT_M)
 
@@ -29,6 +32,17 @@ def test_a_change_of_frame_is_a_rigid_motion(pivot: tuple[float, float, float], 
     changed = turn_heading(move_origin(TRIANGLE, pivot), degrees)
     assert np.abs(pairs(changed.points) - pairs(TRIANGLE.points)).max() <= 2 * ROUNDING_M
     assert (changed.diameter_m, changed.motion) == (TRIANGLE.diameter_m, TRIANGLE.motion)
+
+
+@given(st.floats(-720, 720))
+def test_normals_turn_with_the_markers(degrees: float):
+    """Of a cube: the angle between each normal and the direction to each other marker stays the same."""
+    changed = turn_heading(move_origin(CUBE, (0.1, 0.0, 0.2)), degrees)
+    before, after = (
+        np.einsum("mki,mi->mk", body.points - body.points[:, None], body.unit_normals)
+        for body in (CUBE, changed)
+    )
+    assert np.abs(after - before).max() <= 2 * ROUNDING_M
 
 
 def test_the_new_origin_is_at_the_pivot():

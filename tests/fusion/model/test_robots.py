@@ -3,10 +3,12 @@
 
 import time
 
+import msgspec
 import numpy as np
 import pytest
 
 from camera_node.errors import ConfigError
+from camera_node.geometry.pose import rotation_from_vector
 from fusion.errors import FusionError
 from fusion.model.robots import (
     MAX_ROBOTS,
@@ -15,6 +17,7 @@ from fusion.model.robots import (
     load_robots,
     require_distinct,
     require_trackable,
+    save_robots,
 )
 from tests.conftest import ROOT
 
@@ -56,6 +59,15 @@ def test_a_mirror_symmetry_is_accepted_because_the_print_faces_one_way():
             "robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [0.09, 0, 0], [0, 1, 0]]}}",
             "0 and 1 .* overlap",
         ),
+        ("robots: {a: {diameter_m: 0.1, normals: [[0, 0, 1], [1, 0, 0]]}}", "2 normals for 1 markers"),
+        ("robots: {a: {diameter_m: 0.1, normals: [[0, 0, 0]]}}", r"normal \[0.* has no direction"),
+        ("robots: {a: {diameter_m: 0.1, normals: [[0, .nan, 1]]}}", "has no direction"),
+        ("robots: {a: {diameter_m: 0.1, normals: [[1, 0, 0]]}}", "leave its normal out"),
+        (
+            "robots: {a: {diameter_m: 0.1, markers: [[0, 0, 0], [0, 0, -0.01], [0, 1, 0]], "
+            "normals: [[0, 0, 1], [0, 0, -1], [0, 0, 1]]}}",
+            "taken for one marker",
+        ),
         ("robots: {'a/b': {diameter_m: 0.1}}", "can't name a robot"),
     ],
 )
@@ -66,9 +78,75 @@ def test_an_invalid_declaration_is_refused_with_a_reason(tmp_path, text, reason)
         load_robots(path)
 
 
-@pytest.mark.parametrize("name", ["configs/robots.yaml", "configs/demo/robots.yaml"])
+@pytest.mark.parametrize(
+    "name", ["configs/robots.yaml", "configs/robots_cube.yaml", "configs/demo/robots.yaml"]
+)
 def test_the_examples_work(name):
     assert load_robots(ROOT / name)
+
+
+CUBE_SIDES = [  # R_body_side of the six sides, and the third one turned by 90 degrees about its normal
+    rotation_from_vector(np.radians(v))
+    for v in ([0, 0, 0], [180, 0, 0], [90, 0, 0], [-90, 0, 0], [0, 90, 0], [0, -90, 0])
+]
+
+
+def cube(*shapes: np.ndarray) -> Robot:
+    """A cube of 0.28 m with a shape (M, 2) on each side."""
+    markers, normals = [], []
+    for R, shape in zip(CUBE_SIDES, shapes, strict=False):
+        points = np.column_stack([shape, np.full(len(shape), 0.14)]) @ R.T
+        markers += map(tuple, np.round(points, 6).tolist())
+        normals += [tuple(R[:, 2].tolist())] * len(shape)
+    return Robot(diameter_m=0.05, markers=tuple(markers), normals=tuple(normals))
+
+
+SIDE = np.array([[0.09, 0.0], [-0.08, 0.08], [-0.02, -0.05]])
+OTHER_SIDE = np.array([[0.09, 0.03], [-0.05, 0.07], [-0.08, -0.09]])
+
+
+@pytest.mark.parametrize("shapes", [(SIDE,) * 6, (SIDE, OTHER_SIDE, SIDE)])
+def test_a_cube_with_sides_that_are_equal_by_rotation_is_refused(shapes):
+    with pytest.raises(
+        FusionError, match=r"'a' is ambiguous: the side of markers .* equals that of .* by rotation: .*10 mm"
+    ):
+        require_distinct({"a": cube(*shapes)})
+
+
+def test_a_side_that_is_symmetric_is_refused_and_named():
+    square = np.array(SQUARE)[:, :2]
+    with pytest.raises(
+        FusionError, match=r"'a' is symmetric under rotation on the side of markers 3, 4, 5, 6"
+    ):
+        require_distinct({"a": cube(SIDE, square)})
+
+
+def test_a_cube_with_one_marker_on_each_side_is_symmetric():
+    with pytest.raises(FusionError, match="'a' is symmetric under rotation: "):
+        require_distinct({"a": cube(*(np.zeros((1, 2)),) * 6)})
+
+
+def test_a_mirror_image_of_a_side_is_another_side():
+    """No rotation takes one to the other: the normals differ."""
+    require_distinct({"a": cube(SIDE, SIDE * [1, -1])})
+
+
+def test_a_flat_robot_like_a_side_of_a_cube_is_refused():
+    flat = Robot(diameter_m=0.05, markers=tuple((x, y, 0.0) for x, y in SIDE.tolist()))
+    with pytest.raises(FusionError, match="'a' and 'b' are too alike"):
+        require_distinct({"a": cube(OTHER_SIDE, SIDE), "b": flat})
+    require_distinct({"a": cube(OTHER_SIDE, SIDE * [1, -1]), "b": flat})
+
+
+def test_normals_are_scaled_and_saved_as_they_were(tmp_path):
+    robot = cube(SIDE, OTHER_SIDE)
+    scaled = msgspec.structs.replace(robot, normals=tuple(tuple(2 * x for x in n) for n in robot.normals))
+    np.testing.assert_allclose(scaled.unit_normals, robot.unit_normals, atol=1e-15)
+    for body in (robot, scaled):
+        save_robots({"a": body}, tmp_path / "robots.yaml")
+        assert load_robots(tmp_path / "robots.yaml") == {"a": body}
+    up = Robot(diameter_m=0.1, markers=SCALENE, normals=((0, 0, 3.0),) * 3)
+    assert up == Robot(diameter_m=0.1, markers=SCALENE)
 
 
 def test_more_robots_than_can_be_tracked_are_refused_before_the_work():

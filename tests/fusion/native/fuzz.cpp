@@ -76,8 +76,10 @@ bool estimate(Random& random, double wild) {
     const size_t bodies = 1 + random.below(6), frames = 1 + random.below(4), n = random.below(40);
     const FramePoses poses = poses_of(random, bodies, frames, wild);
     const Indices frame = random.indices(n, frames), body = random.indices(n, bodies);
-    const Numbers marker = random.numbers(3 * n, 0.2, wild), radius = random.numbers(n, 0.05, wild);
-    const Discs discs{frame.data(), body.data(), {marker.data(), n}, radius.data()};
+    const Numbers marker = random.numbers(3 * n, 0.2, wild), normal = random.numbers(3 * n, 1, wild),
+                  radius = random.numbers(n, 0.05, wild), delay = random.numbers(n, 0.01, wild);
+    const Discs discs{frame.data(),       body.data(),   {marker.data(), n},
+                      {normal.data(), n}, radius.data(), delay.data()};
     Numbers views(11 * n);
     view_discs(poses, discs, views.data());
     const Numbers xy = random.numbers(2 * n, 1, wild), four = random.numbers(4 * n, 800, wild),
@@ -115,15 +117,17 @@ bool associate(Random& random, double wild) {
     std::vector<ExpectedMarker> markers;
     for (size_t k = random.below(20); k > 0; --k) {
         const ErrorMatrix P = random.square(wild);
-        markers.push_back(ExpectedMarker::of(int64_t(random.below(bodies)), random.vector(0.2, wild),
-                                             random.number(0.05, wild), random.matrix(wild), P[0].data()));
+        const DiscOnBody disc{random.vector(0.2, wild), random.vector(1, wild), random.number(0.05, wild)};
+        markers.push_back(
+            ExpectedMarker::of(int64_t(random.below(bodies)), disc, random.matrix(wild), P[0].data()));
     }
     Indices frame = random.indices(n, frames);
     std::sort(frame.begin(), frame.end());
     const Numbers xy = random.numbers(2 * n, 0.4, wild), scale = random.numbers(4 * n, 800, wild),
                   cov = random.numbers(4 * n, 1, wild), major = random.numbers(n, 20, wild),
-                  focal = random.numbers(frames, 800, wild);
-    const Detections seen{frame.data(), {xy.data(), n}, {scale.data(), n}, {cov.data(), n}, major.data()};
+                  focal = random.numbers(frames, 800, wild), delay = random.numbers(n, 0.01, wild);
+    const Detections seen{frame.data(),    {xy.data(), n}, {scale.data(), n},
+                          {cov.data(), n}, major.data(),   delay.data()};
     const std::vector<Candidate> pairs = find_candidates(poses, markers, seen, focal.data());
     std::vector<char> found(n * markers.size());
     for (const Candidate& pair : pairs) {

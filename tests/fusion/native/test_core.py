@@ -46,11 +46,18 @@ def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
         body=random.integers(0, BODIES, n),
         marker=np.arange(n),
         position=random.uniform(-0.2, 0.2, (3, n)),
+        normal=unit_vectors(n, np.random.default_rng(seed + 1)),
         radius=random.uniform(0.02, 0.1, n),
     )
     return states, MatchedObservations.of_discs(
         DetectionTable.of(FrameSet(0, tuple(frames)), ARRAY, 0.1), discs
     )
+
+
+def unit_vectors(n: int, random: np.random.Generator) -> np.ndarray:
+    """(3, n) random directions."""
+    v = random.normal(size=(3, n))
+    return v / np.linalg.norm(v, axis=0)
 
 
 def frame(name: str, random: np.random.Generator) -> CalibratedFrame:
@@ -104,6 +111,25 @@ def test_equations_of_outlines_equal_difference_quotients():
     rows = equations.shape_rows(poses, discs, views, seen, sigma)
     rows[np.isnan(views.xy[0])] = 0
     assert_near(found, rows, atol=1e-6)
+
+
+def test_rows_of_a_rolling_shutter_are_frames_of_their_own():
+    """Discs that are captured some time after their frames have the views and equations of frames at that time."""
+    states, seen = scene()
+    exposures, n = seen.detections.exposures, len(seen)
+    delay = np.random.default_rng(4).uniform(-0.02, 0.02, n)
+    rows = replace(exposures, **{k: getattr(exposures, k)[seen.discs.frame] for k in exposures.__slots__})
+    rows = replace(rows, tau=rows.tau + delay)
+    discs = replace(seen.discs, delay=delay), replace(seen.discs, frame=np.arange(n), delay=None)
+    poses = ARRAY.frame_poses(states, exposures), ARRAY.frame_poses(states, rows)
+    given = seen.detections.xy, seen.whiten, np.zeros(BODIES, bool)
+    outlines = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, np.full(n, 0.1)
+    for call in (
+        lambda p, d: p.views(d.columns),
+        lambda p, d: p.linearize_centres(d.columns, *given),
+        lambda p, d: p.linearize_outlines(d.columns, *outlines),
+    ):
+        assert_near(call(poses[0], discs[0]), call(poses[1], discs[1]))
 
 
 def test_sums_and_weights_equal_reweighted_least_squares():
@@ -175,9 +201,8 @@ def test_candidates_are_the_pairs_within_the_gates():
     seen = replace(seen, detections=replace(seen.detections, exposures=exposures))
     states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)
     rows = random.choice(len(discs), 100, replace=False)
-    expected = _core.ExpectedMarkers(
-        states.R, states.P, discs.body[rows], discs.position[:, rows].copy(), discs.radius[rows]
-    )
+    of = discs.select(rows)
+    expected = _core.ExpectedMarkers(states.R, states.P, of.body, of.position, of.normal, of.radius)
     poses = ARRAY.frame_poses(states, exposures)
     (marker, sighting), cost = expected.candidates(
         poses, seen.detections.columns, ARRAY.focal[exposures.camera]
@@ -209,12 +234,12 @@ def test_indices_and_lengths_are_checked():
     states, seen = scene()
     poses = ARRAY.frame_poses(states, seen.detections.exposures)
     frame, body = seen.discs.frame, seen.discs.body
-    position, radius = seen.discs.position, seen.discs.radius
+    position, normal, radius = seen.discs.position, seen.discs.normal, seen.discs.radius
     for wrong in (body + BODIES, body - BODIES):
         with pytest.raises(IndexError):
-            poses.views(_core.DiscColumns(frame, wrong, position, radius))
+            poses.views(_core.DiscColumns(frame, wrong, position, normal, radius, 0 * radius))
     with pytest.raises(ValueError, match="lengths"):
-        _core.DiscColumns(frame, body, position[:, 1:].copy(), radius)
+        _core.DiscColumns(frame, body, position[:, 1:].copy(), normal, radius, 0 * radius)
     with pytest.raises(IndexError):
         _core.residuals(np.zeros((1, 2, 13)), np.array([3]), np.zeros((3, 12)))
 
@@ -229,7 +254,8 @@ def test_a_disc_seen_edge_on_gives_finite_equations_or_zeros():
     ahead, camera = np.tile([0.0, 0.0, 2.0], (n, 1)), np.eye(3)[None].copy()
     exposures = _core.CameraExposures(camera, np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     poses = _core.FramePoses(_core.BodyStates(R, ahead, still, still), exposures)
-    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), np.full(n, 0.04))
+    up = np.tile([[0.0], [0.0], [1.0]], n)
+    discs = _core.DiscColumns(none, np.arange(n), np.zeros((3, n)), up, np.full(n, 0.04), np.zeros(n))
     scale = np.tile(800 * np.eye(2)[..., None], n)
     axes = np.tile([[30.0], [10.0]], n)
     rows = poses.linearize_outlines(discs, axes, np.zeros(n), scale, np.full(n, 0.1))

@@ -27,20 +27,21 @@ FRAME, BODY = np.array([0, 0, 0, 1, 1]), np.array([0, 1, 2, 1, 0])
 P, R = np.tile(np.eye(12), (B, 1, 1)), np.tile(np.eye(3), (B, 1, 1))
 BODY_ARRAYS = R, np.zeros((B, 3)), np.zeros((B, 3)), np.zeros((B, 3))
 EXPOSURE_ARRAYS = np.tile(np.eye(3), (F, 1, 1)), -2 * np.ones((F, 3)), np.zeros(F), np.zeros(F)
-DISC_ARRAYS = FRAME, BODY, np.zeros((3, N)), np.full(N, 0.0625)
+ALONG_Z = np.tile([[0.0], [0.0], [1.0]], N)
+DISC_ARRAYS = FRAME, BODY, np.zeros((3, N)), ALONG_Z, np.full(N, 0.0625), np.full(N, 0.0625)
 SCALES, FOCAL, FALSE = np.tile(np.eye(2)[..., None], N), np.full(F, 800.0), np.zeros(B, bool)
-DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N)
+DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), np.ones(N)
 VIEWPOINT_ARRAYS = np.arange(F), np.zeros((F, 3)), np.zeros(F)
 EQUATIONS, STEPS = np.zeros((N, 2, 13)), np.zeros((B, 12))
 VIEWPOINTS = _core.Viewpoints(*VIEWPOINT_ARRAYS)
 POSES = _core.FramePoses(_core.BodyStates(*BODY_ARRAYS), _core.CameraExposures(*EXPOSURE_ARRAYS))
-MARKERS = _core.ExpectedMarkers(R, P, BODY, DISC_ARRAYS[2], DISC_ARRAYS[3])
+MARKERS = _core.ExpectedMarkers(R, P, BODY, *DISC_ARRAYS[2:5])
 OUTLINES = np.ones((2, N)), np.zeros(N), SCALES, np.ones(N)
 
 
 def of_discs(method: Callable[..., np.ndarray], *rest: np.ndarray) -> tuple[Callable[..., np.ndarray], tuple]:
     """A method whose first argument is given by the arrays of the discs."""
-    return lambda *given: method(_core.DiscColumns(*given[:4]), *given[4:]), (*DISC_ARRAYS, *rest)
+    return lambda *given: method(_core.DiscColumns(*given[:6]), *given[6:]), (*DISC_ARRAYS, *rest)
 
 
 CALLS = {
@@ -51,9 +52,9 @@ CALLS = {
     "linearize_centres": of_discs(POSES.linearize_centres, np.zeros((2, N)), SCALES, FALSE),
     "linearize_outlines": of_discs(POSES.linearize_outlines, *OUTLINES),
     "DetectionColumns": (_core.DetectionColumns, DETECTION_ARRAYS),
-    "ExpectedMarkers": (_core.ExpectedMarkers, (R, P, BODY, DISC_ARRAYS[2], DISC_ARRAYS[3])),
+    "ExpectedMarkers": (_core.ExpectedMarkers, (R, P, BODY, *DISC_ARRAYS[2:5])),
     "candidates": (
-        lambda *given: MARKERS.candidates(POSES, _core.DetectionColumns(*given[:5]), given[5]),
+        lambda *given: MARKERS.candidates(POSES, _core.DetectionColumns(*given[:6]), given[6]),
         (*DETECTION_ARRAYS, FOCAL),
     ),
     "shears": (

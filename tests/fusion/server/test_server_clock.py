@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.protocol.host_clock import unix_ahead_ns
+from camera_node.clocks.host_clock import unix_ahead_ns
 from fusion.client.arena import Arena as Client
 from fusion.protocol.messages import RobotPose
 from fusion.server.server_clock import ServerClock

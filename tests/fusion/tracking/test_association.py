@@ -6,7 +6,6 @@ import pytest
 
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
-from fusion._core import ExpectedMarkers
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import MarkerTable
@@ -31,10 +30,7 @@ def test_the_covariance_of_a_marker_is_that_of_displaced_states(tau: float):
     v, still = random.normal(size=(1, 3)), np.zeros((1, 3))
     states = States(R, random.normal(size=(1, 3)), still, v, root @ root.transpose(0, 2, 1))
     marker_table = MarkerTable.of([WIDE])
-    expected = ExpectedMarkers(
-        states.R, states.P, marker_table.robot, marker_table.position, marker_table.radius
-    )
-    found = expected.covariances(tau)
+    found = marker_table.expected(np.arange(len(marker_table)), states).covariances(tau)
     steps = 1e-4 * np.eye(12)[:, None]
     for k, marker in enumerate(marker_table.position.T):
         J = np.column_stack(

@@ -11,9 +11,10 @@ from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.likeness import distances
 from fusion.model.limits import Limits
 from fusion.model.observations import DetectionTable
-from fusion.model.robots import Robot, distances, require_distinct
+from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking import acquisition
 from fusion.tracking.identity import identification

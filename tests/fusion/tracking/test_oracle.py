@@ -78,6 +78,7 @@ def observed(
         body=np.zeros(n * k, np.intp),
         marker=np.tile(np.arange(n), k),
         position=np.tile(MARKERS.T, k),
+        normal=np.tile([[0.0], [0.0], [1.0]], n * k),
         radius=np.full(n * k, 1e-6),
     )
     return MatchedObservations.of_discs(

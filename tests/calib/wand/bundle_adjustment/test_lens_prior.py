@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma, usual_sigma, widen_lenses
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.grade import assess
+from calib.wand.quality.assessment import assess
 from calib.wand.recalibration import recalibrate_camera
 from calib.wand.result import WandCalibration
 from tests.calib.recordings import SimulatedRecording, WandScenario, record

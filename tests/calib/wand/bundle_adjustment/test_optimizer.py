@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE
+from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE, READOUT
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.disc_centres import displacement
@@ -40,12 +40,12 @@ def test_jacobians_are_those_of_the_residuals():
     """Against central differences, whose error is of second order in the step: 1e-5 of the largest entry at most."""
     arena = ring(3)
     result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
-    problem = result.adjusted.problem.with_free(POSE, OFFSET, DRIFT, LENS)
+    problem = result.adjusted.problem.with_free(POSE, OFFSET, DRIFT, READOUT, LENS)
     seen, state = result.observations, result.adjusted.state
     along = np.zeros((len(state.motion), state.motion[0].size))
     J = reprojection_jacobians(problem, seen, state, predict_markers(problem, seen, state))[1]
     for parameter, step in enumerate(
-        [1e-6] * 6 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-5, 1e-6, 1e-5, 1e-5, 1e-5]
+        [1e-6] * 6 + [1e-5, 1e-5, 1e-4, 1e-6, 1e-3, 1e-3, 1e-5, 1e-6, 1e-5, 1e-5, 1e-5]
     ):
         by = np.zeros((len(state.cameras), PER_CAMERA))
         by[:, parameter] = step

@@ -3,6 +3,7 @@
 
 import contextlib
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.rig import Rig
 from camera_node.errors import RoundelError
+from camera_node.protocol.requests import RequestSource
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots
 from fusion.server.storage.audit import quote
@@ -76,8 +78,11 @@ def test_any_request_can_be_quoted(payload: bytes):
     assert len(msgspec.json.encode(quote(payload))) < 200
 
 
-def test_changes_of_the_rig_are_noted_with_their_claimed_source(tmp_path: Path):
-    """A change, its undo and its redo."""
+def test_changes_of_the_rig_are_noted_with_their_claimed_source(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    """A change, its undo and its redo; in the log, the source in words."""
+    caplog.set_level(logging.INFO, "fusion.audit")
     audit = tmp_path / "audit.jsonl"
     settings = msgspec.structs.replace(config(tmp_path), audit=str(audit))
     with serving(settings) as (server, client):
@@ -92,3 +97,4 @@ def test_changes_of_the_rig_are_noted_with_their_claimed_source(tmp_path: Path):
         ("undo of the rig", "calib undo"),
         ("redo of the rig", "calib redo"),
     ]
+    assert f"(claims to be {RequestSource.of('calib undo')}): done" in caplog.text

@@ -2,6 +2,7 @@
 """Identifies this machine's clock and compares Unix time with the monotonic clock."""
 
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -18,12 +19,12 @@ def clock_id() -> str:
         return ""
 
 
-def unix_ahead_ns() -> int:
-    """Measure Unix time minus the monotonic clock.
+def unix_ahead_ns(read_ns: Callable[[], int] = time.monotonic_ns) -> int:
+    """Measure Unix time minus another clock that `read_ns` reads, the monotonic one unless given.
 
-    Reads Unix time between two readings of the monotonic clock and uses the fastest of `READINGS` attempts, because an
+    Reads Unix time between two readings of that clock and uses the fastest of `READINGS` attempts, because an
     interruption between the readings is an error of its length.
     """
-    readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(READINGS)]
+    readings = [(read_ns(), time.time_ns(), read_ns()) for _ in range(READINGS)]
     before, unix, after = min(readings, key=lambda reading: reading[2] - reading[0])
     return unix - (before + after) // 2

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.node.clock_offset import WANDER, WINDOW_NS, OffsetEstimator, RoundTrip
+from camera_node.clocks.clock_offset import WANDER, WINDOW_NS, OffsetEstimator, RoundTrip
 
 START = 1_700_000_000_000_000_000
 MS = 1_000_000

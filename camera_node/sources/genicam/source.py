@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""GenICam cameras (GigE Vision and USB3 Vision) as a source of frames."""
+
+import queue
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+from camera_node.clocks.device_clock import DeviceClock
+from camera_node.errors import CameraError, ConfigError
+from camera_node.protocol.messages import ControlValue
+from camera_node.sources.controls import Control, check_controls
+from camera_node.sources.description import CameraDescription
+from camera_node.sources.frame import Frame, SourceSettings
+from camera_node.sources.genicam.aravis import AravisError
+from camera_node.sources.genicam.camera import FoundCamera, GenicamCamera, find_camera, find_cameras
+from camera_node.sources.genicam.stream import GenicamStream, StampedImage
+from camera_node.sources.live import Capture, LiveSource
+
+POP_S = 0.1  # longest wait for one buffer, between looks at other requests
+SILENCE_S = 2.0  # without a frame, after which a camera that runs freely counts as lost
+REQUEST_S = 10.0  # longest wait of another thread for the one that reads
+
+
+class GenicamCapture(Capture):
+    """An open camera that delivers. Its time stamps are taken as the start of the exposure, as SFNC describes them.
+
+    Args:
+        found: which camera.
+        settings, controls: are applied before the stream starts.
+
+    Raises:
+        CameraError: the camera does not open or refuses a setting.
+        ConfigError: the camera does not offer a control or its value.
+    """
+
+    has_exposure = True
+
+    def __init__(
+        self, found: FoundCamera, settings: SourceSettings, controls: Mapping[str, ControlValue]
+    ) -> None:
+        self._camera = GenicamCamera(found)
+        self.name = self._camera.name
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future]] = queue.SimpleQueue()
+        self._past_incomplete = self._past_lost = 0  # of streams before the present one
+        try:
+            if not self._camera.is_controlled():
+                raise CameraError(f"{self.name} is controlled by another program; stop that one")
+            if controls:
+                check_controls(controls, self._camera.controls(), self.name)
+            self._camera.configure(settings, controls)
+            self._silence_s = max(SILENCE_S, 3 / settings.fps if settings.fps else 0.0)
+            self._begin()
+        except BaseException:
+            self._camera.close()
+            raise
+
+    @property
+    def incomplete(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]: read only
+        """See `Source`."""
+        return self._past_incomplete + self._stream.incomplete
+
+    @property
+    def lost_packets(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]: read only
+        """See `Source`."""
+        return self._past_lost + self._known_lost
+
+    def read(self) -> Frame | None:
+        """See `Capture.read`."""
+        try:
+            return self._next()
+        except CameraError:
+            self._refuse()
+            raise
+
+    def _next(self) -> Frame | None:
+        end_s = time.monotonic() + self._silence_s
+        while time.monotonic() < end_s:
+            self._serve()
+            self._clock.refresh()
+            if (stamped := self._stream.pop(POP_S)) is not None:
+                self._known_lost = self._stream.lost_packets()
+                return self._frame(stamped)
+            if not self._camera.is_controlled():
+                raise CameraError("the camera does not answer any more, or another program took it over")
+        self._known_lost = self._stream.lost_packets()
+        if self._is_triggered:
+            return None
+        raise CameraError(
+            f"no complete frame within {self._silence_s:g} s, {self.incomplete} incomplete ones so far; "
+            "check the firewall (UDP) and the packet size"
+        )
+
+    def offered(self) -> Mapping[str, Control]:
+        """See `Capture.offered`."""
+        return self._in_reader(self._camera.controls)
+
+    def adjust(
+        self, exposure_us: float | None, gain: float | None, controls: Mapping[str, ControlValue]
+    ) -> None:
+        """See `Capture.adjust`. What can't be set during an acquisition, such as PixelFormat, restarts it."""
+        self._in_reader(partial(self._apply, exposure_us, gain, controls))
+
+    def close(self) -> None:
+        self._refuse()
+        self._stream.close()
+        self._camera.close()
+
+    def _begin(self) -> None:
+        """Start the stream in the camera's present settings."""
+        self._is_triggered = self._camera.is_triggered()
+        self._exposure_us = self._camera.exposure_us()
+        self._clock = DeviceClock(self._camera.clock())
+        self._clock.refresh()
+        self._stream = GenicamStream(self._camera, self._camera.pixel_format())
+        self._known_lost = 0
+
+    def _frame(self, stamped: StampedImage) -> Frame:
+        t_ns, error_us = self._clock.to_unix(stamped.device_ns)
+        return Frame(stamped.image, t_ns + round(self._exposure_us * 500), self._exposure_us, error_us)
+
+    def _apply(
+        self, exposure_us: float | None, gain: float | None, controls: Mapping[str, ControlValue]
+    ) -> None:
+        self._camera.set_exposure(exposure_us, gain)
+        try:
+            self._camera.set_controls(controls)
+        except AravisError:
+            self._restart_with(controls)
+        self._is_triggered = self._camera.is_triggered()
+        self._exposure_us = self._camera.exposure_us()
+
+    def _restart_with(self, controls: Mapping[str, ControlValue]) -> None:
+        self._past_incomplete, self._past_lost = (
+            self.incomplete,
+            self._past_lost + self._stream.lost_packets(),
+        )
+        self._stream.close()
+        try:
+            self._camera.set_controls(controls)
+        finally:
+            self._begin()
+
+    def _in_reader(self, function: Callable[[], Any]) -> Any:
+        """Call a function in the thread that reads, because neither camera nor stream may be used by two at once."""
+        future: Future = Future()
+        self._requests.put((function, future))
+        try:
+            return future.result(REQUEST_S)
+        except TimeoutError:
+            raise CameraError(f"{self.name} does not answer; try again") from None
+
+    def _serve(self) -> None:
+        """Make the calls that other threads requested."""
+        while not self._requests.empty():
+            function, future = self._requests.get()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(function())
+            except Exception as error:  # goes to the thread that waits
+                future.set_exception(error)
+
+    def _refuse(self) -> None:
+        """Fail the requests that wait."""
+        while not self._requests.empty():
+            self._requests.get()[1].set_exception(CameraError(f"{self.name} is being closed; try again"))
+
+
+def open_genicam(text: str, settings: SourceSettings) -> LiveSource:
+    """A source of frames of a camera by serial number, id or address; raises as `GenicamCapture`."""
+    return LiveSource(lambda now, controls: GenicamCapture(find_camera(text), now, controls), settings)
+
+
+def genicam_key(text: str) -> tuple[str, str]:
+    """The key of a camera, its serial number, and its model; raises CameraAbsentError or ConfigError."""
+    found = find_camera(text)
+    return f"genicam {found.vendor} {found.model} {found.serial or found.id}", found.label
+
+
+def list_genicam() -> list[CameraDescription]:
+    """The cameras that answer; raises ConfigError where Aravis is missing."""
+    return [_describe(found) for found in find_cameras()]
+
+
+def _describe(found: FoundCamera) -> CameraDescription:
+    name = f"{found.vendor} {found.model}"
+    place = found.address or found.protocol
+    try:
+        camera = GenicamCamera(found)
+    except CameraError as error:
+        return CameraDescription("genicam", found.source, name, found.serial, note=str(error))
+    try:
+        note = f"at {place}" if camera.is_controlled() else f"at {place}; another program controls it"
+        modes, controls = camera.modes(), tuple(camera.controls().values())
+        return CameraDescription("genicam", found.source, name, found.serial, modes, controls, note)
+    except (CameraError, ConfigError) as error:
+        return CameraDescription("genicam", found.source, name, found.serial, note=str(error))
+    finally:
+        camera.close()

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Each refusal and each reason of a camera that is not placed, with a recording that triggers it."""
+
+import re
+from collections.abc import Callable
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from calib.commands.report import MAX_GROSS, print_report
+from calib.errors import CalibrationError
+from calib.rig.rig import Rig
+from calib.wand.calibrate import calibrate
+from calib.wand.labeling import label_recording
+from calib.wand.quality.assessment import assess
+from calib.wand.recalibration import recalibrate_camera
+from calib.wand.spacing import MAX_ROUNDELS
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+from tests.calib.mishaps import altered, repack
+from tests.calib.synthetic import WAND, Arena, record, ring
+
+Change = Callable[[Detections], Detections]
+
+
+@cache
+def numbered(cameras: int = 4) -> list[Detections]:
+    """Six seconds of a wand with marker numbers."""
+    return record(ring(cameras), 6.0, sigma_px=0.1, numbered=True, sized=False)
+
+
+def without_roundels(message: Detections) -> Detections:
+    return repack(message, message.unpack().select(np.zeros(len(message), bool)))
+
+
+def anywhere(message: Detections) -> Detections:
+    """All markers at random pixels."""
+    seen, rng = message.unpack(), np.random.default_rng([message.seq, *message.camera.encode()])
+    return repack(message, altered(seen, uv=rng.uniform(20, 580, seen.uv.shape)))
+
+
+def of(name: str, change: Change, messages: list[Detections]) -> list[Detections]:
+    """The recording with all messages of a camera changed."""
+    return [change(message) if message.camera == name else message for message in messages]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (without_roundels, "it never saw the wand; wave the wand in front of it"),
+        (anywhere, r"its detections fit no other camera \(at best \d+% .* check its name, its clock"),
+        (
+            lambda message: message if message.seq < 6 else without_roundels(message),
+            r"frame sets shared with other cameras: \d with cam0, .*at least 8",
+        ),
+        (
+            lambda message: msgspec.structs.replace(message, t_ns=message.t_ns + 1_200_000_000),
+            r"its timestamps are 1\.2\d s later than those of 'cam\d'; set its clock",
+        ),
+    ],
+    ids=["never saw", "fits none", "few", "clock"],
+)
+def test_a_camera_that_is_not_placed_has_a_reason(change: Change, reason: str):
+    arena = ring()
+    report = calibrate(arena.intrinsics, WAND, of("cam3", change, numbered())).report
+    assert list(report.unplaced) == ["cam3"]
+    assert re.search(reason, report.unplaced["cam3"])
+
+
+def swapped(cameras: int, first: str, second: str) -> Rig:
+    """The intrinsics of a ring of cameras with those of two exchanged."""
+    given = dict(ring(cameras).intrinsics.cameras)
+    given[first], given[second] = given[second], given[first]
+    return Rig(cameras=given)
+
+
+@pytest.mark.slow
+def test_swapped_lenses_are_named():
+    """Both cameras are named, and what to do; focal lengths differ by 8 %."""
+    messages = record(ring(5), 12.0, sigma_px=0.1, numbered=True, sized=False)
+    report = calibrate(swapped(5, "cam0", "cam4"), WAND, messages).report
+    assert set(report.unplaced) == {"cam0", "cam4"}
+    assert "fit the intrinsics of 'cam4', and vice versa; swap the two" in report.unplaced["cam0"]
+
+
+def test_a_majority_of_cameras_with_faults_is_refused():
+    """The lenses of two of three cameras are swapped: one camera remains. The pairs that agree are named."""
+    messages = record(ring(3), 20.0, sigma_px=0.05, numbered=True, sized=False)
+    agreeing = r"contradict each other: .*swap the two.* Pairs that agree by themselves: '"
+    with pytest.raises(CalibrationError, match=agreeing):
+        calibrate(swapped(3, "cam0", "cam2"), WAND, messages)
+
+
+def test_a_recording_without_the_wand_is_refused_with_counts():
+    messages = [without_roundels(message) for message in numbered(2)]
+    with pytest.raises(
+        CalibrationError, match=r"the wand was in no frame \(too few roundels in the frame: 120\)"
+    ):
+        calibrate(ring(2).intrinsics, WAND, messages)
+
+
+def test_two_cameras_that_rarely_see_the_wand_at_once_are_refused():
+    """Six frames of one of them: fewer than eight frame sets."""
+    messages = of("cam1", lambda m: m if m.seq < 6 else without_roundels(m), numbered(2))
+    with pytest.raises(
+        CalibrationError, match=r"wave the wand where two cameras see it at once \(camera 'cam0': frame"
+    ):
+        calibrate(ring(2).intrinsics, WAND, messages)
+
+
+def test_a_camera_without_common_frames_cannot_be_recalibrated():
+    arena = ring()
+    messages = of("cam3", lambda m: msgspec.structs.replace(m, t_ns=m.t_ns + 60_000_000_000), numbered())
+    with pytest.raises(
+        CalibrationError, match=r"'cam3' can't be placed: .* 0 with cam0.*where its view overlaps"
+    ):
+        recalibrate_camera(arena.truth, WAND, messages, "cam3")
+
+
+def test_a_wand_of_other_lengths_recalibrates_no_camera():
+    half = Body(diameter_m=0.12, markers=tuple((x / 2, y, z) for x, y, z in WAND.markers))
+    with pytest.raises(CalibrationError, match="lengths do not fit the detections; check the wand file"):
+        recalibrate_camera(ring().truth, half, numbered(), "cam3")
+
+
+@pytest.mark.slow
+def test_a_recording_that_contradicts_itself_is_reported(capsys: pytest.CaptureFixture[str]):
+    """Two of four cameras are moved by 0.4 m half way, which explains no camera alone: the report says not to trust the
+    result, with the share of the contradicting detections."""
+    arena = ring()
+    cameras = dict(arena.truth.cameras)
+    for name, shift in (("cam2", (0.0, 0.3, -0.3)), ("cam3", (0.3, 0.0, 0.2))):
+        pose = cameras[name].T_world_cam
+        assert pose is not None
+        x, y, z = np.add(pose.position_m, shift).tolist()
+        moved = msgspec.structs.replace(pose, position_m=(x, y, z))
+        cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=moved)
+    before = record(arena, 8.0, sigma_px=0.1, numbered=True, sized=False)
+    after = record(Arena(Rig(cameras=cameras)), 8.0, sigma_px=0.1, numbered=True, sized=False)
+    messages = [m for m in before if m.seq < 40] + [m for m in after if m.seq >= 40]
+    result = calibrate(arena.intrinsics, WAND, messages)
+    assert result.report.given is not None
+    assert result.report.given.gross > MAX_GROSS
+    print_report(result, assess(result, WAND))
+    assert re.search(r"\d\d% of the detections contradict the rig", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("wand", "change", "reason"),
+    [
+        (WAND, without_roundels, "too few roundels in the frame"),
+        (WAND, anywhere, "no wand among the roundels"),
+        (Body(diameter_m=0.12), lambda message: message, "ambiguous"),
+        (
+            WAND,
+            lambda message: repack(message, crowd(message.unpack())),
+            f"more than {MAX_ROUNDELS} roundels in the frame",
+        ),
+        (
+            WAND,
+            lambda message: repack(message, of_another_object(message.unpack())),
+            "no marker of the wand in the frame",
+        ),
+    ],
+    ids=["few", "none", "ambiguous", "crowded", "other numbers"],
+)
+def test_unused_frames_have_a_reason(wand: Body, change: Change, reason: str):
+    """Of a recording without marker numbers."""
+    arena = ring(2)
+    messages = [change(message) for message in record(arena, 1.0, sigma_px=0.1, clutter=0)]
+    left_out = label_recording(arena.intrinsics, wand, messages).left_out
+    assert left_out[0].most_common(1)[0][0] == reason
+
+
+def crowd(seen: Roundels) -> Roundels:
+    """The roundels with more than can be searched."""
+    rng = np.random.default_rng(len(seen))
+    return Roundels.from_points(np.vstack([seen.uv, rng.uniform(20, 580, (MAX_ROUNDELS, 2))]), 0.1)
+
+
+def of_another_object(seen: Roundels) -> Roundels:
+    """The roundels with numbers that no marker of the wand has."""
+    return altered(seen, id=np.arange(7, 7 + len(seen), dtype=np.int32))

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Wands before rolling shutters: readout times are estimated where the recording shows them, and used where given."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calib.commands.report import print_report
+from calib.rig.camera import OFFSET, READOUT
+from calib.wand.bundle_adjustment.covariance import camera_covariance
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.assessment import assess
+from calib.wand.result import WandCalibration
+from camera_node.geometry.body import Body
+from tests.calib.recordings import SimulatedRecording, WandScenario, record
+from tests.calib.synthetic import joint_error
+
+STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
+READOUT_MS = 30.0
+
+
+def waved(readout_ms: float, offset_ms: float = 50.0, free_running: bool = True) -> SimulatedRecording:
+    """Ten seconds before three cameras."""
+    return record(
+        WandScenario(
+            cameras=3,
+            seconds=10,
+            rate_hz=30,
+            sigma_px=0.2,
+            outliers=0.02,
+            both_sides=True,
+            arc=0.5,
+            offset_ms=offset_ms,
+            drift_ppm=0.0,
+            free_running=free_running,
+            rolling_ms=readout_ms,
+            wand=STICK,
+            seed=5,
+        )
+    )
+
+
+def require_true_clocks(result: WandCalibration, recorded: SimulatedRecording) -> None:
+    """Offsets and poses deviate from the truth as their covariances state."""
+    truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
+    apart = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])  # an offset that all clocks share is unobservable
+    off = apart @ (result.time_offset_ms - truth)
+    covariance = 1e6 * camera_covariance(result.adjusted).of(OFFSET)[:, 0, :, 0]
+    assert off @ np.linalg.solve(apart @ covariance @ apart.T, off) < chi2.ppf(0.999, 2)
+    squared, degrees = joint_error(result, recorded.truth)
+    assert squared < chi2.ppf(0.999, degrees)
+
+
+def test_a_readout_time_is_estimated_and_its_row_times_used(capsys: pytest.CaptureFixture[str]):
+    """It goes to the rig, where tracking finds it; the camera said nothing of it."""
+    recorded = waved(READOUT_MS)
+    result = calibrate(recorded.intrinsics, STICK, recorded.messages)
+    error = result.readout_ms - READOUT_MS
+    covariance = 1e6 * camera_covariance(result.adjusted).of(READOUT)[:, 0, :, 0]
+    assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 3)
+    assert result.readout_sigma_ms.max() < 2.0
+    for k, name in enumerate(result.names):
+        assert result.rig.cameras[name].readout_us == pytest.approx(1e3 * result.readout_ms[k])
+    require_true_clocks(result, recorded)
+    assert result.as_dict()["readout_ms"]["cam00"]["value"] == pytest.approx(READOUT_MS, abs=6.0)
+    print_report(result, assess(result, STICK))
+    assert "rolling shutter, readout time of the image, ms: cam00" in capsys.readouterr().out
+
+
+def test_a_given_readout_time_is_used():
+    """By the cameras' messages; synchronous cameras with rolling shutters still see the wand at different times."""
+    recorded = waved(READOUT_MS, offset_ms=0.0, free_running=False)
+    messages = [msgspec.structs.replace(m, readout_us=1e3 * READOUT_MS) for m in recorded.messages]
+    result = calibrate(recorded.intrinsics, STICK, messages, synchronous=True)
+    assert "captured one after another" in result.report.timing
+    assert not result.synchronous
+    assert result.readout_ms == pytest.approx(READOUT_MS)
+    assert not result.readout_sigma_ms.any()
+    assert all(camera.readout_us is None for camera in result.rig.cameras.values())
+    assert not result.time_offset_ms.any()
+    squared, degrees = joint_error(result, recorded.truth)
+    assert squared < chi2.ppf(0.999, degrees)
+
+
+def test_a_global_shutter_has_no_readout_time():
+    recorded = waved(0.0)
+    result = calibrate(recorded.intrinsics, STICK, recorded.messages)
+    assert not result.readout_ms.any()
+    assert all(camera.readout_us is None for camera in result.rig.cameras.values())
+    assert "readout_ms" not in result.as_dict()

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The commands of docs/recordings.md run in their order, on the recording that is part of the documentation."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.conftest import ROOT, free_port
+from tests.pages import page, programs
+from tests.waiting import DEADLINE_S
+from tests.web.roundel.programs import Program, roundel, roundel_command
+
+VIEW, *COMMANDS = page("recordings.md")
+TRACKED = "rover: tracked 100.0%, coasting 0.0%, lost 0.0%\ndrone: tracked 100.0%, coasting 0.0%, lost 0.0%\n"
+
+
+def test_the_sample_is_processed_cut_and_exported(tmp_path: Path):
+    (tmp_path / "docs").mkdir()
+    shutil.copy(ROOT / "docs" / "sample.mcap", tmp_path / "docs")
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    text = (ROOT / "docs" / "recordings.md").read_text()
+    assert f"```text\n{TRACKED}```" in text
+    for command in COMMANDS:
+        output = roundel(*shlex.split(command)[1:], folder=tmp_path)
+        assert "replay" not in command or TRACKED in output
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files >= {
+        "poses.csv",
+        "smooth.csv",
+        "fused.mcap",
+        "part.mcap",
+        "part.csv",
+        "part-rover.tum",
+        "part.c3d",
+    }
+    (program,) = programs("recordings.md")
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S, check=True)
+    assert "poses of rover" in done.stdout
+
+
+def test_the_sample_is_shown():
+    view = Program(roundel_command(*shlex.split(VIEW)[1:], "--port", str(free_port())), ROOT)
+    try:
+        view.until("http://")
+    finally:
+        assert view.stop() == 0
