@@ -32,6 +32,7 @@ TESTED = {
     "lab.md": "tests/test_docs.py",
     "import_export.md": "tests/test_docs.py",
     "network_cameras.md": "tests/test_docs.py",
+    "cameras.md": "tests/camera_node/commands/test_camera_reports.py",
     "detector_seen_refused.md": "tests/test_docs.py",
 }
 # They change the machine, or need a container engine; tests/test_lab.py checks the services.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import msgspec
 import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
@@ -16,6 +17,7 @@ from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.rate_limit import RateLimit
+from camera_node.protocol.requests import RequestSource
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
@@ -85,11 +87,12 @@ class Subscription:
 
     def change_robots(self, request: RobotsRequest) -> Robots:
         """Have the server change its robots; returns all robots and raises as `define`."""
+        request = msgspec.structs.replace(request, source=RequestSource.of("web"))
         return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
 
     def reframe_robot(self, name: str, change: Callable[[Robot], Robot]) -> Robots:
         """Have the server replace a robot by `change` of it; returns all robots and raises as `define`."""
-        return reframe_robot(self.session, self.feed.keys.arena, name, change, REQUEST_TIMEOUT_S)
+        return reframe_robot(self.session, self.feed.keys.arena, name, change, "web", REQUEST_TIMEOUT_S)
 
     def declared_robots(self) -> Robots:
         """All robots of the server. Raises NetworkError if it does not answer."""

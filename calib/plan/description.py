@@ -9,7 +9,7 @@ from calib.plan.volume import Volume
 from calib.rig.precision_map import SIGMA_PX
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
-from camera_node.sensor_model.imaging import Imaging
+from camera_node.sensor_model.imaging import Ground, Imaging
 
 MAX_CAMERAS = 64
 MAX_ROOM_M = 200.0
@@ -60,6 +60,8 @@ class ImageQuality(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         noise: standard deviation of a pixel's noise, grey levels.
         sigma_px: standard deviation of what calibration, print and light add to one coordinate of a centre, pixels.
         min_diameter_px: smallest minor axis of a roundel; None for the limit of the detector.
+        ground: what surrounds the cards: clutter, or one grey level about midway between ink and paper.
+        found_share: share of the roundels at the limit of size that are found in a new image.
     """
 
     blur_px: float = 0.7
@@ -67,6 +69,8 @@ class ImageQuality(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     noise: float = 3.0
     sigma_px: float = SIGMA_PX
     min_diameter_px: float | None = None
+    ground: Ground = "cluttered"
+    found_share: float = 0.99
 
     def __post_init__(self) -> None:
         self.imaging(0.0)
@@ -74,10 +78,12 @@ class ImageQuality(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             raise ValueError(f"sigma_px is {self.sigma_px}; give 0 to 10 pixels")
         if self.min_diameter_px is not None and not 1 <= self.min_diameter_px <= 1000:
             raise ValueError(f"min_diameter_px is {self.min_diameter_px}; give 1 to 1000 pixels")
+        if not 0.5 <= self.found_share <= 0.99:
+            raise ValueError(f"found_share is {self.found_share}; give 0.5 to 0.99")
 
     def imaging(self, exposure_s: float) -> Imaging:
         """The image quality with an exposure time, seconds."""
-        return Imaging(self.blur_px, self.contrast, self.noise, exposure_s)
+        return Imaging(self.blur_px, self.contrast, self.noise, exposure_s, self.ground)
 
 
 class PlannedRobots(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

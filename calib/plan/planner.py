@@ -175,7 +175,7 @@ def evaluate(arena: PlannedArena, points: int = POINTS) -> PlanReport:
 def _reach(camera: Camera, sensor: RoundelSensor, share: float) -> CameraReach:
     """A level roundel on the optical axis is slanted by the axis's angle from the vertical."""
     slant = float(np.arccos(np.clip(-camera.matrix()[2, 2], 0, 1)))
-    D = sensor.min_diameter_px or float(threshold_D(slant, sensor.imaging.blur_px))
+    D = sensor.min_diameter_px or float(threshold_D(slant, sensor.imaging, sensor.found_share))
     if not np.isfinite(D):
         return CameraReach(OperationalSpace(0.0, 0.0, 0.0, 0.0), share)
     return CameraReach(operational_space(camera, sensor.pattern.d_o, D, slant, slant), share)

@@ -6,7 +6,7 @@ derivative of the image by the point (the lens is taken as affine over one round
 over both axes, because `predict_precision` follows the edge of each roundel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,7 @@ class RoundelSensor:
         speed_m_s: of the roundels, in unknown directions.
         min_diameter_px: smallest minor axis of a detected roundel; None for the measured limit of our detector.
         stamp_sigma_s: standard deviation of a capture time.
+        found_share: share of the roundels at the limit of size that are found in a new image.
     """
 
     pattern: Pattern
@@ -67,6 +68,7 @@ class RoundelSensor:
     speed_m_s: float
     min_diameter_px: float | None
     stamp_sigma_s: float
+    found_share: float
 
     @classmethod
     def of(cls, plan: Plan, kind: CameraKind) -> "RoundelSensor":
@@ -79,6 +81,7 @@ class RoundelSensor:
             robots.speed_m_s,
             image.min_diameter_px,
             kind.stamp_sigma_s,
+            image.found_share,
         )
 
     def view(self, camera: Camera, points: ArrayLike) -> RoundelView:
@@ -116,7 +119,7 @@ class RoundelSensor:
             return axes[:, 1] >= self.min_diameter_px
         motion = axes[:, 0] * self.speed_m_s * self.imaging.exposure_s / self.pattern.d_o
         slant = np.arccos(np.clip(axes[:, 1] / axes[:, 0], 0, 1))
-        return is_large_enough(ImageOfDiscs(uv, axes, slant, motion), self.imaging)
+        return is_large_enough(ImageOfDiscs(uv, axes, slant, motion), self.imaging, self.found_share)
 
     @cached_property
     def _table(self) -> "NoiseTable":
@@ -142,8 +145,8 @@ class NoiseTable:
         motion = MAJOR_PX * speed_m_s * imaging.exposure_s / pattern.d_o
         rows = []
         for major, moved in zip(MAJOR_PX, motion, strict=True):
-            blurred = Imaging(
-                float(np.hypot(imaging.blur_px, moved / np.sqrt(24))), imaging.contrast, imaging.noise
+            blurred = replace(
+                imaging, blur_px=float(np.hypot(imaging.blur_px, moved / np.sqrt(24))), exposure_s=0.0
             )
             rows.append(_centre_variances(pattern, blurred, major))
         return cls(np.log(np.stack(rows, axis=1)))

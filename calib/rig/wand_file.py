@@ -8,11 +8,11 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from camera_node.config import load_yaml
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, PrintedWand
 from camera_node.protocol.messages import Detections
 
 
-class WandBody(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class WandBody(PrintedWand, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A wand of roundels; or, with a diameter of 0, of lights and other points without a size."""
 
     diameter_m: float = 0.0

@@ -166,7 +166,7 @@ def adjust_coarsely(recording: LabeledRecording, rough: RoughRig, budget: int = 
     # motion absorbs noise and the residuals are too small.
     density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
-    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand)
     return with_readout_times(adjust(problem, observations, state), observations, recording.timing)
 
 
@@ -181,7 +181,7 @@ def _prepare_fine(
     density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.timing.gap_s)
     problem = start.problem.with_free(POSE, LENS, *clocks.free)
     problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
-    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand)
     return Estimate(problem, state, observations)
 
 

@@ -130,7 +130,7 @@ def _adjust(recording: LabeledRecording, start: Estimate, this: int) -> Solution
     clock = () if recording.timing.synchronous else OFFSET
     problem = replace(start.problem.with_free(POSE, clock), estimated=(this,))
     state = optimize_robustly(problem, start.observations, start.state)
-    observations = with_disc_centres(problem, state, start.observations, recording.wand.diameter_m)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand)
     first = adjust(problem.with_free(POSE, clock, LENS), observations, state)
     first = inflate_covariance(with_readout_times(first, observations, recording.timing))
     check_lenses(recording.names, first)

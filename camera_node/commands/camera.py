@@ -10,6 +10,8 @@ from typing import Annotated
 
 import tyro
 
+from camera_node.commands.camera_check import check_cameras
+from camera_node.commands.camera_list import list_cameras
 from camera_node.commands.relative import RelativeSettings
 from camera_node.config import require_name
 from camera_node.errors import CameraAbsentError, ConfigError
@@ -22,6 +24,7 @@ from camera_node.supervisor import Supervisor
 from camera_node.terminal import say
 
 TICK_S = 0.25
+MAX_CHECK_S = 3600.0
 LOOK_S = 3.0  # between looks for cameras that were plugged in
 
 
@@ -33,8 +36,9 @@ class JoinArena:
     """
 
     source: tuple[str, ...] = ()
-    """Cameras by number (0), path (/dev/video2) or name; videos; folders of <t_ns>.png|jpg; or sim:NAME. All cameras of
-    this machine unless given, also those that are plugged in later."""
+    """Cameras by number (0), path (/dev/video2) or name; genicam:SERIAL; picamera:NUMBER; addresses of streams; videos;
+    folders of <t_ns>.png|jpg; or sim:NAME. All cameras of this machine unless given, also those that are plugged in
+    later; cameras of the network are given by name."""
     name: str | None = None
     """A fixed name for a single source; the server neither names it nor stores its settings."""
     connect: tuple[str, ...] = ()
@@ -46,13 +50,26 @@ class JoinArena:
     listen: tuple[str, ...] = ()
     """Run one camera without a server, as on a robot: be the Zenoh router that listens on these endpoints, such as
     tcp/127.0.0.1:7447, to which the robot's programs connect. Requires --name."""
+    show_list: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """Print the cameras of all drivers with their modes, and end."""
+    check: bool = False
+    """Read each camera for --seconds and report stamps, rate, losses, light and focus; publish nothing."""
+    seconds: float = 10.0
+    """Duration of --check for each camera."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print --list or --check as JSON; the list then has all controls with their limits."""
     relative: Annotated[RelativeSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=RelativeSettings)
     settings: Annotated[SourceSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=SourceSettings)
 
     def run(self) -> int:
         """Run one node per camera until stopped, or until all recordings ended."""
+        if self.show_list:
+            return list_cameras(self.as_json)
         self._check()
         with stopped_by_signals() as stop:
+            if self.check:
+                sources = self.source or tuple(local_cameras())
+                return check_cameras(sources, self.settings, self.seconds, self.as_json, stop)
             found = self._find(stop)
             if found is None:
                 return 0
@@ -60,6 +77,7 @@ class JoinArena:
             return cameras.run(stop)
 
     def _check(self) -> None:
+        self._check_report()
         if self.arena is not None:
             require_name(self.arena, "an arena")
         if self.name is not None:
@@ -74,6 +92,12 @@ class JoinArena:
             raise CameraAbsentError(
                 "this machine has no camera; plug one in, or give --source (roundel camera --list shows them)"
             )
+
+    def _check_report(self) -> None:
+        if self.as_json and not self.check:
+            raise ConfigError("--json prints --list or --check; give one of them with it")
+        if not 0 < self.seconds <= MAX_CHECK_S:
+            raise ConfigError(f"--seconds {self.seconds:g}: give a duration of up to {MAX_CHECK_S:g} s")
 
     def _check_listen(self) -> None:
         if self.listen and self.connect:

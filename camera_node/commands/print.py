@@ -2,6 +2,7 @@
 """`print`: roundels, wands, boards, L-frames and robots at true scale, as PDF or SVG, with the YAML that belongs to
 them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,7 +12,7 @@ import tyro
 
 from camera_node.config import dump_yaml, example_file, load_yaml, write_atomically
 from camera_node.errors import ConfigError
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, PrintedWand
 from camera_node.printing.drawing import Page, write_pages
 from camera_node.printing.sheets import Card, board_page, body_page, card_pages, cards_for_page
 from camera_node.terminal import say
@@ -97,7 +98,7 @@ class Sheet:
         """The name and the body that the file describes."""
         path = self.file or example_file(EXAMPLES[self.what])
         if self.what != "robot":
-            body = load_yaml(path, Body)
+            body = load_yaml(path, PrintedWand if self.what == "wand" else Body)
             return self.what, self._resized(body)
         robots = load_yaml(path, _Robots).robots
         name = self.name or next(iter(robots), "")
@@ -122,8 +123,11 @@ class Sheet:
         title = f"{name}, d_o = {1e3 * body.diameter_m:g} mm"
         if page := body_page(body, self.paper, name, title):
             return [page]
-        places = (", ".join(f"{1e3 * x:g}" for x in marker) for marker in body.markers)
-        cards = [Card(body, f"{name} {k}: ({place}) mm") for k, place in enumerate(places, 1)]
+        places = [f"({_listed(1e3 * x for x in marker)}) mm" for marker in body.markers]
+        if body.normals:
+            faces = (_listed(round(x, 3) for x in normal) for normal in body.normals)
+            places = [f"{place} facing ({face})" for place, face in zip(places, faces, strict=True)]
+        cards = [Card(body, f"{name} {k}: {place}") for k, place in enumerate(places, 1)]
         return card_pages(cards, self.paper, title)
 
     def _write_yaml(self, path: Path, name: str, body: Body) -> str:
@@ -135,3 +139,7 @@ class Sheet:
         return (
             f"wrote {path}, which describes the print: {len(body.markers)} roundels of {body.diameter_m:g} m"
         )
+
+
+def _listed(numbers: Iterable[float]) -> str:
+    return ", ".join(f"{x:g}" for x in numbers)

@@ -10,6 +10,7 @@ from camera_node.arrays import Array
 
 Vector = tuple[float, float, float]
 MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter
+MAX_THICKNESS_M = 0.1  # of a wand with two printed sides
 UP: Vector = (0.0, 0.0, 1.0)
 UNIT = 1e-9  # a normal whose length differs from 1 by less stays as it is, so that a saved body equals its original
 
@@ -70,6 +71,38 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             )
         normals = tuple(_unit(normal) for normal in self.normals)
         msgspec.structs.force_setattr(self, "normals", () if set(normals) <= {UP} else normals)
+
+
+class PrintedWand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A wand for calibration, with roundels on one side, or back to back on both sides.
+
+    Attributes:
+        thickness_m: from the prints of one side to those of the other, metres; `markers` are in the middle. 0: one side
+            is printed, or both at the same place.
+    """
+
+    thickness_m: float = 0.0
+
+    def check_layout(self) -> None:
+        """Raise ValueError unless the wand can be calibrated with."""
+        super().check_layout()
+        if self.normals:
+            raise ValueError(
+                "a wand has no normals: its prints face one way, or both ways, thickness_m apart; leave normals out"
+            )
+        if not 0 <= self.thickness_m <= MAX_THICKNESS_M:
+            raise ValueError(
+                f"thickness_m is {self.thickness_m}; give metres from 0 to {MAX_THICKNESS_M:g}, or leave it out"
+            )
+        if self.thickness_m and np.linalg.matrix_rank(self.points - self.points[0], tol=0.005) > 1:
+            raise ValueError(
+                "a wand with two printed sides has its markers on a line; move them, or leave out thickness_m"
+            )
+
+
+def thickness_of(wand: Body) -> float:
+    """The distance between the two printed sides of a wand, metres; 0 with one side."""
+    return wand.thickness_m if isinstance(wand, PrintedWand) else 0.0
 
 
 def _unit(v: Vector) -> Vector:

@@ -2,8 +2,11 @@
 """What blurs and disturbs the image of a roundel."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+
+Ground = Literal["cluttered", "even"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +18,7 @@ class Imaging:
         contrast: grey levels of the paper minus those of the ink, of 255.
         noise: standard deviation of a pixel's noise, grey levels.
         exposure_s: exposure time, seconds; it has an effect on moving roundels only.
+        ground: what surrounds the cards: clutter, or one grey level about midway between ink and paper.
 
     Raises:
         ValueError: a value is out of its range.
@@ -24,6 +28,7 @@ class Imaging:
     contrast: float = 150.0
     noise: float = 3.0
     exposure_s: float = 0.0
+    ground: Ground = "cluttered"
 
     def __post_init__(self) -> None:
         values = (self.blur_px, self.contrast, self.noise, self.exposure_s)

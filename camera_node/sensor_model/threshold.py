@@ -1,52 +1,87 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """D, the smallest size of a pattern's image that our detector finds, as measured.
 
-Measured by `python -m tests.benchmarks.paper threshold`, which prints these tables: roundels on cluttered ground with
-the card's default margin, found in 99 % of new images. docs/sensor_model.md shows the measurement.
+Measured by `python -m tests.benchmarks.paper threshold`, which prints these tables: roundels with the card's default
+margin, found in new images. docs/sensor_model.md shows the measurement.
 """
+
+from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
 from camera_node.arrays import Array
+from camera_node.sensor_model.imaging import Ground, Imaging
 
-# Smallest major axis, pixels, by the standard deviation of the lens's blur, pixels, of frontal roundels.
-BLUR_PX = (0.4, 0.7, 1.0, 1.5, 2.0)
-SMALLEST_BY_BLUR_PX = (10.5, 11.5, 16.5, 27.0, 38.0)
-# Smallest major axis relative to that of a frontal roundel, by slant, degrees. At 75 degrees none is found up to 60 px.
-SLANT_DEG = (0.0, 30.0, 45.0, 60.0, 70.0)
-RELATIVE_BY_SLANT = (1.0, 1.0, 1.13, 1.6, 3.2)
-MAX_SLANT_DEG = 72.0
+BLUR_PX = (0.4, 0.7, 1.0, 1.5, 2.0)  # standard deviation of the lens's blur
+SLANT_DEG = (0.0, 30.0, 45.0, 52.5, 60.0, 65.0, 70.0)
+MAX_SLANT_DEG = 72.0  # at 75 degrees none is found up to 48 px
+
+
+@dataclass(frozen=True, slots=True)
+class SmallestSizes:
+    """Major axes, pixels, at which a share of the roundels is found.
+
+    Attributes:
+        by_blur_px: of frontal roundels, at `BLUR_PX`.
+        by_slant: at `SLANT_DEG` and a blur of 0.7 px, relative to a frontal one.
+    """
+
+    by_blur_px: tuple[float, ...]
+    by_slant: tuple[float, ...]
+
+    def at(self, slant_deg: Array, blur_px: float) -> Array:
+        """(...) pixels. The frontal size is linear in the blur, constant below the least and proportional beyond the
+        largest one; the minor axis is linear in the slant, and constant beyond the last one."""
+        frontal = float(np.interp(blur_px, BLUR_PX, self.by_blur_px)) * max(1.0, blur_px / BLUR_PX[-1])
+        minor = np.asarray(self.by_slant) * np.cos(np.radians(SLANT_DEG))
+        return (
+            frontal * np.interp(slant_deg, SLANT_DEG, minor) / np.maximum(np.cos(np.radians(slant_deg)), 1e-9)
+        )
+
+
+HALF, NEARLY_ALL = 0.5, 0.99  # the measured shares
+# At 70 degrees in clutter, 97 % of 36 to 48 px are found, and 99 % of no size up to there: the model takes 50 px.
+SIZES: dict[Ground, dict[float, SmallestSizes]] = {
+    "cluttered": {
+        HALF: SmallestSizes((7.4, 8.1, 10.8, 15.8, 21.3), (1.0, 1.08, 1.24, 1.4, 1.67, 1.98, 2.45)),
+        NEARLY_ALL: SmallestSizes((10.6, 11.1, 15.6, 24.3, 37.6), (1.0, 1.05, 1.16, 1.34, 1.55, 2.18, 4.5)),
+    },
+    "even": {
+        HALF: SmallestSizes((7.1, 7.4, 9.5, 13.2, 16.9), (1.0, 1.08, 1.2, 1.33, 1.59, 1.93, 2.48)),
+        NEARLY_ALL: SmallestSizes((9.0, 9.0, 11.1, 14.9, 19.0), (1.0, 1.12, 1.12, 1.5, 1.95, 2.05, 3.44)),
+    },
+}
 # A roundel that moves by more than this share of its diameter during the exposure counts as moving. Of moving ones,
 # nine in ten are found in a first frame if they are as large as this and move by no more than this many diameters.
 MOVING_SHARE, MOVING_PX, LONGEST_SHARE = 0.1, 20.0, 0.75
 # Share of the diameter that the image's border may cut off; 14 px and more were found in all images.
 CUT_SHARE = 0.1
-MAX_DIAMETER_PX = 400.0  # the detector's default setting
+MIN_DIAMETER_PX, MAX_DIAMETER_PX = 8.0, 400.0  # the detector's default settings
 MIN_CONTRAST = 25.0  # grey levels, the detector's default setting
 
 
-def smallest_major_px(slant_rad: Array | float, blur_px: float) -> Array:
-    """The smallest major axis of a roundel's outer ellipse that the detector finds, pixels.
+def smallest_major_px(slant_rad: Array | float, imaging: Imaging, share: float = NEARLY_ALL) -> Array:
+    """The major axis of a roundel's outer ellipse at which the detector finds a share of the roundels, pixels.
 
-    Linear between measured values, constant below the least blur, proportional to the blur beyond the largest one.
+    The share found is taken as a normal distribution of the size's logarithm, through the two measured shares.
 
     Args:
         slant_rad: (...) angle between the printed side's normal and the line of sight, radians, as it appears in the
             image: the cosine is the ratio of the axes.
-        blur_px: standard deviation of the lens's blur, pixels.
+        imaging: blur, and what surrounds the cards.
+        share: 0.5 to 0.99.
 
     Returns:
         (...) pixels; infinite beyond the largest slant.
     """
     slant = np.degrees(np.asarray(slant_rad, float))
-    frontal = float(np.interp(blur_px, BLUR_PX, SMALLEST_BY_BLUR_PX))
-    frontal *= max(1.0, blur_px / BLUR_PX[-1])
-    # Beyond the last measured slant, the minor axis stays the same.
-    last = np.cos(np.radians(SLANT_DEG[-1])) / np.maximum(np.cos(np.radians(slant)), 1e-9)
-    relative = np.interp(slant, SLANT_DEG, RELATIVE_BY_SLANT) * np.maximum(last, 1.0)
-    return np.where(slant <= MAX_SLANT_DEG, frontal * relative, np.inf)
+    half, nearly_all = (SIZES[imaging.ground][s].at(slant, imaging.blur_px) for s in (HALF, NEARLY_ALL))
+    quantile = NormalDist().inv_cdf
+    weight = quantile(share) / quantile(NEARLY_ALL)
+    return np.where(slant <= MAX_SLANT_DEG, half ** (1 - weight) * nearly_all**weight, np.inf)
 
 
-def threshold_D(slant_rad: Array | float, blur_px: float) -> Array:
-    """D of the paper's model, (...) pixels: the smallest minor axis that the detector finds."""
-    return smallest_major_px(slant_rad, blur_px) * np.cos(slant_rad)
+def threshold_D(slant_rad: Array | float, imaging: Imaging, share: float = NEARLY_ALL) -> Array:
+    """D of the paper's model, (...) pixels: the minor axis at which a share of the roundels is found."""
+    return smallest_major_px(slant_rad, imaging, share) * np.cos(slant_rad)

@@ -128,15 +128,19 @@ def is_detected(
     return visible & is_large_enough(image, imaging)
 
 
-def is_large_enough(image: ImageOfDiscs, imaging: Imaging = DEFAULT_IMAGING) -> Mask:
-    """(N,) whether the detector finds roundels of these axes, slants and motions."""
+def is_large_enough(
+    image: ImageOfDiscs, imaging: Imaging = DEFAULT_IMAGING, share: float = threshold.NEARLY_ALL
+) -> Mask:
+    """(N,) whether the detector finds at least a share of the roundels of these axes, slants and motions."""
     major, minor = image.axes_px.T
     with np.errstate(invalid="ignore"):
         apparent = np.arccos(np.clip(minor / major, 0, 1))
-        smallest = threshold.smallest_major_px(apparent, imaging.blur_px)
+        smallest = threshold.smallest_major_px(apparent, imaging, share)
         moves = image.motion_px > threshold.MOVING_SHARE * minor
         smallest = np.where(moves, np.maximum(smallest, threshold.MOVING_PX), smallest)
-        fits = (major >= smallest) & (major <= threshold.MAX_DIAMETER_PX)
+        fits = (major >= np.maximum(smallest, threshold.MIN_DIAMETER_PX)) & (
+            major <= threshold.MAX_DIAMETER_PX
+        )
         slow = image.motion_px <= threshold.LONGEST_SHARE * major
     return fits & slow & (imaging.contrast >= threshold.MIN_CONTRAST)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from camera_node.arrays import Array, Grey
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_with_z
 from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
@@ -51,8 +51,12 @@ def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
     """The roundels of a body at T_cam_body (4, 4), visible or not."""
     outer = body.diameter_m / 2
     radii = (outer * body.surround_ratio, outer, outer * body.inner_ratio)
-    T_body_disc = np.tile(np.eye(4), (len(body.markers), 1, 1))
-    T_body_disc[:, :3, :3], T_body_disc[:, :3, 3] = rotation_with_z(body.unit_normals), body.points
+    points, normals, half = body.points, body.unit_normals, thickness_of(body) / 2
+    if half:
+        points = np.concatenate([points + half * normals, points - half * normals])
+        normals = np.concatenate([normals, -normals])
+    T_body_disc = np.tile(np.eye(4), (len(points), 1, 1))
+    T_body_disc[:, :3, :3], T_body_disc[:, :3, 3] = rotation_with_z(normals), points
     return [Disc(T, radii) for T in T_cam_body @ T_body_disc]
 
 

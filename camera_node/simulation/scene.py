@@ -11,7 +11,7 @@ import numpy as np
 from camera_node.arrays import Array
 from camera_node.config import load_yaml
 from camera_node.errors import ConfigError
-from camera_node.geometry.body import Body, Vector
+from camera_node.geometry.body import Body, PrintedWand, Vector
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import look_at, rotation_from_vector
 from camera_node.simulation.sensor import SENSORS, Sensor, SensorName
@@ -167,7 +167,7 @@ class Scene:
             ConfigError: a file is missing, invalid or has an unknown key; a robot has no motion, or a motion no robot.
         """
         file = load_yaml(path, _File)
-        wand = load_yaml(path.parent / file.wand, Body)
+        wand = load_yaml(path.parent / file.wand, PrintedWand)
         robots = load_yaml(path.parent / file.robots, _Robots).robots
         if not file.cameras:
             raise ConfigError(f"{path} has no camera; add at least one under cameras")

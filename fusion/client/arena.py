@@ -26,7 +26,7 @@ from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from camera_node.protocol.relative import RelativePositions
-from camera_node.protocol.requests import RETRY_S
+from camera_node.protocol.requests import RETRY_S, RequestSource
 from camera_node.protocol.server_address import LOCAL
 from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
@@ -145,7 +145,11 @@ class Arena:
             NetworkError: no server answers in time.
         """
         request = RobotsRequest(
-            rename=rename or {}, remove=tuple(remove), define=define or {}, replace=replace
+            rename=rename or {},
+            remove=tuple(remove),
+            define=define or {},
+            replace=replace,
+            source=RequestSource.of("fusion.client"),
         )
         return change_robots(self.session, self.keys.arena, request).robots
 

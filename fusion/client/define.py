@@ -10,6 +10,7 @@ import zenoh
 
 from camera_node.config import require_name
 from camera_node.errors import ConfigError
+from camera_node.protocol.requests import RequestSource
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
 from fusion.model.likeness import distances
 from fusion.protocol.messages import Robots, RobotsRequest
@@ -60,7 +61,8 @@ def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition
     if definition.centre is not None:
         markers = markers.within(definition.centre, definition.radius_m)
     robot = robot_from_markers(markers, definition.diameter_m, definition.motion)
-    request = RobotsRequest(define={definition.name: robot}, replace=definition.replace)
+    source = RequestSource.of("fusion define")
+    request = RobotsRequest(define={definition.name: robot}, replace=definition.replace, source=source)
     return change_robots(session, arena, request)
 
 

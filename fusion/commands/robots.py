@@ -9,6 +9,7 @@ import tyro
 import zenoh
 
 from camera_node.errors import ConfigError
+from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 from fusion.client.define import LOST_AT_RESTART
@@ -78,14 +79,17 @@ def robots(
 
 
 def _apply(session: zenoh.Session, arena: str, action: str, arguments: tuple[str, ...]) -> Robots:
+    program = f"fusion robots {action}"
+    source = RequestSource.of(program)
     if action == "rename":
-        return change_robots(session, arena, RobotsRequest(rename={arguments[0]: arguments[1]}))
+        names = {arguments[0]: arguments[1]}
+        return change_robots(session, arena, RobotsRequest(rename=names, source=source))
     if action == "remove":
-        return change_robots(session, arena, RobotsRequest(remove=arguments))
+        return change_robots(session, arena, RobotsRequest(remove=arguments, source=source))
     if action in ("pivot", "turn"):
         name, numbers = arguments[0], _numbers(arguments[1:])
         change = _move(*numbers) if action == "pivot" else lambda robot: turn_heading(robot, *numbers)
-        return reframe_robot(session, arena, name, change)
+        return reframe_robot(session, arena, name, change, program)
     return request_robots(session, arena)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from camera_node.arrays import Array, Index
 from camera_node.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
+from camera_node.protocol.requests import RequestSource
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
@@ -321,6 +322,7 @@ class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         str, Robot
     ] = {}  # new robots, or with `replace` new markers of old ones, which are acquired again
     replace: bool = False  # otherwise `define` with the name of another robot is refused
+    source: RequestSource | None = None
 
 
 class Robots(msgspec.Struct, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ import zenoh
 
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
-from camera_node.protocol.requests import REQUEST_S, RequestError, send_request
+from camera_node.protocol.requests import REQUEST_S, RequestError, RequestSource, send_request
 from camera_node.text import printable
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
@@ -43,9 +43,12 @@ def reframe_robot(
     arena: str,
     name: str,
     change: Callable[[Robot], Robot],
+    program: str,
     timeout_s: float = REQUEST_S,
 ) -> Robots:
     """Replace a robot by `change` of it, such as `fusion.model.robot_frame.move_origin`; it is acquired again.
+
+    `program` asks for it, such as "fusion robots turn", for the server's audit.
 
     Raises:
         FusionError: there is no such robot, or it can not be changed so.
@@ -56,7 +59,8 @@ def reframe_robot(
         raise FusionError(
             f"there is no robot '{printable(name, 80)}'; there are {', '.join(robots) or 'none'}"
         )
-    request = RobotsRequest(define={name: change(robots[name])}, replace=True)
+    changed, source = {name: change(robots[name])}, RequestSource.of(program)
+    request = RobotsRequest(define=changed, replace=True, source=source)
     return change_robots(session, arena, request, timeout_s)
 
 

@@ -22,6 +22,8 @@ from fusion.tracking.gating import (
     MAX_CHI2,
     mean_by_body,
 )
+from fusion.tracking.grouping.multiview import Marker, find_markers
+from fusion.tracking.grouping.portions import Portion, limit_of, portion_of
 from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
@@ -30,7 +32,6 @@ from fusion.tracking.identity.single_markers import (
     choose_markers,
 )
 from fusion.tracking.identity.trial_updates import Starts, refine
-from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
@@ -296,6 +297,10 @@ def _reason(table: TrackTable, k: int, question: Question, identified: Identifie
     if k in identified.rivals:
         rival = identified.rivals[k]
         return "its markers fit in several places" if rival == k else f"ambiguous with {table.names[rival]}"
+    if k in identified.unexplained:
+        return (
+            "some of its markers fit, but the cameras do not detect most of the others that they should see"
+        )
     if k not in found.tables or not len(found.tables[k]):
         return _too_few(table.robots[k], question.scene)
     return f"no {MIN_MARKERS} of its {n} markers fit well anywhere"

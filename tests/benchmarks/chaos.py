@@ -47,9 +47,9 @@ class Episode:
         return during and self.fault.robots in (None, (gap.robot,)) and gap.seconds <= self.fault.gap_s
 
     def excuses(self, pose: WrongPose) -> bool:
-        """Whether a camera's clock was stepped, or stepped back, just now."""
-        since_s = (pose.received_s - self.begun_s, pose.received_s - self.ended_s)
-        return self.kind == "clock stepped" and any(0 <= s < CLOCK_S for s in since_s)
+        """Whether a camera's clock was stepped, or stepped back, just now; the end of a drift is a step."""
+        steps_s = {"clock stepped": (self.begun_s, self.ended_s), "clock drifts": (self.ended_s,)}
+        return any(0 <= pose.received_s - at_s < CLOCK_S for at_s in steps_s.get(self.kind, ()))
 
 
 @dataclass

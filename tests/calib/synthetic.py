@@ -13,7 +13,7 @@ from calib.wand.quality.agreement import CameraPoses, compare_calibrations
 from calib.wand.result import WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector, vector_from_rotation
 from camera_node.protocol.messages import Detections
 
@@ -57,6 +57,8 @@ class Arena:
         T = invert(camera.matrix()) @ self.wand_pose(t_ns * 1e-9)
         points = transform(T, self.wand.points)
         normals = np.repeat(T[None, :3, 2], len(points), axis=0)
+        side = -np.sign(np.einsum("ni,ni->n", normals, points))
+        points = points + thickness_of(self.wand) / 2 * side[:, None] * normals
         uv, axes, angles = outlines(camera, points, normals, self.wand.diameter_m / 2)
         uv = uv if sized else camera.project(points)
         inside = ((uv > 15) & (uv < [camera.width - 15, camera.height - 15])).all(axis=1)

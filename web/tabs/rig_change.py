@@ -10,7 +10,7 @@ from calib.rig.changes import holds_rig
 from calib.rig.rig import Rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import PrintedWand
 from web.subscription import Subscription
 
 
@@ -29,7 +29,7 @@ class CalibrationFiles:
     def check(self) -> None:
         """Raise ConfigError or CalibrationError if a file is missing or invalid."""
         load_known_lenses(self.rig)
-        load_yaml(self.wand, Body)
+        load_yaml(self.wand, PrintedWand)
 
 
 def current_rig(subscription: Subscription, files: CalibrationFiles) -> Rig:

@@ -19,7 +19,7 @@ from calib.live.wand_session import SessionProgress, WandSession, run_wand_sessi
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, PrintedWand
 from web.colours import PREVIEW
 from web.condition import next_step
 from web.errors import WebError
@@ -60,7 +60,7 @@ class WandSessionPanel:
             self._answer = Answer(server.gui)
             self._session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
             self._accept = ActionButton(server.gui, "Accept the calibration", self.accept, self._answer)
-            self._discard = ActionButton(server.gui, "Discard it", self.discard, self._answer)
+            self._discard = ActionButton(server.gui, "Discard the calibration", self.discard, self._answer)
             self._cameras = server.gui.add_html("")
         self._candidate: Rig | None = None
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
@@ -119,7 +119,7 @@ class WandSessionPanel:
 
     def _record_and_calibrate(self, end: threading.Event, only: str) -> str:
         session, arena, files = self._subscription.session, self._subscription.feed.keys.arena, self._files
-        wand = load_yaml(files.wand, Body)
+        wand = load_yaml(files.wand, PrintedWand)
         before = current_rig(self._subscription, files)
         if only == ALL:
             lenses, sizes = load_known_lenses(files.rig), running_camera_sizes(session, arena)

@@ -3,7 +3,8 @@
 
 Perspective displaces the centre of a disc's image from the projection of the disc's centre, by about
 D^2/(4f) sin t cos t pixels for a disc of D pixels that is tilted by t: always to the same side, so the error does not
-average out. All markers of the wand face the same way, so the ellipses of one frame set together give their normal.
+average out. All markers of the wand face the same way, or the opposite one, so the ellipses of one frame set together
+give their normal. A camera that sees one side of a thick wand sees its discs half the thickness from the markers.
 """
 
 from dataclasses import replace
@@ -13,6 +14,7 @@ import numpy as np
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
 from camera_node.arrays import Array, Index
+from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.sphere import fibonacci_sphere
 
@@ -23,26 +25,27 @@ STEPS = 4  # of Gauss-Newton
 
 
 def with_disc_centres(
-    problem: Problem, state: State, observations: WandObservations, diameter_m: float
+    problem: Problem, state: State, observations: WandObservations, wand: Body
 ) -> WandObservations:
-    """The observations of ellipse centres, corrected to the discs' own centres at a state."""
+    """The observations of ellipse centres, corrected to the markers of the wand at a state."""
     points = predict_markers(problem, observations, state).points
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
-    offsets = centre_offsets(lenses, state.cameras, observations, points, diameter_m / 2)
+    offsets = centre_offsets(lenses, state.cameras, observations, points, wand)
     return replace(observations, uv=observations.uv - offsets)
 
 
 def centre_offsets(
-    lenses: list[Lens], cameras: Array, observations: WandObservations, points: Array, radius: float
+    lenses: list[Lens], cameras: Array, observations: WandObservations, points: Array, wand: Body
 ) -> Array:
-    """(n, 2) pixels from the projections of discs' centres to their ellipses' centres; 0 where no ellipse of the frame
-    set gives the normal.
+    """(n, 2) pixels from the projections of the markers to the ellipses' centres of the discs that the cameras see; 0
+    where no ellipse of the frame set gives the normal.
 
     Args:
         lenses, cameras: of C cameras, (C, 4, 4) T_world_cam.
-        points: (n, 3) centres of the discs, world.
-        radius: of the discs, metres.
+        points: (n, 3) markers, world.
+        wand: radius of its discs, and their distance from the markers on both sides.
     """
+    radius, half = wand.diameter_m / 2, thickness_of(wand) / 2
     offsets = np.zeros((len(observations), 2))
     local, P = point_jacobians(lenses, cameras, observations.camera, points)
     known = (
@@ -52,12 +55,15 @@ def centre_offsets(
     )
     if not known.any():
         return offsets
-    normals = _find_normals(cameras, observations.select(known), P[known], points[known], radius)
+    normals = _find_normals(cameras, observations.select(known), P[known], points[known], wand)
     rows = np.flatnonzero(np.isfinite(normals[observations.knot, 0]) & (local[:, 2] > 2 * radius))
     for c, lens in enumerate(lenses):
         mine = rows[observations.camera[rows] == c]
         normal = normals[observations.knot[mine]] @ cameras[c, :3, :3]
-        offsets[mine] = np.nan_to_num(displacement(lens, local[mine], normal, radius))
+        side = -np.sign(np.einsum("ni,ni->n", normal, local[mine]))  # whose print the camera sees
+        disc = local[mine] + half * side[:, None] * normal
+        moved = lens.project(disc) - lens.project(local[mine]) if half else 0.0
+        offsets[mine] = np.nan_to_num(displacement(lens, disc, normal, radius) + moved)
     return offsets
 
 
@@ -77,7 +83,7 @@ def displacement(lens: Lens, points: Array, normals: Array, radius: float) -> Ar
 
 
 def _find_normals(
-    cameras: Array, observations: WandObservations, P: Array, points: Array, radius: float
+    cameras: Array, observations: WandObservations, P: Array, points: Array, wand: Body
 ) -> Array:
     """(K, 3) unit normals by frame set, world; NaN without an ellipse.
 
@@ -91,9 +97,9 @@ def _find_normals(
     shape += b[:, None, None] * across[:, :, None] * across[:, None]
     full = P @ np.swapaxes(P, 1, 2)
     unit = np.trace(full, axis1=1, axis2=2)
-    deficit = (full - shape / radius**2) / unit[:, None, None]
+    deficit = (full - shape / (wand.diameter_m / 2) ** 2) / unit[:, None, None]
     P = P / np.sqrt(unit)[:, None, None]
-    toward = cameras[observations.camera, :3, 3] - points
+    toward = np.zeros_like(points) if thickness_of(wand) else cameras[observations.camera, :3, 3] - points
     count = int(observations.knot.max()) + 1
     normals = _try_directions(count, observations.knot, P, deficit, toward)
     for _ in range(STEPS):

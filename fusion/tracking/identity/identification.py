@@ -100,12 +100,14 @@ class Identified:
         fits: one entry for each number of markers.
         weak: the same of poor fits and of weak ones, which the caller should confirm in several frame sets.
         rivals: by robot, the robot of the best rival; the robot itself where it fits in several places.
+        unexplained: robots with fits whose expected views are mostly not detected.
         turn: row of the first robot whose turn it is in the next frame set.
     """
 
     fits: list[RefinedFits]
     weak: list[RefinedFits]
     rivals: dict[int, int]
+    unexplained: set[int]
     turn: int
 
 
@@ -157,7 +159,7 @@ def identify(question: "Question", refine: Refine, usual: float, turn: int) -> I
     for count in range(most, MIN_MARKERS - 1, -1):
         decisions.decide(count, refine)
     decisions.decide_poor()
-    return Identified(decisions.fits, decisions.weak, decisions.rivals, decisions.turn)
+    return Identified(decisions.fits, decisions.weak, decisions.rivals, decisions.unexplained, decisions.turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,6 +182,7 @@ class _Decisions:
         self.fits: list[RefinedFits] = []
         self.weak: list[RefinedFits] = []
         self.rivals: dict[int, int] = {}
+        self.unexplained: set[int] = set()
         self.turn = turn
 
     def decide(self, count: int, refine: Refine) -> None:
@@ -211,7 +214,9 @@ class _Decisions:
         """Refine mappings and compare those that the detections allow."""
         fits = fit(mappings, self._question.robots, self._question.scene)
         refined = refine(fits)
-        is_plausible = (refined.misfit < MAX_CHI2) & ~(refined.explained < MIN_EXPLAINED)
+        is_plausible, is_refused = refined.misfit < MAX_CHI2, refined.explained < MIN_EXPLAINED
+        self.unexplained.update(refined.robot[is_plausible & is_refused].tolist())
+        is_plausible &= ~is_refused
         fits, refined = fits.select(is_plausible), refined.select(is_plausible)
         return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 

@@ -10,15 +10,19 @@ import numpy as np
 from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.sensor_model import threshold
+from camera_node.sensor_model.imaging import Ground, Imaging
+from camera_node.simulation import background, renderer
 from tests.benchmarks.detector.pictures import Card, Grey, dead_leaves, expose, flat, grid, missed, paste
 from tests.benchmarks.detector.recall import blur_by_motion
 from tests.benchmarks.paper.report import Section, table
 
 SIZE = (300, 400)
-CARDS, FRAMES = 40, 3
+CARDS, FRAMES = 40, 4
 RECALL, NOISE, MIDDLE = 0.99, 3.0, 115.0
-SMALLEST_PX, LARGEST_PX, STEP = 7.0, 48.0, 1.05
-GROUNDS = ("white", "clutter")
+SMALLEST_PX, LARGEST_PX, STEP = 6.5, 48.0, 1.05
+# Of the even ground, between ink at 0 and paper at 1: the simulated arena's.
+FLOOR = (background.FLOOR - renderer.BLACK) / (renderer.WHITE - renderer.BLACK)
+GROUNDS: tuple[Ground, ...] = ("cluttered", "even")
 MOTION_SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)
 MOTION_PX = (16, 20, 24, 32, 48)
 
@@ -27,24 +31,35 @@ MOTION_PX = (16, 20, 24, 32, 48)
 class Condition:
     """Ground, slant in degrees, blur in pixels, and contrast in grey levels."""
 
-    ground: str = "clutter"
+    ground: Ground = "cluttered"
     slant: float = 0.0
     blur: float = 0.7
     contrast: float = 150.0
 
 
-@lru_cache
-def smallest(condition: Condition) -> float | None:
-    """The smallest frontal diameter, pixels, from which on 99 % are found; None if more than `LARGEST_PX`.
+@dataclass(frozen=True)
+class Limits:
+    """Frontal diameters, pixels, at which half and nearly all roundels are found; NaN if above `LARGEST_PX`."""
 
-    It is the first one of which the next two, 5 % larger each, have that recall too.
+    half: float
+    nearly_all: float
+
+
+@lru_cache
+def limits(condition: Condition) -> Limits:
+    """Measure both limits of one condition.
+
+    Half is the first crossing of 50 %, linear in the logarithm of the diameter. Nearly all is the first diameter with
+    99 % of the roundels of that size and the next two, 5 % larger each.
     """
-    passed: list[float] = []
+    half, sizes, shares = np.nan, [SMALLEST_PX / STEP], [0.0]
     for d in _diameters():
-        passed = [*passed, d] if share_found(condition, d) >= RECALL else []
-        if len(passed) == 3:
-            return passed[0]
-    return None
+        sizes, shares = [*sizes, d], [*shares, share_found(condition, d)]
+        if np.isnan(half) and shares[-1] >= 0.5:
+            half = sizes[-2] * STEP ** ((0.5 - shares[-2]) / (shares[-1] - shares[-2]))
+        if np.mean(shares[-3:]) >= RECALL:
+            return Limits(float(half), sizes[-3])
+    return Limits(float(half), np.nan)
 
 
 def _diameters() -> Iterator[float]:
@@ -70,12 +85,13 @@ def render(condition: Condition, diameter_px: float, rng: np.random.Generator) -
     own = np.random.default_rng(1)
     slant = float(np.radians(condition.slant))
     cards = [Card(uv, diameter_px, slant, float(own.uniform(0, 2 * np.pi))) for uv in grid(CARDS, SIZE, own)]
-    ground = _ground(condition.ground, bright, rng)
+    ground = _ground(condition.ground, dark, bright, rng)
     return expose(paste(ground, cards, condition.blur, dark=dark, bright=bright), NOISE, rng), cards
 
 
-def _ground(name: str, bright: float, rng: np.random.Generator) -> Array:
-    return dead_leaves(SIZE, rng) if name == "clutter" else flat(SIZE, bright)
+def _ground(name: Ground, dark: float, bright: float, rng: np.random.Generator) -> Array:
+    """Clutter, or one grey level between ink and paper."""
+    return dead_leaves(SIZE, rng) if name == "cluttered" else flat(SIZE, dark + FLOOR * (bright - dark))
 
 
 def share_of_moving(diameter_px: float, share: float, frames: int = 4) -> float:
@@ -97,41 +113,41 @@ def share_of_moving(diameter_px: float, share: float, frames: int = 4) -> float:
 def measure() -> Section:
     """Measure all conditions."""
     base = Condition()
-    slants = [
-        (
-            f"{slant:g}°",
-            *(_cell(replace(base, ground=g, slant=slant)) for g in GROUNDS),
-            f"{float(threshold.smallest_major_px(np.radians(slant), base.blur)):.1f}",
-            f"{float(threshold.threshold_D(np.radians(slant), base.blur)):.1f}",
-        )
-        for slant in (*threshold.SLANT_DEG, 75.0)
-    ]
-    blurs = [
-        (f"{b:g} px", _cell(replace(base, blur=b)), f"{float(threshold.smallest_major_px(0.0, b)):.1f}")
-        for b in threshold.BLUR_PX
-    ]
-    contrasts = [
-        (f"{c:g}", *(_cell(replace(base, ground=g, contrast=c)) for g in GROUNDS))
-        for c in (150.0, 100.0, 60.0, 40.0)
-    ]
+    slants = [(f"{slant:g}°", *_row(replace(base, slant=slant))) for slant in (*threshold.SLANT_DEG, 75.0)]
+    blurs = [(f"{b:g} px", *_row(replace(base, blur=b))) for b in threshold.BLUR_PX]
+    contrasts = [(f"{c:g}", *_row(replace(base, contrast=c))) for c in (150.0, 100.0, 60.0, 40.0)]
     moving = [
         (f"{d} px", *(f"{100 * share_of_moving(d, share):.0f}" for share in MOTION_SHARES)) for d in MOTION_PX
     ]
+    columns = [f"{ground}, {what}" for ground in GROUNDS for what in ("half", "99 %")]
     return Section(
         "Threshold D of our detector",
-        "Smallest major axis in pixels from which on 99 % are found in a new image (simulated: dead-leaves clutter or "
-        "an even ground as bright as paper; noise 3 grey levels; the card is 9/7 of the disc). The "
-        f"paper's D is 11 px. A dash: none up to {LARGEST_PX:g} px. The columns of the model are "
-        "`camera_node/sensor_model/threshold.py`. Clutter with more contrast than the print hides faint roundels.",
+        "Major axis in pixels at which half of the roundels, and from which on 99 %, are found in a new image "
+        "(simulated: dead-leaves clutter, or an even ground as bright as the simulated arena's, 0.53 between ink and "
+        "paper; noise 3 grey levels; the card is 9/7 of the disc). Each cell: measured / model "
+        "(`camera_node/sensor_model/threshold.py`). The paper's D is 11 px. A dash: none up to "
+        f"{LARGEST_PX:g} px. Clutter with more contrast than the print hides faint "
+        "roundels.",
         [
-            table(("slant", *GROUNDS, "model", "model, minor axis"), slants),
-            table(("blur (sigma)", "clutter", "model"), blurs),
-            table(("contrast", *GROUNDS), contrasts),
+            table(("slant", *columns), slants),
+            table(("blur (sigma)", *columns), blurs),
+            table(("contrast", *columns), contrasts),
             table(("% found of moving ones", *(f"{s:g} diameters" for s in MOTION_SHARES)), moving),
         ],
     )
 
 
-def _cell(condition: Condition) -> str:
-    size = smallest(condition)
-    return "-" if size is None else f"{size:.1f}"
+def _row(condition: Condition) -> list[str]:
+    """Measured and predicted limits on each ground."""
+    cells = []
+    for ground in GROUNDS:
+        got = limits(replace(condition, ground=ground))
+        for size, share in ((got.half, 0.5), (got.nearly_all, RECALL)):
+            imaging = Imaging(blur_px=condition.blur, ground=ground)
+            model = threshold.smallest_major_px(np.radians(condition.slant), imaging, share)
+            cells.append(f"{_size(size)} / {_size(float(model))}")
+    return cells
+
+
+def _size(px: float) -> str:
+    return f"{px:.1f}" if np.isfinite(px) else "-"

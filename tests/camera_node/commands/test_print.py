@@ -125,6 +125,16 @@ def test_a_robot_is_printed_as_its_yaml_declares_it(tmp_path: Path):
     assert np.linalg.norm(x_up - left) == pytest.approx(np.hypot(150, 50), abs=TOLERANCE_MM)
 
 
+def test_the_cards_of_a_cube_say_where_they_face(tmp_path: Path):
+    """A card for each marker, with its place and its normal as printed text."""
+    sheet = write(tmp_path, what="robot", file=example_file("robots_cube.yaml"))
+    with pypdfium2.PdfDocument(sheet) as document:
+        text = " ".join(page.get_textpage().get_text_bounded() for page in document)
+    assert text.count("facing") == 18
+    assert "cube 1: (70, -50, 140) mm facing (0, 0, 1)" in text
+    assert load_robots(tmp_path / "print.yaml") == load_robots(example_file("robots_cube.yaml"))
+
+
 @pytest.mark.parametrize("what", ["wand", "l-frame"])
 def test_cards_have_the_size_of_their_yaml(tmp_path: Path, what: str):
     """A card for each roundel of a body that is larger than the paper; photographed, two of a page are measured."""

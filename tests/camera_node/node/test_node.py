@@ -194,11 +194,16 @@ def test_settings_are_reported_and_changed(network, inbox, running, slow):
     assert got.until(lambda items: len(items[-1]) == 0)
     assert ask(router, key, encode(Settings(mask=(), min_contrast=20)))[0]
     assert got.until(lambda items: len(items[-1]) == 1)
+    assert not got.items[-1].readout_us
+    assert ask(router, key, b'{"readout_us": 28000}')[0]
+    assert got.until(lambda items: items[-1].readout_us == 28000)
+    assert decode(ask(router, key)[1], Settings).readout_us == 28000
     bad = [
         b"\xff",
         b'{"colour": 1}',
         b'{"gain": 3}',
         b'{"exposure_us": -1}',
+        b'{"readout_us": 2e6}',
         b'{"min_contrast": 0}',
         b"{" * 5000,
         b'{"mask": [[[0, 0], [1, 1]]]}',

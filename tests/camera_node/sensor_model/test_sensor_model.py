@@ -133,11 +133,13 @@ def test_the_range_of_our_detector_is_the_papers_with_our_D():
     square = msgspec.structs.replace(LENS, fy=LENS.fx)
     v_min, v_max = detection_range(square, PAPER)
     assert v_max == pytest.approx(
-        farthest_distance(square, PAPER.d_o, float(threshold_D(0.0, 0.7))), rel=2e-3
+        farthest_distance(square, PAPER.d_o, float(threshold_D(0.0, Imaging()))), rel=2e-3
     )
     assert v_min == pytest.approx(LENS.fx * PAPER.d_o / MAX_DIAMETER_PX, rel=2e-3)
     slanted = detection_range(square, PAPER, phi=np.radians(60))[1]
-    assert slanted == pytest.approx(LENS.fx * PAPER.d_o / float(smallest_major_px(np.pi / 3, 0.7)), rel=2e-3)
+    assert slanted == pytest.approx(
+        LENS.fx * PAPER.d_o / float(smallest_major_px(np.pi / 3, Imaging())), rel=2e-3
+    )
     assert np.isnan(detection_range(square, PAPER, phi=1.5)).all()
 
 

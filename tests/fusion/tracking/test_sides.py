@@ -146,6 +146,21 @@ def test_one_side_keeps_a_cube_tracked():
     assert np.abs(errors(arena, late)[:, 3:]).max() < 3e-3
 
 
+def test_a_mostly_covered_cube_is_not_acquired_and_says_why():
+    """One side fits, but cameras that should see the others do not."""
+    arena = Arena(
+        {"cube": CUBE},
+        {"cube": line((0.1, 0.0, 0.5), tilt=(0.2, 0.1, 0.4))},
+        sigma_px=0.05,
+        hidden=lambda robot, marker, t: marker > 2,
+        min_facing=DETECTABLE,
+    )
+    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+    results = [tracker.track(frame_set) for frame_set in frame_sets(arena, 12)]
+    assert poses_of(results, "cube") == []
+    assert tracker.not_acquired()["cube"].startswith("some of its markers fit, but the cameras do not detect")
+
+
 def test_published_markers_have_the_normals_of_their_sides():
     arena = cube_arena()
     tracker = Tracker(arena.cameras, arena.robots, TIGHT)

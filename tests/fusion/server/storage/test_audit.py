@@ -66,6 +66,7 @@ def test_without_certificates_the_address_is_known(tmp_path: Path):
         assert line["certificate"] is None
         assert line["address"].startswith("tcp/127.0.0.1:")
         assert list(line["request"]["define"]) == ["b"]
+        assert line["claimed_source"]["program"] == "fusion.client"
         audit.unlink()
         audit.mkdir()
         assert "b" not in client.change_robots(remove=["b"])
