@@ -153,3 +153,11 @@ def densest_ranges(
     By ray: frame (N,), direction (N, 3), reach (N,) in metres per metre, ranges (N, K, 2): see
     `native/ray_intersections.hpp`.
     """
+
+def ray_pairs(
+    frames: Viewpoints, frame: Index, direction: Array, reach: Array, ranges: Array, most: float, /
+) -> tuple[Index, Array]:
+    """Rows (2, K) of rays of different cameras that miss each other by less than `most` tolerances.
+
+    Also (2, K): the miss in tolerances, and the range on the first ray. By ray: see `densest_ranges`.
+    """

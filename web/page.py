@@ -9,7 +9,7 @@ from web.feed import Feed
 from web.replay import RecordingPlayer
 from web.scene.coverage import CoverageVolume
 from web.subscription import Subscription
-from web.tabs.calibrate import RigHistoryPanel
+from web.tabs.calibrate import CalibrationInForce, RigHistoryPanel
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
@@ -53,6 +53,7 @@ def add_live_page(
         closing.callback(settings.close)
         view.add(settings, is_live=True)
     with header.tabs["Calibrate"]:
+        view.add(CalibrationInForce(gui), is_live=True)
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)

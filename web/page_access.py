@@ -272,6 +272,7 @@ def guarding(access: PageAccess) -> Iterator[None]:
     Raises:
         WebError: Viser did not use `websockets.asyncio.server.serve`, so the page would not be guarded.
     """
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a probe of the port is no fault
     serve, guarded = websockets.asyncio.server.serve, False
 
     def serve_guarded(*arguments: Any, process_request: Handler, **options: Any) -> Any:

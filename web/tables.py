@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 
+from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, RobotPose
 from web.colours import css, robot_colour
 from web.feed import ArenaState
@@ -18,6 +19,7 @@ ROBOT_COLUMNS = (
         "state", explanation="tracked: seen now; coasting: predicted; lost: no pose; not found: never seen"
     ),
     Column("x  y  z", "m", "position of the robot's origin in the world"),
+    Column("heading", "\N{DEGREE SIGN}", "of the x axis, counterclockwise from the world's, seen from above"),
     Column("speed", "m/s"),
     Column("\N{GREEK SMALL LETTER SIGMA}", "mm", "standard deviation of the position"),
     Column("seen", "", "markers seen in the latest frame set"),
@@ -34,6 +36,8 @@ CAMERA_COLUMNS = (
     Column("lost", "", "frames since the start: skipped by the camera / too late for the server"),
 )
 LEVEL_OF_STATE = {"tracked": "ok", "coasting": "warn"}  # other states are bad
+N_FIGURES = len(ROBOT_COLUMNS) - 2
+MAX_HEADING_SIGMA = 30.0  # degrees; a larger one means that nothing shows the heading
 MAX_SIGMA_MM = 1000  # a larger standard deviation has no meaning for a lost robot
 
 
@@ -54,7 +58,7 @@ def tabulate_robots(state: ArenaState) -> HtmlTable:
 
 def _missing_row(state: ArenaState, name: str) -> TableRow:
     """A robot that was never acquired."""
-    cells = (name, "not found", *[NO_VALUE] * 4)
+    cells = (name, "not found", *[NO_VALUE] * N_FIGURES)
     return TableRow(cells, "bad", _robot_note(state, name), css(robot_colour(name)))
 
 
@@ -77,15 +81,24 @@ def _robot_row(state: ArenaState, name: str) -> TableRow:
     pose: RobotPose = state.poses[name].message
     tracking = robot_state(state, name)
     level, note = LEVEL_OF_STATE.get(tracking, "bad"), _robot_note(state, name)
-    figures = (NO_VALUE,) * 4 if tracking == "no data" else _figures(pose)
+    figures = (NO_VALUE,) * N_FIGURES if tracking == "no data" else _figures(pose)
     level = "warn" if note and level == "ok" else level
     return TableRow((name, tracking, *figures), level, note, css(robot_colour(name)))
 
 
-def _figures(pose: RobotPose) -> tuple[str, str, str, str]:
+def _figures(pose: RobotPose) -> tuple[str, ...]:
     position = " ".join(f"{x:+.2f}" for x in pose.position)
     speed, sigma = float(np.linalg.norm(pose.velocity)), format_sigma(position_sigma_mm(pose))
-    return position, f"{speed:.2f}", sigma, str(pose.n_markers)
+    return position, _heading(pose), f"{speed:.2f}", sigma, str(pose.n_markers)
+
+
+def _heading(pose: RobotPose) -> str:
+    """Direction of the x axis in the world's x-y plane, degrees; unknown for a robot with one marker."""
+    R = rotation_from_wxyz(pose.quaternion_wxyz)
+    up = R[2]  # the world's z axis in the body's frame, which is that of the covariance
+    sigma = np.degrees(np.sqrt(max(0.0, float(up @ pose.covariance_matrix[:3, :3] @ up))))
+    degrees = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
+    return f"{degrees:+.0f}" if sigma < MAX_HEADING_SIGMA else NO_VALUE
 
 
 def format_sigma(sigma_mm: float) -> str:
@@ -208,7 +221,7 @@ def describe_arena(state: ArenaState) -> str:
         f"{row.cells[0]} {row.cells[1]} fps{_bracketed_note(row)}" for row in tabulate_cameras(state).rows
     ]
     robots = [
-        f"{row.cells[0]} {row.cells[1]} at {row.cells[2]} ±{row.cells[4]} mm{_bracketed_note(row)}"
+        f"{row.cells[0]} {row.cells[1]} at {row.cells[2]} ±{row.cells[5]} mm{_bracketed_note(row)}"
         for row in tabulate_robots(state).rows
     ]
     parts = [

@@ -29,6 +29,7 @@ class RigLens:
         self._session, self._key, self._camera = session, keys.rig, camera
         self._known: KnownLens | None = None
         self._reported = False  # that the lens is wrong
+        self._closed = False
         purpose = f"reading {keys.rig}"
         self._rig = session.declare_subscriber(
             keys.rig, guarded(purpose, lambda sample: self._receive(sample.payload.to_bytes()))
@@ -59,9 +60,11 @@ class RigLens:
         return refined
 
     def close(self) -> None:
-        """End following."""
+        """End following; the lens is forgotten, because Zenoh may hold callbacks until Python ends."""
+        self._closed = True
         self._server.undeclare()
         self._rig.undeclare()
+        self._known = None
 
     def _fits(self, lens: Lens, size: tuple[int, int]) -> bool:
         if size == (lens.width, lens.height):
@@ -94,7 +97,7 @@ class RigLens:
         try:
             lens = decode(payload, RigLenses).rig.cameras.get(self._camera)
             known = self._known
-            if lens is None or known is None or lens != known.lens:
+            if not self._closed and (lens is None or known is None or lens != known.lens):
                 self._reported = False
                 self._known = KnownLens(lens) if lens is not None else None
         except (MessageError, ConfigError) as error:

@@ -44,11 +44,19 @@ ROUNDEL_CLONES void measure_misses(const FrameRays& of_frame, const Vector& plan
     }
 }
 
-/// Intersects two frames of different cameras.
+/// Two rays i and j that pass each other: their ranges s and t, the distance between them and its tolerance, and
+/// the squared sine of the angle between them.
+struct Passing {
+    size_t i, j;
+    double s, t, distance, reach, parallax;
+};
+
+/// Intersects two frames of different cameras; `To` receives each `Passing` within `most` tolerances.
+template <class To>
 class FramePair {
   public:
-    FramePair(const Rays& rays, const Viewpoint& a, const Viewpoint& b, Intersections& to)
-        : rays_(rays), baseline_(a.centre - b.centre), moved_(std::abs(a.moved - b.moved)), to_(to) {}
+    FramePair(const Rays& rays, const Viewpoint& a, const Viewpoint& b, double most, To& to)
+        : rays_(rays), baseline_(a.centre - b.centre), moved_(std::abs(a.moved - b.moved)), most_(most), to_(to) {}
 
     /// All rays of `of_a` with all of `of_b`. Most pairs pass each other too far away at any range.
     void intersect(const FrameRays& of_a, const FrameRays& of_b) {
@@ -56,34 +64,43 @@ class FramePair {
         std::vector<double> misses(n);
         std::vector<size_t> near(n + 1);
         for (const size_t i : of_a.ray) {
-            const double reach = rays_.reach[i] * rays_.max_range(i) + of_b.reach + moved_;
+            const double reach = most_ * (rays_.reach[i] * rays_.max_range(i) + of_b.reach + moved_);
             const Vector& d = rays_.direction[i];
             measure_misses(of_b, (1 / reach) * cross(baseline_, d), d, misses.data());
             size_t found = 0;
             for (size_t k = 0; k < n; ++k) near[found] = of_b.ray[k], found += misses[k] < 1;
-            for (size_t k = 0; k < found; ++k) add_intersection(i, near[k]);
+            for (size_t k = 0; k < found; ++k) pass(i, near[k]);
         }
     }
 
   private:
-    /// Adds the intersection of rays i and j to both, if there is one and both sizes allow its ranges.
-    void add_intersection(size_t i, size_t j) {
+    /// Reports rays i and j if they pass each other at ranges that both sizes allow.
+    void pass(size_t i, size_t j) {
         const Vector &d = rays_.direction[i], &e = rays_.direction[j], &w = baseline_;
         const double c = dot(d, e), wd = dot(w, d), we = dot(w, e), parallax = 1 - c * c;
         const double s = (c * we - wd) / parallax, t = (we - c * wd) / parallax;
         if (!(parallax > kMinParallax && s > 0 && t > 0 && rays_.allows(i, s) && rays_.allows(j, t))) return;
         const Vector between = w + s * d - t * e;
         const double reach = std::hypot(rays_.reach[i] * s, rays_.reach[j] * t) + moved_;
-        if (!(dot(between, between) < reach * reach)) return;
-        const double along = reach / std::sqrt(parallax);
-        to_[i].push_back({s, along}), to_[j].push_back({t, along});
+        const double distance = std::sqrt(dot(between, between));
+        if (distance < most_ * reach) to_({i, j, s, t, distance, reach, parallax});
     }
 
     const Rays& rays_;
     const Vector baseline_;
-    const double moved_;
-    Intersections& to_;
+    const double moved_, most_;
+    To& to_;
 };
+
+/// All rays of different cameras that pass each other within `most` tolerances.
+template <class To>
+void intersect_all(const Rays& rays, const std::vector<Viewpoint>& frames, double most, To to) {
+    const std::vector<FrameRays> by_frame = rays_by_frame(rays, frames.size());
+    for (size_t a = 0; a < frames.size(); ++a)
+        for (size_t b = a + 1; b < frames.size(); ++b)
+            if (frames[a].camera != frames[b].camera)
+                FramePair<To>(rays, frames[a], frames[b], most, to).intersect(by_frame[a], by_frame[b]);
+}
 
 /// The mean of the intersections that agree with the one that has most agreement; of equals, with the one of
 /// the smallest tolerance.
@@ -120,15 +137,22 @@ double Rays::max_range(size_t ray) const {
 }
 
 std::vector<double> densest_ranges(const Rays& rays, const std::vector<Viewpoint>& frames) {
-    const std::vector<FrameRays> by_frame = rays_by_frame(rays, frames.size());
     Intersections found(rays.n);
-    for (size_t a = 0; a < frames.size(); ++a)
-        for (size_t b = a + 1; b < frames.size(); ++b)
-            if (frames[a].camera != frames[b].camera)
-                FramePair(rays, frames[a], frames[b], found).intersect(by_frame[a], by_frame[b]);
+    intersect_all(rays, frames, 1, [&](const Passing& at) {
+        const double along = at.reach / std::sqrt(at.parallax);
+        found[at.i].push_back({at.s, along}), found[at.j].push_back({at.t, along});
+    });
     std::vector<double> ranges;
     for (auto& on_ray : found) ranges.push_back(densest(on_ray));
     return ranges;
+}
+
+std::vector<RayPair> ray_pairs(const Rays& rays, const std::vector<Viewpoint>& frames, double most) {
+    std::vector<RayPair> pairs;
+    intersect_all(rays, frames, most, [&](const Passing& at) {
+        pairs.push_back({int64_t(at.i), int64_t(at.j), at.distance / at.reach, at.s});
+    });
+    return pairs;
 }
 
 }  // namespace roundel::fusion

@@ -31,6 +31,15 @@ struct Rays {
     double max_range(size_t ray) const;
 };
 
+/// Two rays of different cameras that pass each other: the miss in tolerances of both, and the range on the first one.
+struct RayPair {
+    int64_t first, second;
+    double miss, range;
+};
+
+/// All pairs that miss each other by less than `most` tolerances, at ranges that the sizes allow.
+std::vector<RayPair> ray_pairs(const Rays& rays, const std::vector<Viewpoint>& frames, double most);
+
 /// The range of each ray on which most intersections agree, averaged over these; NaN without intersections.
 std::vector<double> densest_ranges(const Rays& rays, const std::vector<Viewpoint>& frames);
 

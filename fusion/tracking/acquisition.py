@@ -22,6 +22,8 @@ from fusion.tracking.gating import (
     MAX_CHI2,
     mean_by_body,
 )
+from fusion.tracking.grouping.multiview import Marker, find_markers
+from fusion.tracking.grouping.portions import Portion, limit_of, portion_of
 from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
@@ -30,7 +32,6 @@ from fusion.tracking.identity.single_markers import (
     choose_markers,
 )
 from fusion.tracking.identity.trial_updates import Starts, refine
-from fusion.tracking.multiview import Marker, Portion, find_markers, limit_of, portion_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 

@@ -16,7 +16,7 @@ from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
 from fusion.protocol.messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
-from fusion.tracking.multiview import Marker
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers
 

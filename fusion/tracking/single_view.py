@@ -16,7 +16,7 @@ from camera_node.detection.disc_pose import decompose
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import DetectionTable
 from fusion.tracking.gating import AXIS_SIGMA_PX, FORGET_NS, MAX_SPEED_M_S, POSITION_GATE
-from fusion.tracking.multiview import Marker
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.unlabeled import UnlabeledMarkers
 
 CONFIRMED = 3  # frame sets with a detection near its last position

@@ -23,8 +23,8 @@ from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import Association
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.own_detections import OwnDetections
-from fusion.tracking.multiview import Marker
 from fusion.tracking.result import (
     FilterStep,
     ObservationSummary,

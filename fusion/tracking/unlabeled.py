@@ -28,7 +28,7 @@ from fusion.tracking.gating import (
     mean_by_body,
     misfit,
 )
-from fusion.tracking.multiview import Marker
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.normals import start_rotation
 
 MAX_TRACKS = 64  # markers with a velocity and a normal; false detections make hundreds of markers

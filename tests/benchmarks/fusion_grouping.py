@@ -1,16 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Grouping without history: identical discs of one size in many views."""
+"""Grouping without history: identical markers in many views. `python -m tests.benchmarks.fusion_grouping [--thorough]`.
 
+`cold_grouping` renders discs of one size; `Scene` has points without a size in front of cameras around the arena or
+side by side, and cameras whose poses are wrong.
+"""
+
+import sys
 import time
 from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.rig.camera import Camera
+from camera_node.detection.roundels import Roundels
+from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from fusion.model.camera_array import CameraArray
-from fusion.model.frames import FrameSet
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import DetectionTable
-from fusion.tracking.multiview import find_markers
-from tests.benchmarks.fusion_load import DIAMETER_M, Load
+from fusion.tracking.grouping.multiview import find_markers
+from tests.benchmarks.fusion_load import DIAMETER_M, DISTORTION, LENS, Load
 
 APART_M = 0.12  # between the centres of discs of 0.08 m with their white margins
 
@@ -23,7 +32,7 @@ def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: flo
     load = Load(
         points, 1, cameras, speed_m_s=0, missing=0, false=0, synchronised=True, sigma_px=sigma_px, seed=seed
     )
-    load.paths.place(scattered(points, seed))
+    load.paths.place(scattered(points, np.random.default_rng(seed)))
     frames = tuple(load.frames(1 / load.hz))
     seen = Counter(int(k) for frame in frames for k in frame.roundels.id)
     camera_array = CameraArray(load.rig)
@@ -42,11 +51,156 @@ def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: flo
     return len(right) / max(len(kinds), 1), len(set().union(*right) & many) / len(many), cost_s
 
 
-def scattered(n: int, seed: int) -> np.ndarray:
+def scattered(n: int, rng: np.random.Generator) -> np.ndarray:
     """(n, 3) points in the arena, no closer to each other than discs can be."""
-    rng, places = np.random.default_rng(seed), np.empty((0, 3))
+    places = np.empty((0, 3))
     while len(places) < n:
         p = rng.uniform([-2.3, -1.4, 0.05], [2.3, 1.4, 0.8])
         if not len(places) or np.linalg.norm(places - p, axis=1).min() > APART_M:
             places = np.vstack([places, p])
     return places
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Points of unknown size at one moment.
+
+    Attributes:
+        baseline_m: between cameras side by side; 0 for cameras around the arena.
+        missing, false: share of missing detections, and false ones of each camera.
+        turned_rad, moved_m: standard deviations of the errors of the camera poses.
+    """
+
+    points: int = 34
+    cameras: int = 2
+    baseline_m: float = 0.0
+    sigma_px: float = 0.1
+    missing: float = 0.1
+    false: float = 1.0
+    turned_rad: float = 0.0
+    moved_m: float = 0.0
+
+    def rig(self) -> dict[str, Camera]:
+        n = self.cameras
+        if self.baseline_m:
+            x = self.baseline_m * (np.arange(n) - (n - 1) / 2)
+            poses = [look_at([at, -3.5, 2.5], [at / 2, 0.0, 0.2]) for at in x]
+        else:
+            a = 0.3 + 2 * np.pi * np.arange(n) / n
+            at = np.column_stack([4 * np.cos(a), 3 * np.sin(a), 3 + 0.3 * np.cos(3 * a)])
+            poses = [look_at(p, [0.0, 0.0, 0.2]) for p in at]
+        return {
+            f"cam{k}": Camera(**LENS, distortion=DISTORTION, T_world_cam=Pose.from_matrix(T))
+            for k, T in enumerate(poses)
+        }
+
+    def detect(self, seed: int) -> tuple[CameraArray, DetectionTable, np.ndarray]:
+        """The cameras as calibrated, the detections, and the number of the point of each; -1 for false ones."""
+        rng, frames, numbers = np.random.default_rng(seed), [], []
+        true = self.rig()
+        used = {name: self._calibrated(camera, rng) for name, camera in true.items()}
+        points = scattered(self.points, rng)
+        for name, camera in true.items():
+            uv = camera.project_world(points)
+            seen = np.flatnonzero(camera.sees(uv) & (rng.random(len(uv)) >= self.missing))
+            false = rng.uniform(0, [camera.width - 1, camera.height - 1], (rng.poisson(self.false), 2))
+            uv = np.vstack([uv[seen] + self.sigma_px * rng.normal(size=(len(seen), 2)), false])
+            order = rng.permutation(len(uv))
+            roundels = Roundels.from_points(uv[order], self.sigma_px)
+            frames.append(CalibratedFrame.measure(name, 0, roundels, used[name]))
+            numbers.append(np.append(seen, np.full(len(false), -1))[order])
+        cameras = CameraArray(used)
+        return cameras, DetectionTable.of(FrameSet(0, tuple(frames)), cameras, 0.0), np.concatenate(numbers)
+
+    def _calibrated(self, camera: Camera, rng: np.random.Generator) -> Camera:
+        error = np.eye(4)
+        error[:3, :3] = rotation_from_vector(self.turned_rad * rng.normal(size=3))
+        error[:3, 3] = self.moved_m * rng.normal(size=3)
+        return Camera(**LENS, distortion=DISTORTION, T_world_cam=Pose.from_matrix(camera.matrix() @ error))
+
+
+@dataclass(frozen=True)
+class Score:
+    """Counts over all seeds: markers and correct ones; points that two or more, or exactly two, cameras detect."""
+
+    markers: int
+    correct: int
+    points: int
+    found: int
+    of_two: int
+    found_of_two: int
+    cost_s: float
+
+    @property
+    def precision(self) -> float:
+        return self.correct / max(self.markers, 1)
+
+    @property
+    def recall(self) -> float:
+        return self.found / max(self.points, 1)
+
+    @property
+    def recall_of_two(self) -> float:
+        """Of the points that exactly two cameras detect."""
+        return self.found_of_two / max(self.of_two, 1)
+
+
+def score(scene: Scene, seeds: range) -> Score:
+    """Group the detections of a scene, once for each seed."""
+    counts = np.array([_counts(scene, seed) for seed in seeds])
+    a, b, c, d, e, f = counts[:, :-1].sum(0).astype(int).tolist()
+    return Score(a, b, c, d, e, f, float(np.median(counts[:, -1])))
+
+
+def _counts(scene: Scene, seed: int) -> tuple[float, ...]:
+    cameras, detections, number = scene.detect(seed)
+    start = time.process_time()
+    markers = find_markers(cameras, detections, np.arange(len(detections)), np.array([DIAMETER_M]))
+    cost_s = time.process_time() - start
+    kinds = [set(number[marker.detections].tolist()) for marker in markers]
+    right = [min(kind) for kind in kinds if len(kind) == 1 and -1 not in kind]
+    seen = Counter(number[number >= 0].tolist())
+    many, two = (
+        {k for k, count in seen.items() if least <= count <= most} for least, most in ((2, 99), (2, 2))
+    )
+    found = set(right)
+    return len(kinds), len(right), len(many), len(found & many), len(two), len(found & two), cost_s
+
+
+def shaken(scene: Scene) -> Scene:
+    """With camera poses that are off by 0.3 mrad and 1 mm."""
+    return replace(scene, turned_rad=3e-4, moved_m=1e-3)
+
+
+SIDE_BY_SIDE = Scene(130, 10, 0.15, 0.3)
+SCENES = {
+    "34 points, 2 cameras 1 m apart": Scene(baseline_m=1.0),
+    "the same, 0.3 px": Scene(baseline_m=1.0, sigma_px=0.3),
+    "the same, poses off by 0.3 mrad, 1 mm": shaken(Scene(baseline_m=1.0)),
+    "the same, poses off by 1 mrad, 3 mm": Scene(baseline_m=1.0, turned_rad=1e-3, moved_m=3e-3),
+    "the same, 40 % missing, 10 false": Scene(baseline_m=1.0, missing=0.4, false=10),
+    "130 points, 2 cameras 1 m apart": Scene(130, 2, 1.0),
+    "34 points, 2 cameras around": Scene(),
+    "34 points, 3 cameras around, poses off": shaken(Scene(cameras=3)),
+    "130 points, 4 cameras 0.6 m apart": Scene(130, 4, 0.6),
+    "the same, 0.3 px, poses off": shaken(Scene(130, 4, 0.6, 0.3)),
+    "the same, 50 % missing, 10 false": Scene(130, 4, 0.6, missing=0.5, false=10),
+    "130 points, 10 cameras 0.15 m apart, 0.3 px": SIDE_BY_SIDE,
+    "the same, poses off": shaken(SIDE_BY_SIDE),
+    "30 false roundels in 2 cameras": Scene(1, missing=1.0, false=30),
+}
+
+
+def main() -> None:
+    seeds = range(40 if "--thorough" in sys.argv else 8)
+    print(f"{'scene, sizes unknown':45} precision  recall  in two views        ms")
+    for name, scene in SCENES.items():
+        got = score(scene, seeds)
+        two = f"{got.found_of_two}/{got.of_two} = {got.recall_of_two:.2f}"
+        print(
+            f"{name:45} {got.precision:9.3f} {got.recall:7.3f}  {two:18} {1e3 * got.cost_s:4.1f}", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -3,16 +3,19 @@
 
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
+from web.feed import Feed
 from web.page_access import PageAccess
-from web.view import View
+from web.view import PanelSection, View
 
+Panel = TypeVar("Panel", bound=PanelSection)
 CHROMIUM = shutil.which("chromium")
 FLAGS = [
     "--use-gl=angle",
@@ -43,6 +46,25 @@ def drawing(view: View) -> Iterator[None]:
         stop.set()
         thread.join()
         view.close()
+
+
+@contextmanager
+def showing(feed: Feed, make: Callable[[View], Panel]) -> Iterator[tuple[View, Panel]]:
+    """A view that draws, and one panel on it, which `make` adds; the panel is closed at the end if it can be."""
+    view = View(feed, loopback())
+    panel = make(view)
+    view.add(panel)
+    with drawing(view):
+        try:
+            yield view, panel
+        finally:
+            getattr(panel, "close", lambda: None)()
+
+
+def value_of(view: View, label: str) -> Any:
+    """The value of the first control with a label, as the page's process has it."""
+    handles = view.server.gui._gui_input_handle_from_uuid.values()
+    return next(handle.value for handle in handles if getattr(handle, "label", None) == label)
 
 
 @contextmanager

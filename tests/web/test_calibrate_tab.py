@@ -20,7 +20,7 @@ from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_wo
 from tests.fusion.serving import serving
 from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
 from web.feed import Feed
 from web.scene.cameras import CameraDrawing
@@ -47,31 +47,37 @@ def test_the_world_is_measured_shown_and_accepted(
     frames = detect_landmarks(ARENA, L_FRAME)
 
     def send() -> None:
+        for name in rig.cameras:
+            arena.camera(name)
+        arena.rig(rig)
         for frame in frames:
             arena.put(arena.keys.detections(frame.camera), encode(frame))
 
-    view = View(subscription.feed, loopback())
-    panel = WorldPanel(view.server, subscription, files, collect_s=1.0)
-    with pytest.raises(WebError, match="no measurement"):
-        panel.accept()
-    panel._by.value = BY_L_FRAME
-    with repeating(send, 0.1):
-        text = panel.measure()
-    assert "accept or discard" in text
-    assert panel._change is not None
-    assert load_rig(files.rig) == rig, "nothing changes before the user accepts"
-    origin = panel._change.origin_in(rig)
-    true = rig.cameras["cam0"].matrix() @ np.linalg.inv(ARENA.truth.cameras["cam0"].matrix())
-    assert origin == pytest.approx(true, abs=5e-3)
-    panel.accept()
+    make = lambda view: WorldPanel(view.server, subscription, files, collect_s=1.0)  # noqa: E731
+    with showing(subscription.feed, make) as (view, panel):
+        with pytest.raises(WebError, match="no measurement"):
+            panel.accept()
+        panel._by.value = BY_L_FRAME
+        with repeating(send, 0.1), browsing(view) as page:
+            page.set_default_timeout(30_000)
+            page.get_by_text("Floor and origin").click()
+            for decision in ("Discard", "Accept"):
+                page.get_by_role("button", name="Measure").click()
+                page.get_by_text("accept or discard them").wait_for()
+                assert load_rig(files.rig) == rig, "nothing changes before the user accepts"
+                assert panel._change is not None
+                origin = panel._change.origin_in(rig)
+                page.get_by_role("button", name=f"{decision} the new world").click()
+                page.get_by_text("discarded" if decision == "Discard" else "the new world is").wait_for()
+        true = rig.cameras["cam0"].matrix() @ np.linalg.inv(ARENA.truth.cameras["cam0"].matrix())
+        assert origin == pytest.approx(true, abs=5e-3)
+        panel._by.value = STANDING
+        files.wand.write_text(dump_yaml(l_frame))
+        with pytest.raises(WebError, match="not a straight wand"):
+            panel.measure()
+        assert panel._change is None
     for name, camera in load_rig(files.rig).cameras.items():
         assert camera.matrix() == pytest.approx(ARENA.truth.cameras[name].matrix(), abs=5e-3)
-    panel._by.value = STANDING
-    files.wand.write_text(dump_yaml(l_frame))
-    with pytest.raises(WebError, match="not a straight wand"):
-        panel.measure()
-    assert panel._change is None
-    view.close()
 
 
 def moved(rig: Rig, name: str, metres: float) -> Rig:
@@ -93,9 +99,8 @@ def test_the_history_is_listed_undone_and_redone(tmp_path: Path):
     settings = msgspec.structs.replace(settings, saved_robots=settings.robots)
     with serving(settings) as (server, client), closing(ServerConnection(server.endpoints)) as connection:
         subscription = Subscription(connection, Feed("test"))
-        view = View(subscription.feed, loopback())
-        view.add(RigHistoryPanel(view.server.gui, subscription))
-        with drawing(view), browsing(view) as page:
+        make = lambda view: RigHistoryPanel(view.server.gui, subscription)  # noqa: E731
+        with showing(subscription.feed, make) as (view, _), browsing(view) as page:
             for metres in (0.012, 0.034):
                 apply_rig(subscription, files, moved(rig, "north", metres))
             for change in ("north 12.0 mm", "north 22.0 mm"):

@@ -15,7 +15,7 @@ from camera_node.protocol.registration import CameraChange, RegisteredCameras, c
 from camera_node.protocol.requests import encode_jpeg
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing
+from tests.web.browser import browsing, value_of
 from web.view import View
 
 ROUNDEL = (320.0, 240.0)
@@ -80,15 +80,29 @@ def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View, east: S
         wait_for(caption.count, speak)
         size = "document.querySelector('img[alt=east]').naturalWidth"
         wait_for(lambda: page.evaluate(size) == 64, speak)
+        exposure = page.locator("xpath=//*[text()='Exposure, us']/following::input[1]")
+        wait_for(lambda: exposure.input_value() == "4000", speak)  # read when the camera is selected
+        exposure.fill("3000")
+        exposure.press("Enter")
+        page.get_by_role("button", name="Apply").click()
+        page.get_by_text("exposure 3000 us, 0 masked places").wait_for(timeout=20_000)
+        east.used = msgspec.structs.replace(east.used, exposure_us=4000.0)
         page.get_by_role("button", name="Read the settings").click()
         page.get_by_text("exposure 4000 us, 0 masked places").wait_for(timeout=20_000)
         page.get_by_role("button", name="Mask everything detected now").click()
         page.get_by_text("east: 1 masked places").wait_for(timeout=20_000)
         page.get_by_role("button", name="Remove the mask").click()
         page.get_by_text("east: 0 masked places").wait_for(timeout=20_000)
-    polygon = np.array(east.changes[0].mask)[0]
+        for box in ("Show what the cameras see", "Live pictures"):
+            checkbox = f"xpath=//*[text()='{box}']/following::input[@type='checkbox'][1]"
+            page.locator(checkbox).click(force=True)
+        wait_for(lambda: not page.locator("img[alt=east]").count(), speak)
+        wait_for(lambda: not is_matched(publisher))
+    assert value_of(view, "Show what the cameras see")
+    assert east.changes[0].exposure_us == 3000.0
+    polygon = np.array(east.changes[1].mask)[0]
     assert cv2.pointPolygonTest(polygon.astype(np.float32), ROUNDEL, False) > 0
-    assert east.changes[1].mask == ()
+    assert east.changes[2].mask == ()
     wait_for(lambda: not is_matched(publisher))
     publisher.undeclare()
 
@@ -112,6 +126,10 @@ def test_a_mask_is_drawn_by_clicks(arena: LiveArena, view: View, east: SettingsO
         page.get_by_text("corner 1 at 320, 240").or_(page.get_by_text("corner 1 at 319, 239")).wait_for()
         page.mouse.click(middle[0] + 60, middle[1] + 30)
         page.get_by_text("corner 2 at").wait_for()
+        page.get_by_role("button", name="Remove the last corner").click()
+        page.get_by_text("1 corners").wait_for()
+        page.mouse.click(middle[0] + 60, middle[1] + 30)
+        page.get_by_text("corner 2 at").wait_for()
         page.get_by_role("button", name="Add what is drawn to the mask").click()
         page.get_by_text("east: 1 masked places").wait_for(timeout=20_000)
         page.get_by_role("button", name="Back to the arena's view").click()
@@ -125,8 +143,8 @@ def test_a_mask_is_drawn_by_clicks(arena: LiveArena, view: View, east: SettingsO
     assert size[0] > 30
 
 
-def test_a_camera_is_renamed(arena: LiveArena, view: View):
-    """The server gets the request; an empty name is refused."""
+def test_a_camera_is_renamed_and_forgotten(arena: LiveArena, view: View):
+    """The server gets the requests; an empty name is refused."""
     changes: list[CameraChange] = []
 
     def answer(query: zenoh.Query) -> None:
@@ -142,7 +160,13 @@ def test_a_camera_is_renamed(arena: LiveArena, view: View):
         rename.click()
         page.get_by_text("'' can't name a camera").wait_for(timeout=20_000)
         page.locator("xpath=//*[text()='Rename to']/following::input[1]").fill("north-2")
-        wait_for(lambda: changes, rename.click)
+        wait_for(lambda: value_of(view, "Rename to") == "north-2")
+        rename.click()
         page.get_by_text("camera-1 is called north-2 from now on").wait_for(timeout=20_000)
+        page.get_by_role("button", name="Forget the camera").click()
+        page.get_by_text("click again to forget camera-1").wait_for(timeout=20_000)
+        page.get_by_role("button", name="Forget: click again").click()
+        page.get_by_text("camera-1 is forgotten").wait_for(timeout=20_000)
     assert (changes[0].camera, changes[0].name) == ("camera-1", "north-2")
+    assert (changes[-1].camera, changes[-1].forget) == ("camera-1", True)
     queryable.undeclare()

@@ -3,7 +3,6 @@
 
 import itertools
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from camera_node.protocol.requests import encode_jpeg
 from tests.calib.boards import LENS, SPEC, board_poses, render
 from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, showing
 from web.subscription import Subscription
 from web.tabs.cameras import CameraSettings
 from web.tabs.lens import describe_lens
@@ -31,17 +30,19 @@ def files(tmp_path: Path) -> CalibrationFiles:
 
 
 @pytest.fixture
-def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
-    """A view that draws, with the settings of one camera."""
-    view = View(subscription.feed, loopback())
-    with closing(CameraSettings(view.server, subscription, files)) as settings:
-        view.add(settings)
-        with drawing(view):
-            yield view
+def shown(subscription: Subscription, files: CalibrationFiles) -> Iterator[tuple[View, CameraSettings]]:
+    """A view with the settings of one camera."""
+    make = lambda view: CameraSettings(view.server, subscription, files)  # noqa: E731
+    with showing(subscription.feed, make) as shown:
+        yield shown
 
 
-def test_a_lens_is_calibrated_in_the_page(arena: LiveArena, view: View, files: CalibrationFiles):
-    """The true lens results, to five of its own standard deviations; the file changes when it is accepted."""
+def test_a_lens_is_calibrated_in_the_page(
+    arena: LiveArena, shown: tuple[View, CameraSettings], files: CalibrationFiles
+):
+    """The true lens results, to five of its own standard deviations; the file changes when it is accepted, and not when
+    it is discarded."""
+    view, settings = shown
     images = itertools.cycle([encode_jpeg(render(*pose), 95) for pose in board_poses(0.6, N_VIEWS)])
 
     def answer(query: zenoh.Query) -> None:
@@ -57,7 +58,13 @@ def test_a_lens_is_calibrated_in_the_page(arena: LiveArena, view: View, files: C
         page.get_by_text(f"east: {N_VIEWS} views of").wait_for()
         page.get_by_role("button", name="End, and calibrate").click()
         page.get_by_text("accept or discard it").wait_for()
+        panel = settings._lens
+        assert panel is not None
+        candidate = panel._candidate
+        page.get_by_role("button", name="Discard the lens").click()
+        page.get_by_text("discarded").wait_for()
         assert not files.rig.exists(), "nothing changes before the user accepts"
+        panel._candidate = candidate
         page.get_by_role("button", name="Accept the lens").click()
         page.get_by_text("its pose is void").wait_for()
     queryable.undeclare()

@@ -16,7 +16,7 @@ from fusion.client.arena import Arena as Client
 from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_robot
 from tests.fusion.synthetic import WIDE
 from tests.waiting import wait_for
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, showing
 from web.feed import Feed
 from web.subscription import Subscription
 from web.tabs.cameras import CameraTable
@@ -34,11 +34,9 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
     monkeypatch.setattr("web.view.PANEL_INTERVAL", 2)
     with serving_an_unknown_robot(tmp_path) as (endpoint, client), ServerConnection([endpoint]) as connection:
         subscription = Subscription(connection, Feed("test"))
-        view = View(subscription.feed, loopback())
-        picker = MarkerPicker(view.server, subscription)
-        view.add(picker)
-        view.add(CameraTable(view.server.gui))
-        with drawing(view):
+        make = lambda view: MarkerPicker(view.server, subscription)  # noqa: E731
+        with showing(subscription.feed, make) as (view, picker):
+            view.add(CameraTable(view.server.gui))
             yield client, view, picker
         subscription.close()
 
@@ -94,8 +92,12 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
         wait_for(lambda: (picker._name.value, picker._diameter.value) == ("wide", 120.0))
         define = page.get_by_role("button", name="Define robot")
         click(define.click, page, re.compile("wide.* 3 markers"))
-    wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
-    robot = client.change_robots()["wide"]
+        wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
+        robot = client.change_robots()["wide"]
+        client.change_robots(remove=["wide"])
+        picker._name.value = "all"
+        everything = page.get_by_role("button", name="Define from everything stationary")
+        click(everything.click, page, re.compile("all.* 3 markers"))
     assert robot.diameter_m == 0.12
     first = WIDE.points[0] - WIDE.points.mean(0)
     assert abs(robot.points[0, 0] - np.linalg.norm(first)) < 2e-3

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Locator
 
 from camera_node.protocol.connection import ServerConnection
 from fusion.commands.record import recordings
@@ -14,7 +15,7 @@ from fusion.recordings.summary import list_recordings
 from tests.fusion.serving import serving_an_unknown_robot
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, drawing, loopback, value_of
 from web.condition import Condition
 from web.feed import Feed
 from web.history import LENGTH_S, EventLog, FigureHistory
@@ -39,6 +40,13 @@ def view(tmp_path: Path) -> Iterator[View]:
         subscription.close()
 
 
+def middle_left_of(thumb: Locator, by_px: float = 60.0) -> tuple[float, float]:
+    """A point left of the middle of an element."""
+    box = thumb.bounding_box()
+    assert box is not None
+    return box["x"] + box["width"] / 2 - by_px, box["y"] + box["height"] / 2
+
+
 def test_a_recording_is_made_shown_and_exported(
     view: View, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -59,9 +67,21 @@ def test_a_recording_is_made_shown_and_exported(
         page.get_by_role("cell", name=summary.path.name).wait_for()
         page.get_by_role("button", name="Replay").click()
         page.get_by_text(f"recording {summary.path.name}:").wait_for()
+        page.locator("xpath=//*[text()='Loop']/following::input[@type='checkbox'][1]").click(force=True)
+        wait_for(lambda: value_of(view, "Loop"))
+        page.get_by_role("button", name="Pause").click()
         page.get_by_role("button", name="Step").click()
         page.get_by_role("button", name="Play", exact=True).wait_for()
         assert view.shown is not view.feed
+        end = page.locator(".multi-slider-thumb").last  # of the part
+        end.hover()
+        page.mouse.down()
+        page.mouse.move(*middle_left_of(end))
+        page.mouse.up()
+        save = page.get_by_role("button", name="Save the part as a recording")
+        wait_for(save.is_enabled)
+        save.click()
+        page.get_by_text(f"wrote {summary.path.with_suffix('')}_0.0-").wait_for(timeout=EXPORT_MS)
         page.get_by_role("button", name="Back to the arena").click()
         page.get_by_text("the page shows the arena").wait_for()
         assert view.shown is view.feed
@@ -71,6 +91,7 @@ def test_a_recording_is_made_shown_and_exported(
     capsys.readouterr()
     recordings(folder)
     assert f"{summary.path.name}: {summary.seconds:.1f} s" in capsys.readouterr().out
+    assert len(list_recordings(folder)) == 2
 
 
 def test_a_file_without_an_index_is_listed(tmp_path: Path):

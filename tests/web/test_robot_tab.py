@@ -60,6 +60,8 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
         page.get_by_role("button", name="Turn the heading").click()
         page.get_by_text("turned by 90 degrees").wait_for()
         assert client.declared_robots().robots == {"a": turn_heading(TRIANGLE, 90.0)}
+        page.get_by_role("button", name="Move the pivot").click()
+        page.get_by_text("the origin of a moved by 0, 0, 0 m").wait_for()
         page.get_by_text("New name").locator("xpath=ancestor::*[.//input][1]").locator("input:visible").fill(
             "cart"
         )

@@ -33,7 +33,7 @@ def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
     arena.status()
     wait_for(lambda: (x := feed.state()).poses and x.cameras and x.status)
     state = feed.state()
-    robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "0.50", "1.0", "3")
+    robot = ("rover", "tracked", "+0.50 -0.25 +0.12", "+0", "0.50", "1.0", "3")
     assert tabulate_robots(state).rows == [TableRow(robot, "ok", dot=css(robot_colour("rover")))]
     camera = ("north", "30.0", "0.7", "8.0", "0.6", "0.08", "5.1", "0.02", "2 / 1")
     assert tabulate_cameras(state).rows == [TableRow(camera, "warn", "too dark")]
@@ -119,7 +119,7 @@ def test_an_old_pose_has_no_state(arena: LiveArena, feed: Feed):
     state = feed.state()
     state.poses["rover"] = replace(state.poses["rover"], received_s=time.monotonic() - 2 * STALE_S)
     (row,) = tabulate_robots(state).rows
-    assert (row.cells[1:], row.level) == (("no data", "–", "–", "–", "–"), "bad")
+    assert (row.cells[1:], row.level) == (("no data", "–", "–", "–", "–", "–"), "bad")
 
 
 def test_the_status_line_of_an_empty_arena():

@@ -21,7 +21,7 @@ from camera_node.protocol.session import open_client
 from tests.calib.synthetic import assert_near, record, ring
 from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, drawing, loopback
+from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
 from web.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles
@@ -49,13 +49,11 @@ def files(tmp_path: Path) -> CalibrationFiles:
 
 
 @pytest.fixture
-def view(subscription: Subscription, files: CalibrationFiles) -> Iterator[View]:
-    """A view that draws, with the button."""
-    view = View(subscription.feed, loopback())
-    with closing(WandSessionPanel(view.server, subscription, files)) as panel:
-        view.add(panel)
-        with drawing(view):
-            yield view
+def shown(subscription: Subscription, files: CalibrationFiles) -> Iterator[tuple[View, WandSessionPanel]]:
+    """A view with the panel."""
+    make = lambda view: WandSessionPanel(view.server, subscription, files)  # noqa: E731
+    with showing(subscription.feed, make) as shown:
+        yield shown
 
 
 @contextmanager
@@ -71,10 +69,10 @@ def cameras_present(arena: LiveArena) -> Iterator[None]:
 
 
 def test_a_wand_session_in_the_page_calibrates_the_cameras(
-    arena: LiveArena, view: View, files: CalibrationFiles
+    arena: LiveArena, shown: tuple[View, WandSessionPanel], files: CalibrationFiles
 ):
     """The rig and the recording are written; the page shows the grade, and that no server has the rig in force."""
-    sent = record(ARENA, 8.0)  # no noise
+    (view, _), sent = shown, record(ARENA, 8.0)  # no noise
     with browsing(view) as page, open_client([arena.endpoint]) as session:
         with cameras_present(arena):  # without cameras the button is disabled
             page.get_by_role("button", name="Start wand session").click(timeout=30_000)
@@ -144,18 +142,20 @@ def test_the_wand_is_drawn_during_a_session(subscription: Subscription, files: C
     view.close()
 
 
-def test_a_discarded_calibration_changes_nothing(subscription: Subscription, files: CalibrationFiles):
+def test_a_discarded_calibration_changes_nothing(
+    shown: tuple[View, WandSessionPanel], files: CalibrationFiles
+):
     """The preview and the candidate's file disappear; there is nothing left to accept."""
-    view, before = View(subscription.feed, loopback()), files.rig.read_bytes()
-    with closing(WandSessionPanel(view.server, subscription, files)) as panel:
-        save_rig(ARENA.truth, files.candidate)
-        panel._candidate = load_rig(files.candidate)
-        assert "discarded" in panel.discard()
-        assert not files.candidate.exists()
-        assert files.rig.read_bytes() == before
-        with pytest.raises(WebError, match="no calibration to accept"):
-            panel.accept()
-    view.close()
+    (view, panel), before = shown, files.rig.read_bytes()
+    save_rig(ARENA.truth, files.candidate)
+    panel._candidate = load_rig(files.candidate)
+    with browsing(view) as page:
+        page.get_by_role("button", name="Discard the calibration").click(timeout=30_000)
+        page.get_by_text("discarded; the recording is").wait_for(timeout=20_000)
+    assert not files.candidate.exists()
+    assert files.rig.read_bytes() == before
+    with pytest.raises(WebError, match="no calibration to accept"):
+        panel.accept()
 
 
 def test_missing_files_are_found_before_the_page_opens(files: CalibrationFiles):

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tab Calibrate: the versions of the rig, of which any can be restored by undo and redo."""
 
-from datetime import datetime
+from datetime import UTC, datetime
 
 import viser
 
 from calib.rig.messages import RigHistory, RigVersion
+from calib.rig.rig import Rig
 from camera_node.text import printable
+from fusion.protocol.health import assess_calibration, calibration_problems, describe_calibration
 from web.feed import ArenaState
-from web.html_tables import Column, HtmlTable, TableRow
+from web.html_tables import Column, HtmlTable, TableRow, small
 from web.subscription import Subscription
 from web.tables import NO_VALUE
 from web.widgets import ActionButton, Answer, set_content
@@ -20,6 +22,34 @@ HISTORY_COLUMNS = (
     Column("file", "", "on the server; none if a restart loses it"),
 )
 LEVELS = {"earlier": "wait", "in force": "ok", "undone": "warn"}
+
+
+class CalibrationInForce:
+    """One line on the calibration that the server uses: its grade, age and expected error, and what needs attention."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._line = gui.add_html("")
+
+    def update(self, state: ArenaState) -> None:
+        """Show the state."""
+        problems = calibration_problems(assess_calibration(state.rig, datetime.now(UTC)))
+        set_content(self._line, small(describe_rig(state.rig), "warn" if problems else "ok"))
+
+
+def describe_rig(rig: Rig | None) -> str:
+    """Such as "calibration of grade B, 2 days old; 4 of 4 cameras placed; expected error 0.8 mm, at most 1.9 mm".
+
+    The rig comes from the network: its `calibration` holds anything.
+    """
+    assessed = assess_calibration(rig, datetime.now(UTC))
+    if rig is None or not assessed.placed:
+        return "not calibrated: start a wand session"
+    parts = [describe_calibration(assessed), f"{assessed.placed} of {len(rig.cameras)} cameras placed"]
+    expected = rig.calibration.get("expected_mm")
+    figures = [expected.get(key) for key in ("median", "worst")] if isinstance(expected, dict) else []
+    if figures and all(isinstance(figure, int | float) for figure in figures):
+        parts.append(f"expected error {figures[0]:.1f} mm, at most {figures[1]:.1f} mm")
+    return "; ".join([*parts, *calibration_problems(assessed)])
 
 
 class RigHistoryPanel:

@@ -3,7 +3,9 @@
 
 import base64
 import html
+import threading
 from collections.abc import Mapping
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -11,7 +13,8 @@ import viser
 from numpy.typing import NDArray
 
 from camera_node.config import require_name
-from camera_node.errors import NetworkError
+from camera_node.errors import NetworkError, RoundelError
+from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Preview, Settings
 from camera_node.protocol.registration import CameraChange
@@ -28,6 +31,7 @@ from web.tabs.rig_change import CalibrationFiles
 from web.widgets import ActionButton, Answer, set_content, set_property
 
 NO_CAMERA = "no camera yet"
+FORGET, CONFIRM = "Forget the camera", "Forget: click again"
 
 
 class CameraTable:
@@ -107,6 +111,8 @@ class CameraSettings:
     ) -> None:
         gui = server.gui
         self._gui, self._subscription = gui, subscription
+        self._confirmed = ""  # camera that the next click forgets
+        self._shown = ""  # camera whose settings are in the fields
         self._folder = gui.add_folder("One camera")
         with self._folder:
             self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
@@ -122,6 +128,7 @@ class CameraSettings:
                 hint="least contrast of a roundel, grey levels",
             )
             answer = Answer(gui)
+            self._forget = ActionButton(gui, FORGET, self.forget, answer, "of a camera that was removed")
             self._buttons = (
                 ActionButton(gui, "Rename the camera", self.rename, answer),
                 ActionButton(gui, "Read the settings", self.read, answer),
@@ -134,11 +141,18 @@ class CameraSettings:
 
     def update(self, state: ArenaState) -> None:
         """Offer the cameras that publish."""
-        names = tuple(sorted(state.cameras)) or (NO_CAMERA,)
+        of_server = state.status.message.cameras if state.status else {}
+        names = tuple(sorted({*state.cameras, *of_server})) or (NO_CAMERA,)
         if names != tuple(self._camera.options):
             self._camera.options = names
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
+        is_asked = self._confirmed == self._name
+        self._forget.show(enabled=names != (NO_CAMERA,), label=CONFIRM if is_asked else FORGET)
+        if self._name in state.cameras and self._name != self._shown:
+            self._shown = self._name
+            show = guarded("the settings of a camera", self._show_present)
+            threading.Thread(target=show, args=[self._name], name="settings", daemon=True).start()
         self._mask.update(state)
         if self._lens is not None:
             self._lens.update(state)
@@ -157,6 +171,27 @@ class CameraSettings:
         change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
         self._new_name.value = ""
         return f"{old} is called {new} from now on"
+
+    def forget(self) -> str:
+        """Have the server forget the camera, with the second click. Raises RequestError or NetworkError."""
+        name = self._name
+        if self._confirmed != name:
+            self._confirmed = name
+            return (
+                f"click again to forget {name}; a camera that still runs registers again when it is restarted"
+            )
+        self._confirmed = ""
+        change = CameraChange(camera=name, forget=True, source=RequestSource.of("web"))
+        arena = self._subscription.feed.keys.arena
+        change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
+        return f"{name} is forgotten"
+
+    def _show_present(self, name: str) -> None:
+        """Fill the fields with the settings of a camera that was selected."""
+        with suppress(RoundelError):  # the button shows why it does not answer
+            used = self._subscription.change_settings(name)
+            if name == self._name:
+                self._show(used)
 
     def read(self) -> str:
         """Show the settings in use."""

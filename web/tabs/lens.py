@@ -68,7 +68,7 @@ class LensPanel:
             self._capture = LongAction(gui, LABELS, self._calibrate, answer)
             self._cells = gui.add_html("")
             self._accept = ActionButton(gui, "Accept the lens", self.accept, answer)
-            self._discard = ActionButton(gui, "Discard it", self.discard, answer)
+            self._discard = ActionButton(gui, "Discard the lens", self.discard, answer)
         self._residuals: viser.GuiImageHandle | None = None
 
     def update(self, state: ArenaState) -> None:

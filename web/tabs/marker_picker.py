@@ -3,7 +3,7 @@
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from camera_node.arrays import Array
 from camera_node.config import require_name
@@ -13,13 +13,15 @@ from fusion.errors import FusionError
 from web.colours import SELECTED
 from web.condition import next_step
 from web.feed import ArenaState
+from web.html_tables import small
 from web.subscription import Subscription
-from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_property
+from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
 MAX_ANGLE_RAD = 0.03  # between the ray of a click and the direction of the selected marker
 MARKERS_S = 1.0  # age up to which the latest markers can be selected
 MEASURE_S = 1.5  # for which the markers of the new robot are measured
 SAME_M = 0.05  # distance up to which a measured marker is the selected one
+NOTHING_SEEN = "no unlabeled marker in view: place the robot, markers up, where two cameras see it"
 SELECT, STOP = "Select markers", "Stop selecting"
 
 
@@ -32,6 +34,7 @@ class MarkerPicker:
         self._unlabeled = np.empty((0, 3))  # current positions of unlabeled markers that several cameras see
         self._active = False
         with server.gui.add_folder("New robot"):
+            self._seen = server.gui.add_html(small(NOTHING_SEEN))
             self._button = server.gui.add_button(SELECT, color=GREY)
             self._name = server.gui.add_text("Name", "robot")
             self._diameter = server.gui.add_number("Black disc, mm", 90.0, min=1.0, max=10_000.0, step=0.1)
@@ -66,7 +69,9 @@ class MarkerPicker:
         """Store the current unlabeled markers, and draw the selected ones."""
         timed = state.markers
         if timed is not None and state.age_s(timed) < MARKERS_S:
-            self._unlabeled = timed.message.positions()[timed.message.unlabeled()]
+            rows = timed.message.unlabeled()
+            self._unlabeled = timed.message.positions()[rows]
+            set_content(self._seen, small(describe_unlabeled(timed.message.diameters()[rows])))
         is_next = next_step(state) == "robots"
         set_property(self._button, "color", PRIMARY if is_next and not self.selected else GREY)
         set_property(self._button, "disabled", not self._active and not len(self._unlabeled))
@@ -124,6 +129,15 @@ class MarkerPicker:
 
     def _answer_with(self, text: str) -> None:
         self._answer.show(text)
+
+
+def describe_unlabeled(diameters_m: NDArray[np.float32]) -> str:
+    """How many unlabeled markers are in view, and the median of their diameters (N,), metres, NaN where unknown."""
+    if not len(diameters_m):
+        return NOTHING_SEEN
+    known = diameters_m[np.isfinite(diameters_m)]
+    size = f", discs of about {1e3 * np.median(known):.0f} mm" if len(known) else ""
+    return f"unlabeled markers in view: {len(diameters_m)}{size}"
 
 
 def _match_selected(measured: StationaryMarkers, selected: Array) -> StationaryMarkers:

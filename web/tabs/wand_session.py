@@ -60,7 +60,7 @@ class WandSessionPanel:
             self._answer = Answer(server.gui)
             self._session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
             self._accept = ActionButton(server.gui, "Accept the calibration", self.accept, self._answer)
-            self._discard = ActionButton(server.gui, "Discard it", self.discard, self._answer)
+            self._discard = ActionButton(server.gui, "Discard the calibration", self.discard, self._answer)
             self._cameras = server.gui.add_html("")
         self._candidate: Rig | None = None
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)

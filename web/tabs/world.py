@@ -53,7 +53,7 @@ class WorldPanel:
             answer = Answer(gui)
             self._measure = ActionButton(gui, "Measure", self.measure, answer, MEASURE_HINT)
             self._accept = ActionButton(gui, "Accept the new world", self.accept, answer)
-            self._discard = ActionButton(gui, "Discard it", self.discard, answer)
+            self._discard = ActionButton(gui, "Discard the new world", self.discard, answer)
         self._preview = WorldPreview(server.scene)
 
     def update(self, state: ArenaState) -> None:

@@ -20,9 +20,10 @@ constexpr double kReach = 0.75;         // minor axes searched around the predic
 constexpr double kReachPerSpeed = 0.5;  // so many frames of motion,
 constexpr double kMaxReach = 2.5;       // at most so many minor axes
 
-bool is_accepted(const RoundelFit& fit, const AcceptanceContext& context, double max_sigma) {
+/// `noise` explains a part of the residuals, grey levels.
+bool is_accepted(const RoundelFit& fit, const AcceptanceContext& context, double noise, double max_sigma) {
     const Symmetric centre = fit.centre_covariance();
-    return is_within_limits(fit, context.limits) && fit.is_explained(context.noise, kMisfit) &&
+    return is_within_limits(fit, context.limits) && fit.is_explained(noise, kMisfit) &&
            fit.support > kMinSupport &&
            std::hypot(fit.motion_x, fit.motion_y) < kMaxMotion * fit.outer.major &&
            std::sqrt(centre.xx + centre.yy) < max_sigma * fit.outer.minor;
@@ -41,15 +42,17 @@ bool is_similar(const RoundelFit& fit, const RoundelFit& last) {
 std::optional<RoundelFit> fit_new_moving(const ImageView& image, const MovingGuess& guess,
                                          const AcceptanceContext& context) {
     const auto fit = fit_moving(image, guess);
-    return fit && is_accepted(*fit, context, kMaxNewSigma) ? fit : std::nullopt;
+    return fit && is_accepted(*fit, context, context.noise, kMaxNewSigma) ? fit : std::nullopt;
 }
 
 std::optional<RoundelFit> fit_known_moving(const ImageView& image, const KnownRoundel& known,
                                            const AcceptanceContext& context) {
     const RoundelFit& last = known.last;
+    const double noise = std::max(context.noise, context.edge_noise);  // with what processing leaves at edges
     const auto fit_from = [&](const MovingGuess& guess) {
         const auto fit = fit_moving(image, guess);
-        return fit && is_accepted(*fit, context, kMaxSigma) && is_similar(*fit, last) ? fit : std::nullopt;
+        return fit && is_accepted(*fit, context, noise, kMaxSigma) && is_similar(*fit, last) ? fit
+                                                                                             : std::nullopt;
     };
     MovingGuess predicted{{last.outer, last.ratio, last.dark, last.bright}, last.motion_x, last.motion_y};
     predicted.still.outer.x += known.vx, predicted.still.outer.y += known.vy;

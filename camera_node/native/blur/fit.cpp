@@ -3,6 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
+#include <utility>
 
 #include "blur/sums.hpp"
 #include "fit/fit_covariance.hpp"
@@ -20,8 +22,9 @@ struct Stage {
     double spacing, time_steps;
     int max_steps;
     double converged;
+    bool is_last;
 };
-constexpr Stage kCoarse{240, 1.5, 8, 7, 0.1}, kFine{1200, 1, 1000, 5, 0.01};
+constexpr Stage kCoarse{240, 1.5, 8, 7, 0.1, false}, kFine{1200, 1, 1000, 5, 0.01, true};
 
 constexpr double kInitialBlur = 0.9;
 // Prior standard deviations. They are smaller than those of fit_photometric: a motion hides both.
@@ -30,7 +33,9 @@ constexpr double kMinMotion = 0.1;  // over the minor axis: below it the roundel
 constexpr double kMaxMotion = 4;    // mean radii
 // Residuals after the coarse stage: of the contrast, and grey levels of the noise.
 constexpr double kMaxMisfit = 0.08, kMaxNoise = 4;
-constexpr int kHopeful = 3;                           // steps after which they are at most twice as large
+constexpr double kMaxFineMisfit = 0.06;  // before the fine stage: it changes true fits by 0.005
+// Residuals over that limit after so many steps, beyond which no true roundel (1.8 and 1.3) reaches it.
+constexpr std::pair<int, double> kHopeful[] = {{2, 2.25}, {3, 1.5}};
 constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
 constexpr double kPatch = 64;                         // pixels of the ground with correlated levels
 constexpr SanityLimits kLimits{
@@ -54,7 +59,7 @@ class MovingFitter : GaussNewton<kMovingCount> {
         prior_ = join(0, 0, prior_information(guess.still.outer.major, kRatioPrior, kBlurPrior));
     }
 
-    bool solve() { return iterate(kCoarse) && noise_ < max_noise() && iterate(kFine); }
+    bool solve() { return iterate(kCoarse) && noise_ < max_noise(kMaxMisfit) && iterate(kFine); }
     RoundelFit fit() const;
 
   private:
@@ -65,13 +70,19 @@ class MovingFitter : GaussNewton<kMovingCount> {
             const double spacing = std::max(stage.spacing, motion() / stage.time_steps);
             sums_ = accumulate(pixels_, p_, spacing, kPatch * square(spread_ / noise_));
             update_noise();
-            if (k == kHopeful && noise_ > 2 * max_noise()) return false;
+            if (stage.is_last ? k == 0 && noise_ > max_noise(kMaxFineMisfit) : is_hopeless(k)) return false;
             if (!factorize(sums_.system, noise_)) return false;
             const double moved = advance();
             if (!is_sane(kLimits) || motion() >= kMaxMotion * start_radius()) return false;
             if (k > 0 && moved < stage.converged) return true;
         }
         return true;
+    }
+
+    bool is_hopeless(int step) const {
+        return std::any_of(std::begin(kHopeful), std::end(kHopeful), [&](const auto& limit) {
+            return step == limit.first && noise_ > limit.second * max_noise(kMaxMisfit);
+        });
     }
 
     /// Estimates the noise from the pixels that do not see the ground, and the ground's standard deviation
@@ -96,7 +107,7 @@ class MovingFitter : GaussNewton<kMovingCount> {
         return moved;
     }
 
-    double max_noise() const { return std::hypot(kMaxMisfit * contrast(), kMaxNoise); }
+    double max_noise(double misfit) const { return std::hypot(misfit * contrast(), kMaxNoise); }
     double motion() const { return std::hypot(p_[kMotionX], p_[kMotionY]); }
 
     const ImageView& image_;

@@ -20,6 +20,8 @@ constexpr double kMinDistance = 0.3;     // minor axes between two matches
 
 // New roundels.
 constexpr double kLengths[] = {0.25, 0.4, 0.55, 0.75, 1};  // of the motion, diameters
+constexpr double kLongest = 1;
+constexpr double kNeighbour = 1.65;       // factor between two neighbours of these lengths at most
 constexpr double kMaxFirstMisfit = 0.4;   // RMS over the contrast in the direction of the streak,
 constexpr double kMaxStartMisfit = 0.25;  // in the best direction, before the descent,
 // and after each of its rounds. Templates are not blurred and have five lengths: true matches reach 0.11.
@@ -134,12 +136,13 @@ void MotionBlurMatcher::sample(const ImageView& image, const DiscPlace& p, NewTe
         }
 }
 
-/// Replaces the best match by better ones among every `stride`-th template.
+/// Replaces the best match by better ones among the selected templates.
 ROUNDEL_CLONES void MotionBlurMatcher::compare(const NewTemplate::Column& levels, const DiscPlace& place,
-                                               size_t stride, StreakMatch& best) const {
+                                               const Selection& among, StreakMatch& best) const {
     constexpr size_t kPadded = NewTemplate::kPadded;
-    for (size_t n = stride - 1; n < templates_.size(); n += stride) {
+    for (size_t n = among.stride - 1; n < templates_.size(); n += among.stride) {
         const NewTemplate& t = templates_[n];
+        if (t.length < among.shortest || t.length > among.longest) continue;
         Lanes sums[3] = {}, squares = {};
         for (size_t k = 0; k < kPadded; k += kLanes)
             for (size_t i = 0; i < 3; ++i) sums[i] += load(&t.solve[i].at[k]) * load(&levels.at[k]);
@@ -167,7 +170,8 @@ bool MotionBlurMatcher::descend(const ImageView& image, StreakMatch& best) const
                 DiscPlace place = best.place;
                 place.*member += sign * step * (member == &DiscPlace::angle ? kRadians : width);
                 sample(image, place, levels);
-                compare(levels, place, 1, best);
+                const double length = best.found->length;
+                compare(levels, place, {1, length / kNeighbour, length * kNeighbour}, best);
             }
         if (best.misfit > max_misfit) return false;
         step *= kNextStep;
@@ -183,7 +187,7 @@ std::optional<MovingMatch> MotionBlurMatcher::match_streak(const ImageView& imag
     for (const double turn : kTurns) {
         const DiscPlace place{double(s.x), double(s.y), angle + turn, width, width};
         sample(image, place, levels);
-        compare(levels, place, 2, best);
+        compare(levels, place, {2, 0, kLongest}, best);
         if (!best.found) return std::nullopt;
     }
     if (best.misfit > kMaxStartMisfit || !descend(image, best)) return std::nullopt;

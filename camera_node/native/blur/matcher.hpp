@@ -42,7 +42,12 @@ class MotionBlurMatcher {
         double misfit, dark, bright;
     };
     static void sample(const ImageView& image, const DiscPlace& place, NewTemplate::Column& levels);
-    void compare(const NewTemplate::Column& levels, const DiscPlace& place, size_t stride,
+    /// Every `stride`-th template with a motion in a range, diameters.
+    struct Selection {
+        size_t stride;
+        double shortest, longest;
+    };
+    void compare(const NewTemplate::Column& levels, const DiscPlace& place, const Selection& among,
                  StreakMatch& best) const;
     bool descend(const ImageView& image, StreakMatch& best) const;
 

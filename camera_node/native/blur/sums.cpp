@@ -56,11 +56,12 @@ class DiscPath {
         to_radii(p[kMotionX], p[kMotionY], u_, v_);
         length_ = u_ * u_ + v_ * v_ + 1e-12;
     }
-    double distance(double x, double y) const {
+    /// Square of the distance.
+    double distance2(double x, double y) const {
         double u, v;
         to_radii(x - p_[kX], y - p_[kY], u, v);
         const double t = std::clamp((u * u_ + v * v_) / length_, -0.5, 0.5);
-        return std::hypot(u - t * u_, v - t * v_);
+        return square(u - t * u_) + square(v - t * v_);
     }
 
   private:
@@ -93,7 +94,7 @@ void select_moving(const ImageView& image, const MovingParameters& p, int limit,
     pixels.used = pixels.expected = 0;
     for (int y = int(y0 - half_h); y <= int(y0 + half_h); y += step)
         for (int x = int(x0 - half_w); x <= int(x0 + half_w); x += step)
-            if (path.distance(x, y) < reach) append(image, x, y, pixels);
+            if (path.distance2(x, y) < reach * reach) append(image, x, y, pixels);
     pixels.pad();
 }
 

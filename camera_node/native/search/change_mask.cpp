@@ -105,8 +105,8 @@ void ChangeMask::visit(const Ellipse& e, const Work& work) {
     for (int y = first(e.y); y <= last(e.y, rows_); ++y)
         for (int x = first(e.x); x <= last(e.x, columns_); ++x) {
             const double dx = (x + 0.5) * kTile - e.x, dy = (y + 0.5) * kTile - e.y;
-            if (std::hypot((c * dx + s * dy) / along, (c * dy - s * dx) / across) < 1)
-                work(size_t(y) * size_t(columns_) + size_t(x));
+            const double u = (c * dx + s * dy) / along, v = (c * dy - s * dx) / across;
+            if (u * u + v * v < 1) work(size_t(y) * size_t(columns_) + size_t(x));
         }
 }
 

@@ -14,7 +14,8 @@ bool is_inside(const Ellipse& e, double x, double y) {
     const double dx = x - e.x, dy = y - e.y;
     if (std::abs(dx) > e.major / 2 || std::abs(dy) > e.major / 2) return false;
     const double c = std::cos(e.angle), s = std::sin(e.angle);
-    return std::hypot((c * dx + s * dy) / e.major, (c * dy - s * dx) / e.minor) < 0.5;
+    const double along = (c * dx + s * dy) / e.major, across = (c * dy - s * dx) / e.minor;
+    return along * along + across * across < 0.25;
 }
 
 }  // namespace

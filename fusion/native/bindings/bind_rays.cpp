@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
+#include <nanobind/stl/tuple.h>
+
 #include <algorithm>
 
 #include "arrays.hpp"
@@ -19,23 +21,45 @@ void make_viewpoints(Viewpoints* self, const Index& camera, const Positions& cen
     new (self) Viewpoints(std::move(frames));
 }
 
-Out densest_ranges_of(const Viewpoints& frames, const Index& frame, const Positions& direction,
-                      const Numbers& reach, const In<double, -1, -1, 2>& ranges) {
+using Ranges = In<double, -1, -1, 2>;
+
+Rays rays_of(const Viewpoints& frames, const Index& frame, const Positions& direction, const Numbers& reach,
+             const Ranges& ranges) {
     const size_t n = frame.size();
     require_equal(n, {direction.shape(0), reach.size(), ranges.shape(0)});
     if (!ranges.shape(1)) throw nb::value_error("rays without ranges");
-    const Rays rays{below(frames.size(), frame),
-                    reinterpret_cast<const Vector*>(direction.data()),
-                    reach.data(),
-                    ranges.data(),
-                    n,
-                    ranges.shape(1)};
-    auto [found, to] = make({n});
+    return {below(frames.size(), frame),
+            reinterpret_cast<const Vector*>(direction.data()),
+            reach.data(),
+            ranges.data(),
+            n,
+            ranges.shape(1)};
+}
+
+Out densest_ranges_of(const Viewpoints& frames, const Index& frame, const Positions& direction,
+                      const Numbers& reach, const Ranges& ranges) {
+    const Rays rays = rays_of(frames, frame, direction, reach, ranges);
+    auto [found, to] = make({rays.n});
     unlocked([&, to = to] {
         const std::vector<double> densest = densest_ranges(rays, frames);
         std::copy(densest.begin(), densest.end(), to);
     });
     return found;
+}
+
+/// Rows (2, K) of the rays of each pair, and (2, K): the miss in tolerances, and the range on the first ray.
+auto ray_pairs_of(const Viewpoints& frames, const Index& frame, const Positions& direction,
+                  const Numbers& reach, const Ranges& ranges, double most) {
+    const Rays rays = rays_of(frames, frame, direction, reach, ranges);
+    std::vector<RayPair> found;
+    unlocked([&] { found = ray_pairs(rays, frames, most); });
+    auto [pairs, rows] = make<int64_t>({2, found.size()});
+    auto [numbers, to] = make({2, found.size()});
+    for (const RayPair& pair : found) {
+        rows[0] = pair.first, rows[found.size()] = pair.second, ++rows;
+        to[0] = pair.miss, to[found.size()] = pair.range, ++to;
+    }
+    return std::make_tuple(pairs, numbers);
 }
 
 }  // namespace
@@ -44,6 +68,7 @@ void bind_rays(nb::module_& m) {
     m.attr("MIN_PARALLAX") = kMinParallax;
     nb::class_<Viewpoints>(m, "Viewpoints").def("__init__", &make_viewpoints);
     m.def("densest_ranges", &densest_ranges_of);
+    m.def("ray_pairs", &ray_pairs_of);
 }
 
 }  // namespace roundel::fusion

@@ -13,7 +13,7 @@ import numpy as np
 from camera_node.arrays import Array, Index, Mask
 from fusion.model.states import POSITION
 from fusion.tracking.gating import DIAMETER_TOLERANCE, POSITION_GATE
-from fusion.tracking.multiview import Marker
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import MarkerHistories
 

@@ -18,11 +18,11 @@ from fusion.tracking.gating import (
     mean_by_body,
     misfit,
 )
+from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.constellation import Fits
 from fusion.tracking.identity.identification import RefinedFits
 from fusion.tracking.identity.single_markers import history_chi2, is_local
 from fusion.tracking.identity.verification import explained_shares
-from fusion.tracking.multiview import Marker
 from fusion.tracking.track_table import TrackTable
 
 SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization

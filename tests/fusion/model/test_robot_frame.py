@@ -89,3 +89,20 @@ def test_the_commands_change_the_running_server(tmp_path: Path, capsys: pytest.C
             robots("turn", ("b", "90"), connect=connect, arena="test")
         with pytest.raises(ConfigError, match="give numbers"):
             robots("turn", ("a", "left"), connect=connect, arena="test")
+
+
+def test_the_commands_list_save_rename_and_remove_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with serving(config(tmp_path)) as (server, client):
+        connect, out = tuple(server.endpoints), tmp_path / "saved.yaml"
+        robots("list", connect=connect, arena="test")
+        assert capsys.readouterr().out == "a: 3 markers of 0.12 m\n"
+        robots("save", (str(out),), connect=connect, arena="test")
+        assert load_robots(out) == {"a": TRIANGLE}
+        with pytest.raises(ConfigError, match="exists; add --force"):
+            robots("save", (str(out),), connect=connect, arena="test")
+        robots("rename", ("a", "cart"), connect=connect, arena="test")
+        assert client.declared_robots().robots == {"cart": TRIANGLE}
+        robots("remove", ("cart",), connect=connect, arena="test")
+        assert client.declared_robots().robots == {}
+        with pytest.raises(ConfigError, match="use fusion robots rename OLD NEW"):
+            robots("rename", ("a",), connect=connect, arena="test")

@@ -138,7 +138,7 @@ bool associate(Random& random, double wild) {
     return true;
 }
 
-/// The densest range of a ray is a possible one, or NaN.
+/// The densest range of a ray is a possible one, or NaN; pairs are of rays that miss each other by little.
 bool intersect(Random& random, double wild) {
     const size_t frames = 1 + random.below(5), n = random.below(60), sizes = 1 + random.below(3);
     std::vector<Viewpoint> viewpoints;
@@ -156,6 +156,8 @@ bool intersect(Random& random, double wild) {
     for (size_t k = 0; k < n; ++k)
         if (std::isfinite(ranges[k]) && !(ranges[k] > 0 && ranges[k] <= rays.max_range(k) * (1 + 1e-9)))
             return false;
+    for (const RayPair& pair : ray_pairs(rays, viewpoints, 3))
+        if (!(pair.first >= 0 && pair.second < int64_t(n) && pair.miss < 3 && pair.range > 0)) return false;
     return ranges.size() == n;
 }
 

@@ -77,6 +77,10 @@ CALLS = {
         _core.densest_ranges,
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.ones((N, 1, 2))),
     ),
+    "ray_pairs": (
+        lambda frames, frame, d, reach, ranges: _core.ray_pairs(frames, frame, d, reach, ranges, 2.0),
+        (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.ones((N, 1, 2))),
+    ),
     "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)))),
 }
 # Constructors check the indices only where they know what the indices refer to.

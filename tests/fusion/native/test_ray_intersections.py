@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fusion._core import MIN_PARALLAX, Viewpoints, densest_ranges
+from fusion._core import MIN_PARALLAX, Viewpoints, densest_ranges, ray_pairs
 from tests.fusion.synthetic import ring
 
 F, EACH, SIZES = 5, 40, np.array([0.1, 0.16])
@@ -27,9 +27,9 @@ def scene(seed: int) -> tuple[np.ndarray, ...]:
     return camera, centre, moved, frame, to / range_m[:, None], reach, ranges
 
 
-def expected(camera, centre, moved, frame, d, reach, ranges) -> np.ndarray:
-    """(N,) ranges from all pairs."""
-    n, o = len(frame), centre[camera[frame]]
+def all_pairs(camera, centre, moved, frame, d, reach, ranges) -> tuple[np.ndarray, ...]:
+    """(N, N) of all pairs: whether they can intersect, miss, its limit, range on the first, and parallax."""
+    o = centre[camera[frame]]
     w, b = o[:, None] - o, d @ d.T
     wi, wj = np.einsum("ijc,ic->ij", w, d), np.einsum("ijc,jc->ij", w, d)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -40,13 +40,16 @@ def expected(camera, centre, moved, frame, d, reach, ranges) -> np.ndarray:
     low, high = ranges[..., 0], ranges[..., 1]
     suits = ((low[:, None] < s[..., None]) & (s[..., None] < high[:, None])).any(2)
     suits &= ((low[None] < t[..., None]) & (t[..., None] < high[None])).any(2)
-    intersects = (camera[frame][:, None] != camera[frame]) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
-    intersects &= suits & ((between**2).sum(2) < limit**2)
+    suits &= (camera[frame][:, None] != camera[frame]) & (parallax > MIN_PARALLAX) & (s > 0) & (t > 0)
+    return suits, np.sqrt((between**2).sum(2)), limit, s, parallax
+
+
+def expected(*given) -> np.ndarray:
+    """(N,) ranges from all pairs."""
+    suits, miss, limit, s, parallax = all_pairs(*given)
+    near = suits & (miss < limit)
     return np.array(
-        [
-            densest(s[k, intersects[k]], limit[k, intersects[k]] / np.sqrt(parallax[k, intersects[k]]))
-            for k in range(n)
-        ]
+        [densest(s[k, near[k]], limit[k, near[k]] / np.sqrt(parallax[k, near[k]])) for k in range(len(near))]
     )
 
 
@@ -67,6 +70,20 @@ def test_ranges_equal_those_of_all_pairs(seed: int):
     found = densest_ranges(Viewpoints(*given[:3]), *given[3:])
     assert 0.5 < np.isfinite(found).mean() < 1
     np.testing.assert_allclose(found, expected(*given), rtol=1e-9)
+
+
+@pytest.mark.parametrize("most", [0.5, 4.0])
+def test_pairs_equal_those_of_all_rays(most: float):
+    given = scene(1)
+    suits, miss, limit, s, _ = all_pairs(*given)
+    i, j = np.nonzero(np.triu(suits & (miss < most * limit)))
+    camera, centre, moved, frame, d, reach, ranges = given
+    rows, found = ray_pairs(Viewpoints(camera, centre, moved), frame, d, reach, ranges, most)
+    (first, second), (found_miss, range_m) = rows, found
+    order = np.lexsort((second, first))
+    np.testing.assert_array_equal(np.stack([first, second])[:, order], [i, j])
+    np.testing.assert_allclose(found_miss[order], miss[i, j] / limit[i, j], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(range_m[order], s[i, j], rtol=1e-9)
 
 
 def test_nearly_parallel_rays_do_not_intersect():

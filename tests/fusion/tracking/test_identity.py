@@ -17,9 +17,9 @@ from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking import acquisition
+from fusion.tracking.grouping.multiview import find_markers
 from fusion.tracking.identity import identification
 from fusion.tracking.identity.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
-from fusion.tracking.multiview import find_markers
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.fusion_accuracy import accuracy, frame_sets

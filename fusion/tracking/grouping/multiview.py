@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Groups unassigned detections across views into markers, by epipolar geometry and apparent size.
+
+1. Two rays of two frames are a candidate where they intersect in front of both cameras, at a range that both sizes
+   allow.
+2. The candidates of a ray lie along it. The true ones agree on the range, the false ones scatter: the densest range
+   wins.
+3. Rays whose points are within half a disc are one marker, since discs can't overlap. In every frame the closest ray
+   remains.
+4. An unassigned ray, or one close to another ray of its frame, joins the marker that it clearly intersects.
+5. Markers that three or more cameras see remain. Of the other rays, pairs are chosen by probability (`two_views`): for
+   two rays the densest range is any of their intersections.
+
+The result is one grouping over all cameras, in which each detection belongs to one marker at most. A ray that fits two
+markers equally well joins neither. Free-running cameras see a moving marker at different positions, so the gates grow
+with the time between frames.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from camera_node.arrays import Array, Index, Mask
+from fusion import _core
+from fusion.model.camera_array import CameraArray
+from fusion.model.observations import DetectionTable
+from fusion.tracking.gating import MAX_SPEED_M_S
+from fusion.tracking.grouping.rays import Rays, misses, rays_of, triangulate
+from fusion.tracking.grouping.two_views import misfit_of, pair_rays
+
+CLEARLY = 0.5  # largest ratio of a ray's distances to the closest and the second closest marker
+BLOCK = 64  # rays compared with all markers at a time: the distances stay in the cache
+JOIN_ROUNDS = 2  # of refinement before ambiguous rays are reassigned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """A triangulated marker.
+
+    Attributes:
+        position, covariance: (3,) and (3, 3), world frame.
+        detections, cameras: rows of its detections, and the index of the camera of each.
+        diameter_m: median of its views; NaN where unknown.
+    """
+
+    position: Array
+    covariance: Array
+    detections: Index
+    cameras: Index
+    diameter_m: float
+
+
+def find_markers(
+    cameras: CameraArray, detections: DetectionTable, rows: Index, diameters: Array
+) -> list[Marker]:
+    """Triangulate the markers that two or more cameras see.
+
+    Args:
+        cameras: cameras of the rig.
+        detections: of a frame set.
+        rows: its unassigned detections.
+        diameters: marker diameters in use, metres; without known axes, geometry alone decides.
+    """
+    rows = rows[np.isfinite(detections.xy[0, rows])]
+    rays = rays_of(cameras, detections, rows, diameters)
+    group, centres = _seen_by_three(rays, float(np.min(diameters)) / 2)
+    group, centres = _with_pairs(rays, group, centres)
+    return _markers(rays, group, centres, rows)
+
+
+def _seen_by_three(rays: Rays, radius: float) -> tuple[Index, Array]:
+    """Groups (N,) of three or more cameras, -1 for the other rays, and their centres (K, 3)."""
+    range_m = _core.densest_ranges(rays.viewpoints, rays.frame, rays.d, rays.reach, rays.ranges)
+    rows = np.flatnonzero(np.isfinite(range_m))
+    if not len(rows):
+        return np.full(len(rays), -1), np.empty((0, 3))
+    points = rays.o[rows] + range_m[rows, None] * rays.d[rows]
+    group, centres = _cluster(rays, rows, points, radius)
+    for _ in range(JOIN_ROUNDS):
+        group, centres = _refine(rays, group, centres)
+    group, centres = _refine(rays, np.where(_ambiguous(rays), -1, group), centres)
+    group = _join_unassigned(rays, group, centres)
+    number = _renumber_groups(rays, group, len(centres), 3)
+    return np.append(number, -1)[group], centres[number >= 0]
+
+
+def _with_pairs(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
+    """With the points that two of the remaining rays determine: groups (N,) and centres (K, 3)."""
+    left = np.flatnonzero(group < 0)
+    pairs, points = pair_rays(rays.select(left), misfit_of(rays, group, centres))
+    group = group.copy()
+    group[left[pairs]] = len(centres) + np.arange(pairs.shape[1])
+    return group, np.concatenate([centres, points])
+
+
+def _cluster(rays: Rays, rows: Index, points: Array, radius: float) -> tuple[Index, Array]:
+    """Single-linkage clusters of points closer than `radius`: the groups (N,) of the rays, and their centres."""
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    number = connected_components(graph, directed=False)[1]
+    group = np.full(len(rays.o), -1)
+    group[rows] = number
+    sums = np.column_stack([np.bincount(number, points[:, k]) for k in range(3)])
+    return group, sums / np.bincount(number)[:, None]
+
+
+def _refine(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
+    """Remove rays that miss their centre or are not the closest of their frame, and triangulate again.
+
+    Groups with fewer than two cameras are dissolved; the others are renumbered from 0.
+    """
+    rows = np.flatnonzero(group >= 0)
+    miss = misses(rays, rows, centres[group[rows]])
+    order = np.lexsort((miss, rays.frame[rows], group[rows]))
+    order = order[miss[order] < 1]
+    rank = group[rows[order]] * (int(rays.frame.max()) + 1) + rays.frame[rows[order]]
+    closest = rows[order[np.concatenate([[True], np.diff(rank) > 0])]] if len(order) else order
+    refined = np.full(len(group), -1)
+    refined[closest] = group[closest]
+    number = _renumber_groups(rays, refined, len(centres), 2)
+    refined[closest] = number[refined[closest]]
+    return refined, triangulate(rays, refined, centres[number >= 0])[0]
+
+
+def _renumber_groups(rays: Rays, group: Index, n: int, n_cameras: int) -> Index:
+    """(n,) new numbers from 0 of the groups with so many cameras or more, -1 for the others."""
+    assigned = group >= 0
+    seen = np.zeros((n, int(rays.camera.max(initial=0)) + 1), bool)
+    seen[group[assigned], rays.camera[assigned]] = True
+    valid = seen.sum(1) >= n_cameras
+    return np.where(valid, np.cumsum(valid) - 1, -1)
+
+
+def _ambiguous(rays: Rays) -> Mask:
+    """(N,) rays so close to another of their frame that noise can exchange them."""
+    reach = 2 * rays.reach
+    near = KDTree(rays.d + rays.frame[:, None] * 10.0).query_pairs(float(reach.max()), output_type="ndarray")
+    distance = np.linalg.norm(rays.d[near[:, 0]] - rays.d[near[:, 1]], axis=1)
+    ambiguous = np.zeros(len(rays.d), bool)
+    ambiguous[near[distance < reach[near[:, 0]]]] = True
+    return ambiguous
+
+
+def _two_closest(rays: Rays, rows: Index, points: Array) -> tuple[Index, Array, Array]:
+    """The closest point of each ray, and the distances (see `misses`) to it and to the second closest one."""
+    o, d = rays.o[rows], rays.d[rows]
+    along = d @ points.T - np.einsum("ni,ni->n", o, d)[:, None]
+    squared = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ points.T + np.einsum("ki,ki->k", points, points)
+    distance = np.sqrt(np.maximum(squared - along**2, 0))
+    reach = (rays.reach[rows])[:, None] * along + (MAX_SPEED_M_S * np.abs(rays.tau[rows]))[:, None]
+    miss = np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
+    two = np.partition(np.column_stack([miss, np.full(len(rows), np.inf)]), 1, axis=1)
+    return np.argmin(miss, 1), two[:, 0], two[:, 1]
+
+
+def _join_unassigned(rays: Rays, group: Index, centres: Array) -> Index:
+    """Add each unassigned ray to the one marker that it clearly intersects, unless that has a ray in its frame."""
+    free = np.flatnonzero(group < 0)
+    if not len(free) or not len(centres):
+        return group
+    taken = np.zeros((len(centres), int(rays.frame.max()) + 1), bool)
+    taken[group[group >= 0], rays.frame[group >= 0]] = True
+    blocks = np.array_split(free, -(-len(free) // BLOCK))
+    closest = [_two_closest(rays, block, centres) for block in blocks]
+    best, first, second = (np.concatenate(column) for column in zip(*closest, strict=True))
+    clear = (first < 1) & (first < CLEARLY * second) & ~taken[best, rays.frame[free]]
+    group = group.copy()
+    group[free[clear]] = best[clear]
+    return group
+
+
+def _markers(rays: Rays, group: Index, centres: Array, rows: Index) -> list[Marker]:
+    centres, covariance = triangulate(rays, group, centres)
+    assigned = np.flatnonzero(group >= 0)
+    sizes = rays.size[assigned] * np.linalg.norm(centres[group[assigned]] - rays.o[assigned], axis=1)
+    order = np.argsort(group[assigned], kind="stable")
+    ends = np.cumsum(np.bincount(group[assigned], minlength=len(centres))).tolist()
+    parts = [order[first:last] for first, last in pairwise([0, *ends])]
+    return [
+        Marker(
+            centres[k], covariance[k], rows[assigned[part]], rays.camera[assigned[part]], _median(sizes[part])
+        )
+        for k, part in enumerate(parts)
+    ]
+
+
+def _median(sizes: Array) -> float:
+    known = sorted(size for size in sizes.tolist() if isfinite(size))
+    return known[len(known) // 2] if known else np.nan
