@@ -30,6 +30,7 @@ from tests.benchmarks.fusion_load import Load, Scene
 
 READOUT_NS = 5_000_000
 STAMP_SIGMA_NS = 20_000  # of a driver: no two frames have exactly the same stamp
+UNKNOWN_PX2 = 1e4  # variance of what no image was fitted for: a node refines outlines by the lens and these
 GREY = {"black": 0, "bright": 255}  # levels of the images; others are grey
 
 
@@ -50,7 +51,9 @@ class SceneDetector(Detector):
     def detect(self, image: Grey) -> DetectedRoundels:
         columns = {name: getattr(self.current, name) for name in Roundels.__slots__}
         n = len(self.current)
-        return DetectedRoundels(**columns, offset_px=np.zeros((n, 2)), pose_cov=np.zeros((n, 7, 7)))
+        pose_cov = np.tile(UNKNOWN_PX2 * np.eye(7), (n, 1, 1))
+        pose_cov[:, :2, :2] = self.current.cov
+        return DetectedRoundels(**columns, offset_px=np.zeros((n, 2)), pose_cov=pose_cov)
 
     def adjusted(self, **changes: Any) -> Detector:
         super().adjusted(**changes)  # refuses invalid settings

@@ -16,7 +16,9 @@ import msgspec
 import tyro
 import zenoh
 
+from calib.rig.messages import redo_rig_key, rig_history_key, undo_rig_key
 from camera_node.protocol.messages import Keys, Settings
+from camera_node.protocol.registration import assigned_key, change_key, register_key, registered_key
 from camera_node.protocol.session import open_client
 from camera_node.terminal import say
 from fusion.protocol.messages import RobotsRequest
@@ -67,6 +69,7 @@ class Fuzzer:
             (10, self._query_rig),
             (10, self._query_node),
             (5, self._query_reader),
+            (5, self._query_registry),
         )
 
     def send(self, only: str = "") -> None:
@@ -150,6 +153,8 @@ class Fuzzer:
         key, message = self.rng.choice(
             (
                 (self.keys.robot_pose(name), self._sample("/pose") | {"robot": name}),
+                (self.keys.poses, {"version": 1, "poses": [msgspec.msgpack.encode(self._sample("/pose"))]}),
+                (assigned_key(self.arena, name), {"version": 1, "id": name, "name": name, "settings": {}}),
                 (self.keys.markers, self._sample("/markers")),
                 (self.keys.fusion_status, self._sample("/fusion/status")),
                 (f"{self.arena}/fusion/shard/2", self._sample("/pose")),
@@ -209,8 +214,26 @@ class Fuzzer:
         self._get(self.keys.settings(camera), data, "settings")
 
     def _query_reader(self) -> None:
-        key = self.rng.choice((self.keys.clock, self.keys.rig, f"{self.arena}/robots"))
+        answering = (self.keys.clock, self.keys.rig, f"{self.arena}/robots")
+        key = self.rng.choice((*answering, rig_history_key(self.arena), registered_key(self.arena)))
         self._get(key, mutate({"version": 1}, self.rng), "questions")
+
+    def _query_registry(self) -> None:
+        """Cameras and the history of the rig: every valid request would change what the others rely on."""
+        requests = {
+            register_key(self.arena): {
+                "version": 1,
+                "id": "ghost",
+                "driver": "sim",
+                "width": 640,
+                "height": 480,
+            },
+            change_key(self.arena): {"version": 1, "camera": "ghost0", "name": "ghost1", "forget": True},
+            undo_rig_key(self.arena): {"version": 1, "source": {"program": "fuzzer"}},
+            redo_rig_key(self.arena): {"version": 1, "source": {"program": "fuzzer"}},
+        }
+        key = self.rng.choice(sorted(requests))
+        self._get(key, certainly_invalid(requests[key], self.rng) or b"\xc1", "registry and history")
 
     def clean_up(self) -> None:
         """Remove the robots that were defined."""
