@@ -26,6 +26,7 @@ class Sight:
         tilt: between the printed side's normal and the line of sight, radians; `turn` its direction.
         dark, bright, ground: grey levels; the ground surrounds the card.
         blur: standard deviation of the lens's Gaussian point spread, pixels, without the pixel's own width.
+        bend: height of the middle of the card above its two ends, over the card's diameter: paper on a cylinder.
     """
 
     lens: Lens
@@ -40,6 +41,7 @@ class Sight:
     bright: float = 190.0
     ground: float = 90.0
     blur: float = 0.7
+    bend: float = 0.0
 
     @property
     def position(self) -> Array:
@@ -95,10 +97,22 @@ def _trace_radius(sight: Sight, margin: int, pieces: int) -> Array:
         xy = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)).reshape(len(v), len(u), 2)
     else:
         xy = np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), -1)
-    n, c = sight.normal, sight.position
-    depth = (c @ n) / (xy @ n[:2] + n[2])
+    c = sight.position
+    depth = _depth(xy, sight)
     squared = (depth * xy[..., 0] - c[0]) ** 2 + (depth * xy[..., 1] - c[1]) ** 2 + (depth - c[2]) ** 2
     return np.sqrt(squared) / (sight.diameter_m / 2)
+
+
+def _depth(xy: Array, sight: Sight) -> Array:
+    """Depth at which rays (..., 2) meet the paper; a bent one's height falls with the square of a coordinate."""
+    n, c, half = sight.normal, sight.position, sight.diameter_m * sight.card / 2
+    along = np.cross(n, [0.0, 1.0, 0.0])
+    along /= np.linalg.norm(along)
+    slope, depth = xy @ n[:2] + n[2], np.zeros(())
+    for _ in range(5 if sight.bend else 1):
+        s = (xy @ along[:2] + along[2]) * depth - c @ along
+        depth = (c @ n - 2 * sight.bend * half * (s / half) ** 2 * (depth > 0)) / slope
+    return depth
 
 
 def _pieces(n: int, margin: int, pieces: int) -> Array:

@@ -11,7 +11,17 @@ from rich.console import Console
 
 from camera_node.detection.detector import Detector
 from camera_node.errors import ConfigError
-from tests.benchmarks.detector import accuracy, cameras, known_lens, motion, negatives, pose, recall, speed
+from tests.benchmarks.detector import (
+    accuracy,
+    bent,
+    cameras,
+    known_lens,
+    motion,
+    negatives,
+    pose,
+    recall,
+    speed,
+)
 from tests.benchmarks.detector.table import Run, print_verdicts
 
 PARTS = {
@@ -23,6 +33,7 @@ PARTS = {
     "false_positives": negatives.measure,
     "pose": pose.measure,
     "cameras": cameras.measure,
+    "bent": bent.measure,
 }
 
 
@@ -41,6 +52,7 @@ class Benchmark:
                 "false_positives",
                 "pose",
                 "cameras",
+                "bent",
                 "all",
             ],
             ...,

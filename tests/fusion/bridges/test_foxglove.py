@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A live server in Foxglove's websocket, read by the schemas that it sends."""
 
+import contextlib
+import os
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +19,7 @@ import pytest
 from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import Preview, encode
 from camera_node.protocol.session import open_client
+from fusion.bridges.foxglove import serving
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
 from tests.conftest import ROOT
@@ -162,3 +166,15 @@ def test_a_port_in_use_is_reported_in_one_line(endpoint: str):
 def test_without_the_sdk_one_line_says_what_to_install():
     advice = advice_without("foxglove", "fusion", "foxglove")
     assert "pip install 'roundel[foxglove]'" in advice
+
+
+def test_messages_do_not_wait_for_acknowledgements():
+    """Nagle's algorithm is off on the server's end of a connection: it added up to 40 ms to every other frame set."""
+    with serving("127.0.0.1", 0, "test") as (_, port), FoxgloveClient(port):
+        ends = []
+        for name in os.listdir("/dev/fd"):
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(name))) as end:
+                if end.getsockname()[1:2] == (port,) and end.getpeername():
+                    ends.append(end.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+        assert ends
+        assert all(ends)
