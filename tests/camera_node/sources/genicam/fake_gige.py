@@ -107,7 +107,7 @@ def _painter(scene: list[str]):
 
     def paint(t_ns: int, exposure_s: float, shape: tuple[int, int]) -> np.ndarray:
         t_s = (t_ns - int(epoch_ns)) * 1e-9 + exposure_s / 2
-        image = renderer.render(t_s, round(t_s * 1000))
+        image = renderer.render(t_s, abs(round(t_s * 1000)))  # the number seeds the noise
         assert image.shape == shape
         return image.copy()
 
