@@ -13,7 +13,7 @@ import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.session import NO_SERVER, PATIENCE_S, open_endless
+from camera_node.protocol.session import NO_SERVER, PATIENCE_S, SEND_BUFFER, open_endless
 
 log = logging.getLogger("camera_node.network")
 
@@ -30,19 +30,22 @@ class ServerConnection:
     Args:
         connect: endpoints of the server.
         zenoh_config: a file.
+        send_buffer: of the kernel, bytes; `BURST_BUFFER` for a program that sends many messages at once.
 
     Raises:
         NetworkError: an endpoint is invalid.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
 
-    def __init__(self, connect: Sequence[str], zenoh_config: Path | None = None) -> None:
+    def __init__(
+        self, connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int = SEND_BUFFER
+    ) -> None:
         self.endpoints = " ".join(connect)
         self._future: Future[zenoh.Session] = Future()
         self._lock = threading.Lock()
         self._actions: list[Callable[[zenoh.Session], object]] = []
         self._closed = False
-        arguments = connect, zenoh_config
+        arguments = connect, zenoh_config, send_buffer
         threading.Thread(target=self._open, args=arguments, daemon=True, name="open Zenoh session").start()
         self._opened_within(FIRST_S)
 
@@ -114,9 +117,9 @@ class ServerConnection:
         except FutureTimeout:
             return None
 
-    def _open(self, connect: Sequence[str], zenoh_config: Path | None) -> None:
+    def _open(self, connect: Sequence[str], zenoh_config: Path | None, send_buffer: int) -> None:
         try:
-            session = open_endless(connect, zenoh_config)
+            session = open_endless(connect, zenoh_config, send_buffer)
         except (NetworkError, ConfigError) as error:
             self._future.set_exception(error)
             return

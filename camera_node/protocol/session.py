@@ -33,6 +33,7 @@ ALWAYS = {
     "transport/shared_memory/enabled": False,
 }
 SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
+BURST_BUFFER = 1 << 18  # for bursts of messages: a full buffer waits for an acknowledgement, 40 ms
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
@@ -107,8 +108,15 @@ def open_client(
         raise NetworkError(f"{NO_SERVER.format(' '.join(connect), timeout_s)} ({_brief(error)})") from None
 
 
-def open_endless(connect: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
+def open_endless(
+    connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int = SEND_BUFFER
+) -> zenoh.Session:
     """As `open_client`, but tries until a server answers: for threads that are daemons.
+
+    Args:
+        connect: endpoints of the server.
+        zenoh_config: a file.
+        send_buffer: of the kernel, bytes.
 
     Raises:
         NetworkError: an endpoint is invalid, or a certificate is missing.
@@ -116,7 +124,7 @@ def open_endless(connect: Sequence[str], zenoh_config: Path | None = None) -> ze
     """
     limits = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
     try:
-        return _open_client(connect, zenoh_config, limits)
+        return _open_client(connect, zenoh_config, {**limits, **_send_buffers(send_buffer)})
     except zenoh.ZError as error:
         raise NetworkError(f"can't connect to {' '.join(connect)}: {_brief(error)}") from None
 
@@ -132,11 +140,14 @@ def _open_client(
         "connect/endpoints": list(connect),
         "connect/retry": RETRY,
         "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
-        "transport/link/tcp/so_sndbuf": SEND_BUFFER,
-        "transport/link/tls/so_sndbuf": SEND_BUFFER,
+        **_send_buffers(SEND_BUFFER),
         "transport/link/tx/queue/size/real_time": 1,  # batches
     }
     return zenoh.open(_config(zenoh_config, {**options, **limits}))
+
+
+def _send_buffers(size: int) -> dict[str, int]:
+    return {f"transport/link/{protocol}/so_sndbuf": size for protocol in ("tcp", "tls")}
 
 
 def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:

@@ -4,6 +4,7 @@
 import os
 
 from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.session import BURST_BUFFER
 from camera_node.service import stopped_by_signals
 from camera_node.terminal import say
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
@@ -36,7 +37,7 @@ def ros2(
     with (
         stopped_by_signals() as stop,
         server.receive_poses() as poses,
-        ServerConnection(ros or server.connect, None if ros else server.zenoh) as connection,
+        ServerConnection(ros or server.connect, None if ros else server.zenoh, BURST_BUFFER) as connection,
     ):
         if (session := connection.wait_unless(stop)) is None:
             return 0

@@ -21,6 +21,7 @@ from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.geometry.pose import Pose, rotation_from_vector
+from camera_node.logs import set_up_logging
 from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import MAX_ROUNDELS
 from camera_node.protocol.session import open_client
@@ -170,6 +171,7 @@ def main(name: str, connect: str, arena: str, epoch_ns: int, load: str) -> None:
         epoch_ns: Unix time of the load's time 0.
         load: the `Load` as JSON.
     """
+    set_up_logging()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     world = World(msgspec.json.decode(load, type=Load), epoch_ns)
     detector = SceneDetector()
