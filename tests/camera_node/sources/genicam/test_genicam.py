@@ -47,9 +47,11 @@ def error_us(frame: Frame) -> float:
 def running(fake_library: Path) -> Iterator[Source]:
     """A camera at 100 Hz that the tests of this module share, because each opening takes seconds."""
     camera = FakeCamera(fake_library, 1)
-    with opened(camera, fps=100.0, controls=("BinningVertical=1", "PixelFormat=Mono8")) as source:
-        yield source
-    camera.stop()
+    try:
+        with opened(camera, fps=100.0, controls=("BinningVertical=1", "PixelFormat=Mono8")) as source:
+            yield source
+    finally:
+        camera.stop()
 
 
 def test_stamps_are_those_of_the_camera(running: Source):
