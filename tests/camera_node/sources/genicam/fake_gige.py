@@ -57,7 +57,9 @@ class FakeCamera:
     def __init__(
         self, library: Path, number: int, lost: float = 0.0, scene: tuple[Path, str, int] | None = None
     ) -> None:
-        self.serial, self.address = f"FAKE{number}", f"127.0.0.{number}"
+        process = os.getpid()  # tests of other processes have cameras too, which all discoveries find
+        self.serial = f"F{process}N{number}"
+        self.address = f"127.{process // 250 % 250 + 1}.{process % 250 + 1}.{number}"
         self._environment = {
             **os.environ,
             "LD_PRELOAD": str(library),
