@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 
 from tests.waiting import wait_for
-from web.demo import USUAL, Demo, conclude
+from web.demo import Demo, conclude
 
 
 def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:
@@ -70,13 +70,12 @@ def test_a_taken_endpoint_is_one_line(scene: Path):
 
 
 def test_a_second_demo_finds_another_port(scene: Path, tmp_path: Path):
-    """Whether or not a program of this machine has the usual port, two servers listen on two ports."""
+    """Whether or not a program of this machine has the usual port, now or while the first starts, they differ."""
     folders = [tmp_path / name for name in ("first", "second")]
     for folder in folders:
         folder.mkdir()
     with Demo(scene, folders[0]) as first, Demo(scene, folders[1]) as second:
         assert first.endpoint != second.endpoint
-        assert second.endpoint != USUAL
 
 
 def test_a_demo_that_a_user_ends_does_not_fail():

@@ -10,6 +10,7 @@ differ from all other sides and from itself under rotation, as a flat robot must
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, product
 
 import numpy as np
@@ -27,26 +28,31 @@ SIDE_COS = math.cos(math.radians(30))  # between the normals of markers on one s
 
 def sides(body: Body) -> list[Index]:
     """The sets of markers that face one way: for each marker those within 30 degrees of it, each set once."""
+    if not body.normals:
+        return [np.arange(len(body.markers))]
     normals = body.unit_normals
     return [np.flatnonzero(row) for row in np.unique(normals @ normals.T > SIDE_COS, axis=0)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Markers:
-    """Some markers of a body: their numbers (M,), positions (M, 3) and normals (M, 3), body frame."""
+    """Some markers of a body: numbers (M,), positions (M, 3) and normals (M, 3), body frame; distances (M, M)."""
 
     numbers: Index
     points: Array
     normals: Array
+    distance: Array
 
     @classmethod
     def of(cls, body: Body, numbers: Index) -> "_Markers":
-        return cls(numbers, body.points[numbers], body.unit_normals[numbers])
+        points = body.points[numbers]
+        return cls(numbers, points, body.unit_normals[numbers], distances(points))
 
     def __len__(self) -> int:
         return len(self.numbers)
 
 
+@lru_cache(maxsize=4096)  # each body is compared with all others
 def _distinctive(body: Body) -> list[_Markers]:
     """The parts of a constellation that acquisition may see alone: its sides with three markers or more, or all."""
     large = [side for side in sides(body) if len(side) >= MIN_MARKERS]
@@ -74,7 +80,7 @@ def symmetry(body: Body) -> str | None:
             continue  # they are seen together
         if fault := _alike(*sorted((a, b), key=len)):
             return f"ambiguous: the side of markers {_list(a)} equals that of {_list(b)} by rotation: {fault}"
-    fault = _alike(every, every)
+    fault = None if len(parts[0]) == len(every) else _alike(every, every)
     return fault and f"symmetric under rotation: {fault}"
 
 
@@ -84,14 +90,14 @@ def _list(markers: _Markers) -> str:
 
 def _alike(small: _Markers, large: _Markers) -> str | None:
     """How the markers of `small` match some of `large`; for the same ones, in another order. None if they don't."""
-    D, E = distances(small.points), distances(large.points)
+    D, E = small.distance, large.distance
     orders = _labelings(D, E)
     if small is large:
         orders = orders[(orders != np.arange(len(D))).any(1)]
     worst = np.abs(D - E[orders[:, :, None], orders[:, None]])  # (labelings, M, M)
     for k in range(len(orders)):
         if _may_be_seen_as(small, large, orders[k]):
-            return _explain((small, D), (large, E), orders[k], worst[k])
+            return _explain(small, large, orders[k], worst[k])
     return None
 
 
@@ -116,20 +122,19 @@ def _labelings(D: Array, E: Array) -> Index:
     every = np.arange(len(E))
     orders = every[:, None]
     for m in range(1, len(D)):
-        fits = (np.abs(E[orders] - D[m, :m, None]) < DISTINCT_M).all(
-            1
-        )  # (labelings, N) of the first m markers
+        # (labelings, N) of the first m markers
+        fits = (np.abs(E[orders] - D[m, :m, None]) < DISTINCT_M).all(1)
         fits &= (orders[:, :, None] != every).all(1)
         row, added = np.nonzero(fits)
         orders = np.column_stack([orders[row], added])
     return orders
 
 
-def _explain(small: tuple[_Markers, Array], large: tuple[_Markers, Array], order: Index, worst: Array) -> str:
-    (markers, D), (others, E) = small, large
+def _explain(small: _Markers, large: _Markers, order: Index, worst: Array) -> str:
+    D, E = small.distance, large.distance
     i, j = np.unravel_index(np.argmax(worst), worst.shape)
     a, b = sorted((order[i], order[j]))
-    of, there = markers.numbers, others.numbers
+    of, there = small.numbers, large.numbers
     return (
         f"the distance between markers {of[i]} and {of[j]} ({D[i, j] * 1e3:.1f} mm) and that between {there[a]} and "
         f"{there[b]} ({E[a, b] * 1e3:.1f} mm) differ most, by only {worst[i, j] * 1e3:.1f} mm; move a marker until "

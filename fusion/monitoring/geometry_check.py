@@ -20,7 +20,8 @@ MISFIT_PX = 1.0  # RMS residual; a good calibration has 0.1 to 0.5
 MAX_PX = 3.0  # larger residuals count as this: a few frame sets with a wrong clock blame no robot
 MEMORY = 60  # frame sets of the running mean
 MIN_CAMERAS = 2  # that show the residual
-SAMPLE = 16  # detections of a frame set whose size is measured: a millisecond for any number of robots
+# Every eighth frame set, the sizes of so many detections are measured: a millisecond for any number of robots.
+SAMPLE_EVERY, SAMPLE = 8, 128
 MIN_MEASURED = 100  # detections of a robot
 MAX_SIZE_ERROR = 0.05  # of a declared diameter; thresholds and blur change apparent sizes by 1 to 3 %
 MAX_LOG_RATIO = 0.3  # larger ratios count as this: a partly covered disc decides nothing
@@ -81,10 +82,12 @@ class SizeCheck:
         self._reported: set[str] = set()
 
     def sample(self, n: int) -> Index:
-        """The rows, of n detections, to measure in this frame set; others in the next one."""
+        """The rows, of n detections, to measure in this frame set; others the next time."""
         self._turn += 1
+        if not n or self._turn % SAMPLE_EVERY:
+            return np.arange(0)
         step = -(-n // SAMPLE)
-        return np.arange(self._turn % step, n, step) if n else np.arange(0)
+        return np.arange(self._turn // SAMPLE_EVERY % step, n, step)
 
     def note(self, cameras: CameraArray, detections: DetectionTable, robot: Index, position: Array) -> None:
         """Measure the discs of detections (N,) of robots (N,), whose centres are at positions (N, 3), world."""

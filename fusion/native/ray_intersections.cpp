@@ -44,8 +44,8 @@ ROUNDEL_CLONES void measure_misses(const FrameRays& of_frame, const Vector& plan
     }
 }
 
-/// Two rays i and j that pass each other: their ranges s and t, the distance between them and its tolerance, and
-/// the squared sine of the angle between them.
+/// Two rays i and j that pass each other: their ranges s and t, the distance between them and its tolerance,
+/// and the squared sine of the angle between them.
 struct Passing {
     size_t i, j;
     double s, t, distance, reach, parallax;
@@ -56,7 +56,11 @@ template <class To>
 class FramePair {
   public:
     FramePair(const Rays& rays, const Viewpoint& a, const Viewpoint& b, double most, To& to)
-        : rays_(rays), baseline_(a.centre - b.centre), moved_(std::abs(a.moved - b.moved)), most_(most), to_(to) {}
+        : rays_(rays),
+          baseline_(a.centre - b.centre),
+          moved_(std::abs(a.moved - b.moved)),
+          most_(most),
+          to_(to) {}
 
     /// All rays of `of_a` with all of `of_b`. Most pairs pass each other too far away at any range.
     void intersect(const FrameRays& of_a, const FrameRays& of_b) {

@@ -31,7 +31,8 @@ struct Rays {
     double max_range(size_t ray) const;
 };
 
-/// Two rays of different cameras that pass each other: the miss in tolerances of both, and the range on the first one.
+/// Two rays of different cameras that pass each other: the miss in tolerances of both, and the range on the
+/// first one.
 struct RayPair {
     int64_t first, second;
     double miss, range;

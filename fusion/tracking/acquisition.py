@@ -41,6 +41,7 @@ MAX_PAIRS = 200_000
 # The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
 # defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
 MAX_OTHER_PAIRS = 20_000
+OTHERS_EVERY = 8  # frame sets from one search for other sizes to the next, while none is found
 CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
 MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
@@ -116,6 +117,7 @@ class Acquisition:
         self._turn = 0  # row of the first constellation to search for, if there are too many
         self._weak: dict[int, _Sighting] = {}  # by robot
         self._frame_sets = 0  # searched so far
+        self._has_others = False  # whether the last search for other sizes found markers
 
     def acquire(
         self,
@@ -221,8 +223,10 @@ class Acquisition:
         portion = Portion(limit, self._frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         markers = find_markers(self._cameras, detections, rows, diameters)
-        if self._leads and len(table.names):
-            markers += self._find_other_sizes(detections, rows, markers, diameters)
+        if self._leads and len(table.names) and (self._has_others or self._frame_sets % OTHERS_EVERY == 0):
+            others = self._find_other_sizes(detections, rows, markers, diameters)
+            self._has_others = len(others) > 0
+            markers += others
         return markers, crowded
 
     def _find_other_sizes(

@@ -183,7 +183,6 @@ class Tracker:
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         self.geometry.note(summary.mean_px2)
-        self._check_sizes(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(
@@ -192,6 +191,7 @@ class Tracker:
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
+        self._check_sizes(update.detections, update.assignments)
         update, found = self._acquire(update)
         table = self.table
         now = Snapshot(update.t_ns, table.states, table.tracked)
@@ -248,6 +248,8 @@ class Tracker:
     def _check_sizes(self, detections: DetectionTable, assignments: Assignments) -> None:
         """Compare some assigned detections with the declared diameters."""
         rows = self.sizes.sample(len(assignments))
+        if not len(rows):
+            return
         marker, seen = assignments.marker[rows], detections.select(assignments.detection[rows])
         owner = self.table.markers.robot[marker]
         arms = np.einsum(

@@ -42,6 +42,7 @@ def table(columns: "_core.FrameColumns") -> np.ndarray:
     return np.hstack([array.reshape(len(array), int(np.prod(array.shape[1:]))) for array in arrays])
 
 
+@pytest.mark.slow  # compiles the library twice
 @pytest.mark.skipif(
     not CPU.exists() or " avx2 " not in CPU.read_text(), reason="this machine has one variant only"
 )

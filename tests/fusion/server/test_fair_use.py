@@ -73,7 +73,7 @@ def test_a_camera_at_ten_times_the_rate_is_thinned_and_reported(tmp_path: Path):
         assert f"camera cam3: {ABOVE_QUOTA}" in server.log.read_text()
 
 
-@pytest.mark.parametrize("n", [4096, 600])
+@pytest.mark.parametrize("n", [4096, pytest.param(600, marks=pytest.mark.slow)])
 def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
     """Before: 1.1 s with 600 in two cameras; a frame with more than that was searched by none."""
     with arena(tmp_path, range(2)) as (server, observer):
@@ -88,7 +88,12 @@ def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
 
 @pytest.mark.parametrize(
     ("key", "payload"),
-    [("test/robots", ""), ("test/robots/set", "{}"), ("test/clock", ""), ("test/rig", "")],
+    [
+        ("test/robots/set", "{}"),
+        ("test/rig", ""),
+        pytest.param("test/robots", "", marks=pytest.mark.slow),
+        pytest.param("test/clock", "", marks=pytest.mark.slow),
+    ],
 )
 def test_a_client_that_queries_in_a_loop_does_not_delay_poses(tmp_path: Path, key: str, payload: str):
     with arena(tmp_path, range(4)) as (server, observer), ExitStack() as stack:

@@ -55,7 +55,7 @@ def test_a_robot_with_another_size_has_that_as_its_reason():
 @pytest.mark.parametrize(("factor", "is_found"), [(0.92, True), (1.0, False), (1.09, True)])
 def test_a_slightly_wrong_size_is_measured(factor: float, is_found: bool):
     """It is tracked, but ranges from single views are wrong: a print that was scaled to fit its page."""
-    tracker, results = tracked(ARENA, {"a": scaled(TRIANGLE, factor), "b": LARGE}, 40)
+    tracker, results = tracked(ARENA, {"a": scaled(TRIANGLE, factor), "b": LARGE}, 96)
     assert {pose.robot: pose.state for pose in results[-1].poses} == {"a": "tracked", "b": "tracked"}
     found = tracker.sizes.misfits()
     assert found == ({"a": pytest.approx(TRIANGLE.diameter_m, rel=0.02)} if is_found else {})
