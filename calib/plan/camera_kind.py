@@ -14,6 +14,8 @@ from camera_node.geometry.pose import Pose, look_at
 
 Vector = tuple[float, float, float]
 STAMP_SIGMA_S = 1e-4  # of a global shutter whose clock is synchronized over the network
+# Of a rolling shutter's readout time after a wand calibration: `python -m tests.benchmarks.rolling_shutter`.
+READOUT_SIGMA_S = 0.4e-3
 VERTICAL = 1e-4  # rad; an axis nearer to the vertical leaves the rotation about it undefined
 PINHOLE_FOV_DEG, FISHEYE_FOV_DEG = (1.0, 170.0), (1.0, 178.0)
 
@@ -114,13 +116,14 @@ class CameraKind(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def stamp_sigma_s(self) -> float:
         """Standard deviation of the capture time of one detection, seconds.
 
-        The rows of a rolling shutter are read during about the time of a frame, evenly: its standard deviation is that
-        of a uniform distribution.
+        The wand calibration finds the readout time of a rolling shutter. A detection's row is uniformly distributed
+        over the image, and so is the part of the readout's error that its time has.
         """
         if self.stamp_sigma_ms is not None:
             return 1e-3 * self.stamp_sigma_ms
         shutter = self.shutter or (find_camera(self.model).shutter if self.model else "global")
-        return STAMP_SIGMA_S if shutter == "global" else float(1 / self.rate / np.sqrt(12))
+        row_sigma_s = READOUT_SIGMA_S / np.sqrt(12) if shutter == "rolling" else 0.0
+        return float(np.hypot(STAMP_SIGMA_S, row_sigma_s))
 
     def placed(self, position_m: Vector | Array, look_at_m: Vector | Array) -> Camera:
         """The camera at a position, directed at a point; its pose counts as exact.
