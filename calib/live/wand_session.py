@@ -42,7 +42,7 @@ MIN_USED = 0.5  # of the image area that a camera shares with others
 MIN_GROWTH = 0.01  # of the used area, summed over cameras: less counts as none
 IDLE_S = 15.0  # without growth of the used area
 GONE_S = 15.0  # without a roundel that moves: the wand is gone
-PAUSE_S = 3.0  # without a roundel that moves: the user is told
+PAUSE_S = 3.0  # without a roundel that moves: the progress line reports it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,9 +25,8 @@ from fusion.protocol.messages import Markers
 SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
 STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position
 MIN_SEEN = 0.5  # share of the messages that contain a marker that counts
-MAX_SIZE_ERROR = (
-    0.1  # between the given diameter and the one that is seen; beyond 0.2 a robot is never acquired
-)
+# Between the given diameter and the one that is seen; beyond 0.2 a robot is never acquired.
+MAX_SIZE_ERROR = 0.1
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
 SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis

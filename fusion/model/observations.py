@@ -69,9 +69,8 @@ class DetectionTable:
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         axes = np.array([[c, -s], [s, c]]) * self.axes_px / 2  # half axes, pixels
         half = np.linalg.solve(self.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
-        dual = np.empty((len(self), 3, 3))
         m = np.column_stack([*self.xy, np.ones(len(self))])
-        dual[:] = m[:, :, None] * m[:, None]
+        dual = m[:, :, None] * m[:, None]
         dual[:, :2, :2] -= half @ half.transpose(0, 2, 1)
         return -np.asarray(np.linalg.inv(dual), float)
 

@@ -23,9 +23,8 @@ APART_M = 0.6  # between the starts of identical robots: several sigma of manual
 # These limit the comparison of labelings at load, and the live acquisition, to milliseconds.
 MAX_MARKERS, MAX_SIDE_MARKERS = 28, 7
 BACK_COS = 0.5  # between normals, below which discs are on different faces and can't overlap
-BACK_SHARE = (
-    0.6  # of the diameter, between discs on different faces: acquisition takes closer ones for one marker
-)
+# Of the diameter, between discs on different faces: acquisition takes closer ones for one marker.
+BACK_SHARE = 0.6
 MAX_ROBOTS, MAX_ALL_MARKERS = 256, 1024  # of one arena: more than one process follows, or two
 MANOEUVRE_S = 0.1  # duration of an acceleration; converts accelerations to densities of white noise
 

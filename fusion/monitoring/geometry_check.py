@@ -95,9 +95,8 @@ class SizeCheck:
         if not len(known):
             return
         seen, robot = detections.select(known), robot[known]
-        unit_m = np.linalg.norm(decompose(seen.conics(), 1.0)[0], axis=2).mean(
-            1
-        )  # range of a disc of radius 1
+        # Range of a disc of radius 1.
+        unit_m = np.linalg.norm(decompose(seen.conics(), 1.0)[0], axis=2).mean(1)
         range_m = np.linalg.norm(position[known] - cameras.centres[seen.camera], axis=1)
         log_ratio = np.log(2 * range_m / unit_m / self._diameters[robot])
         for k, value in zip(robot.tolist(), log_ratio.tolist(), strict=True):

@@ -23,9 +23,8 @@ from fusion.tracking.estimator import Estimator
 
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
-CHANGED = np.log(
-    0.02
-)  # of a robot or its view in a camera from one frame to the next: hidden, or visible again
+# Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
+CHANGED = np.log(0.02)
 LOG_2PI = np.log(2 * np.pi)
 
 
