@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from tests.benchmarks.plan import measure_coverage, measure_precision
+from tests.benchmarks.plan.coverage import measure_coverage
+from tests.benchmarks.plan.precision import measure_precision
 
 
 @pytest.mark.slow
