@@ -41,15 +41,14 @@ class SmallestSizes:
 
 
 HALF, NEARLY_ALL = 0.5, 0.99  # the measured shares
-# At 70 degrees in clutter, 97 % of 36 to 48 px are found, and 99 % of no size up to there: the model takes 50 px.
 SIZES: dict[Ground, dict[float, SmallestSizes]] = {
     "cluttered": {
-        HALF: SmallestSizes((7.4, 8.1, 10.8, 15.8, 21.3), (1.0, 1.08, 1.24, 1.4, 1.67, 1.98, 2.45)),
-        NEARLY_ALL: SmallestSizes((10.6, 11.1, 15.6, 24.3, 37.6), (1.0, 1.05, 1.16, 1.34, 1.55, 2.18, 4.5)),
+        HALF: SmallestSizes((7.29, 8.28, 11.0, 15.8, 21.3), (1.0, 1.084, 1.217, 1.376, 1.647, 1.929, 2.404)),
+        NEARLY_ALL: SmallestSizes((10.1, 11.1, 16.4, 24.3, 37.6), (1.0, 1.1, 1.22, 1.41, 1.63, 1.89, 3.92)),
     },
     "even": {
-        HALF: SmallestSizes((7.1, 7.4, 9.5, 13.2, 16.9), (1.0, 1.08, 1.2, 1.33, 1.59, 1.93, 2.48)),
-        NEARLY_ALL: SmallestSizes((9.0, 9.0, 11.1, 14.9, 19.0), (1.0, 1.12, 1.12, 1.5, 1.95, 2.05, 3.44)),
+        HALF: SmallestSizes((7.09, 7.43, 9.77, 13.5, 17.3), (1.0, 1.089, 1.207, 1.329, 1.604, 1.954, 2.422)),
+        NEARLY_ALL: SmallestSizes((9.15, 9.6, 11.1, 14.9, 19.0), (1.0, 1.05, 1.1, 1.48, 1.63, 2.08, 3.23)),
     },
 }
 # A roundel that moves by more than this share of its diameter during the exposure counts as moving. Of moving ones,

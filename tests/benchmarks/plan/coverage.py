@@ -21,6 +21,7 @@ from tests.benchmarks.plan.arena import DIAMETER_M, HALF_M, HEIGHTS_M, image_of,
 REACH_M = 0.15  # half length of paths through edges of the image
 FAR_M = 0.75  # half length of paths through limits of size and slant
 STEPS = 31  # of a path
+PERIOD_S = 1000.0  # of the motion along a path: the roundels of the prediction are at rest, so these must not blur
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def follow(arena: PlannedArena, name: str, paths: Sequence[EdgePath]) -> Iterato
         scene = write_scene(Path(folder), {name: camera}, motions, sensor.pattern.d_o)
         renderer = Renderer(scene, name)
         for frame, s in enumerate(track(steps, f"edges of {name}")):
-            t_s = 1.0 + float(np.arcsin(s / (2 * reach_m))) / (2 * np.pi)
+            t_s = PERIOD_S * (1.0 + float(np.arcsin(s / (2 * reach_m))) / (2 * np.pi))
             roundels = Detector().detect(renderer.render(t_s, frame))
             places = np.array([path.middle + s * path.outward for path in paths])
             uv, radius = image_of(camera, places, sensor.pattern.d_o)
@@ -156,12 +157,12 @@ def measure_cut(edges: int, seed: int = 3) -> list[tuple[float, float, int]]:
 
 
 def _line(path: EdgePath) -> dict[str, Any]:
-    """A motion through the edge: middle + 2 reach sin(2 pi t) outward."""
+    """A motion through the edge: middle + 2 reach sin(2 pi t / period) outward."""
     return {
         f"{axis}_m": {
             "mean": path.middle[k],
             "amplitude": 2 * path.reach_m * path.outward[k],
-            "period_s": 1.0,
+            "period_s": PERIOD_S,
         }
         for k, axis in enumerate("xyz")
     }
