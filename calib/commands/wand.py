@@ -19,7 +19,8 @@ from calib.errors import CalibrationError
 from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
 from calib.live.camera_sizes import running_camera_sizes
 from calib.live.collect import CollectedFrames
-from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
+from calib.live.trials import MAX_SECONDS, WandSession
+from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
