@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Trials of a wand session: calibrations from part of the frames, in a process of their own because GTSAM holds the GIL.
+"""Trials of a wand session: calibrations from part of the frames, in another process because GTSAM holds the GIL.
 
 Covariances are inversely proportional to the number of frames, which predicts the result of all frames.
 """

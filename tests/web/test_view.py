@@ -22,7 +22,6 @@ from tests.web.browser import browsing, loopback
 from web.errors import WebError
 from web.feed import Feed
 from web.messages import DemoProgress, progress_key
-from web.scene.robots import cylinder_mesh
 from web.scene.viewpoint import FIELD_OF_VIEW, MARGIN, USUAL_ROOM, default_viewpoint
 from web.tabs.cameras import decode_jpeg
 from web.view import View, check_port
@@ -223,14 +222,6 @@ def test_the_default_viewpoint_shows_the_whole_rig(rig: Rig | None, aspect: floa
     )
     seen = np.abs(eye.project_world(np.vstack([centres, centres * [1, 1, 0]]))) / (aspect, 1)
     np.testing.assert_allclose(seen.max(), MARGIN, atol=0.02)
-
-
-def test_the_mesh_of_a_robot_is_closed():
-    """Each edge belongs to two faces, once in each direction."""
-    _, faces = cylinder_mesh(0.1, 0.03)
-    edges = [tuple(edge) for face in faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
-    assert sorted(edges) == sorted((b, a) for a, b in edges)
-    assert len(set(edges)) == len(edges)
 
 
 @pytest.mark.parametrize("data", [None, b"", b"not an image", bytes(100)])
