@@ -83,7 +83,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
         for name in ARENA.truth.cameras:
             page.get_by_text(name).first.wait_for(timeout=20_000)
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
-        assert "wave the wand" in panel.next_action()
+        assert "wave where" in panel.next_action()
         page.get_by_role("button", name="End wand session").click()
         page.get_by_text("accept or discard").wait_for(timeout=CALIBRATION_MS)
         assert not load_rig(files.rig).placed(), "nothing changes before the user accepts"

@@ -72,7 +72,7 @@ class WandSessionPanel:
     def next_action(self) -> str:
         """What the operator should do in the session, or with its result; empty if there is none."""
         if self._session.is_running:
-            return "a wand session runs: wave the wand where the table in Calibrate says"
+            return "a wand session runs: wave where the table in Calibrate says"
         return "a new calibration is ready: decide in Calibrate whether to use it" if self._candidate else ""
 
     def update(self, state: ArenaState) -> None:
