@@ -57,6 +57,7 @@ def add_live_page(
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
+            header.calibrating = panel.next_action
             closing.callback(panel.close)
             view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistoryPanel(gui, subscription), is_live=True)
@@ -71,7 +72,7 @@ def add_live_page(
         controls = ReplayControls(gui)
         shown = ShownRecording(view, header, controls)
         closing.callback(shown.show, None)
-        view.add(RecordingList(gui, folder, shown.show), is_live=True)
+        view.add(RecordingList(gui, folder, shown.show, recorder), is_live=True)
         view.add(controls)
     with header.tabs["Status"]:
         view.add(StatusTab(gui, endpoint, view.feed.keys.arena), is_live=True)

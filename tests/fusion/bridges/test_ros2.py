@@ -25,7 +25,8 @@ from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, 
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.messages import RobotPose
-from tests.fusion.bridges.pose_server import publish_poses
+from tests.conftest import free_port
+from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
 
 DEADLINE_S = 60.0
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -211,6 +212,28 @@ def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, ow
     assert {p[8] for p in parts[1:]} == {"::,10:,:,:,,"}
 
 
+def test_topics_continue_after_a_restart_of_the_server():
+    """The server's router is that of ROS, too, so that publishers and tokens are declared in it again."""
+    received, tokens, endpoint = queue.Queue(), queue.Queue(), f"tcp/127.0.0.1:{free_port()}"
+
+    def seconds(sample: zenoh.Sample) -> float:
+        stamp = read(sample.payload.to_bytes(), "nav_msgs/msg/Odometry").header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+
+    with PoseServer(endpoint) as server, ros_peer(endpoint) as ros, bridging(endpoint):
+        topics = ros.declare_subscriber("0/rover/odometry/**", received.put)
+        received.get(timeout=DEADLINE_S)
+        since_s = restart(server) * 1e-9
+        while seconds(received.get(timeout=DEADLINE_S)) <= since_s:
+            pass
+        graph = ros.liveliness().declare_subscriber(
+            "@ros2_lv/0/**/%rover%odometry/**", tokens.put, history=True
+        )
+        assert "/MP/" in str(tokens.get(timeout=DEADLINE_S).key_expr)
+        graph.undeclare()
+        topics.undeclare()
+
+
 def test_robots_with_equal_ros_names_are_counted():
     assert [ros_name(n) for n in ("rover", "rover-2", "2nd", "öre")] == [
         "rover",
@@ -222,6 +245,23 @@ def test_robots_with_equal_ros_names_are_counted():
         node = Ros2Node(session)
         node.publish([draw_pose(name) for name in ("rover-2", "rover_2", "rover_2")], "world")
         assert node.faults == {"poses of 'rover_2', which has the same ROS name as 'rover-2'": 2}
+
+
+def test_the_last_message_of_each_burst_is_express():
+    """Zenoh waits for more messages of a burst otherwise: 5 ms with 50 robots, `python -m tests.benchmarks.bridges`."""
+    received, names = queue.Queue(), ["a", "b", "c"]
+    with routing() as (session, _):
+        subscriber = session.declare_subscriber("0/**", received.put)
+        Ros2Node(session).publish([draw_pose(name) for name in names], "world")
+        samples = [received.get(timeout=DEADLINE_S) for _ in range(2 * len(names) + 1)]
+        subscriber.undeclare()
+    topics = [f"{name}/{kind}" for kind in ("odometry", "pose") for name in names] + ["tf"]
+    assert ["/".join(str(sample.key_expr).split("/")[1:-2]) for sample in samples] == topics
+    assert [topic for topic, sample in zip(topics, samples, strict=True) if sample.express] == [
+        "c/odometry",
+        "c/pose",
+        "tf",
+    ]
 
 
 @pytest.mark.parametrize("domain", ["-1", "233", "lab"])
