@@ -39,6 +39,7 @@ constexpr double kSlack = 1.3;     // upper bound: tolerance of a median of few 
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kMaxPrintError = 3;                 // standard deviations
+constexpr double kMinPlateauMajor = 48;              // pixels: smaller ones gain less than a tone curve costs
 constexpr int kMinPlateau = 16;                      // pixels
 constexpr double kPlateauVariance = 2;               // factor from that of the residuals at the edges
 constexpr double kMaxPlateauError = 3;               // standard deviations
@@ -236,7 +237,8 @@ bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& pla
 /// Conditions the estimate on the levels far from the edges. They are most of the pixels of a large roundel,
 /// and its size depends on the level half way between them.
 void PhotometricFitter::use_plateaus() {
-    if (occlusion_.any() || clipped_) return;
+    const double major = p_[kAxx] + p_[kAyy] + std::hypot(p_[kAxx] - p_[kAyy], 2 * p_[kAxy]);
+    if (occlusion_.any() || clipped_ || major < kMinPlateauMajor) return;
     const Plateaus plateaus =
         read_plateaus(image_, p_, pixels_.origin_x, pixels_.origin_y, kSeparateBlurs * p_[kBlur]);
     Parameters g{};
