@@ -113,6 +113,8 @@ class Latencies:
         """Those of the next seconds."""
         start = len(self._values)
         threading.Event().wait(seconds)
+        if len(self._values) == start:
+            sys.exit(f"no poses in {seconds:g} s: this machine is too slow for this rate; give a lower --hz")
         return self._values[start:]
 
 
