@@ -150,13 +150,14 @@ Displacement SectorSums::displacement(double noise) const {
     return {std::sqrt(sum / n), std::sqrt(chance / n)};
 }
 
-EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
+EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields)
     : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
     EdgePixels pixels;
     pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
+    if (fields.any()) fields.remove_from(pixels);
     add_misfit(pixels, Model(local), SectorIndex(local), edges_);
 }
 

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "fit/edge_pixels.hpp"
+#include "fit/fields.hpp"
 #include "numeric/image.hpp"
 
 namespace roundel {
@@ -57,10 +58,10 @@ class SectorSums {
     std::array<double, kSectors> rr_{}, weight_{}, squared_{}, regression_{};
 };
 
-/// The residuals of the model `p` (in the image's frame) on both edges of the ring.
+/// The residuals of the model `p` and its fields (both in the image's frame) on both edges of the ring.
 class EdgeMisfit {
   public:
-    EdgeMisfit(const ImageView& image, const Parameters& p);
+    EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields);
     /// The sectors in which the residuals of an edge exceed `noise` and `slack`, both in grey levels RMS, and
     /// adjacent ones that the blurred edge of the occluding object can reach.
     OcclusionMask occlusion(double noise, double slack) const;

@@ -91,16 +91,25 @@ class Ray {
     int t_ = 0;
 };
 
-/// Grey levels at kRays points on the ellipse scaled by `scale`; negative outside of the image.
-inline std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
-    std::array<float, kRays> levels;
+/// kRays points on the ellipse scaled by `scale`, and their grey levels; negative outside of the image.
+struct LevelAt {
+    float x, y, level;
+};
+inline std::array<LevelAt, kRays> levels_at(const ImageView& image, const Ellipse& e, double scale) {
+    std::array<LevelAt, kRays> levels;
     const double c = std::cos(e.angle), s = std::sin(e.angle);
     for (int k = 0; k < kRays; ++k) {
         const Direction d = kDirections[size_t(k)];
         const double along = scale * e.major / 2 * double(d.x), across = scale * e.minor / 2 * double(d.y);
-        levels[size_t(k)] =
-            sample(image, float(e.x + c * along - s * across), float(e.y + s * along + c * across));
+        const auto x = float(e.x + c * along - s * across), y = float(e.y + s * along + c * across);
+        levels[size_t(k)] = {x, y, sample(image, x, y)};
     }
+    return levels;
+}
+inline std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
+    std::array<float, kRays> levels;
+    const auto at = levels_at(image, e, scale);
+    std::transform(at.begin(), at.end(), levels.begin(), [](const LevelAt& point) { return point.level; });
     return levels;
 }
 

@@ -14,9 +14,10 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
     LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
-        for (const float value : levels_on(image, e, scale)) {
+        for (const auto [x, y, value] : levels_at(image, e, scale)) {
             if (value < 0) continue;
-            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
+            const double level = fit.fields.even_level(double(x), double(y), double(value));
+            const double share = (level - fit.dark) / contrast;  // 0 is ink, 1 is paper
             ++samples.total, samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
         }
     };

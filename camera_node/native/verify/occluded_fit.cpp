@@ -138,7 +138,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     RoundelFit fit = input.full_fit;
     std::optional<EdgeMisfit> misfit = input.misfit;
     for (const double slack : kSlacks) {
-        if (!misfit) misfit.emplace(image, fit.p);
+        if (!misfit) misfit.emplace(image, fit.p, fit.fields);
         const OcclusionMask mask = misfit->occlusion(input.noise, slack * fit.contrast());
         if (masks_too_much(mask)) return std::nullopt;
         if (mask == guess.occlusion) continue;
