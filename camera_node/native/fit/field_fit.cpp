@@ -19,17 +19,13 @@ constexpr double kMeanBend = 2, kOtherBend = 0.3;  // of the bend that shows: it
 
 }  // namespace
 
-void PhotometricFitter::test_fields() {
-    if (occlusion_.any()) return;
+bool PhotometricFitter::shows_bend() {
+    if (occlusion_.any()) return false;
     Parameters step = p_;
     for (int i = 0; i < kCount; ++i) step[i] -= linearized_at_[i];
     scores_ = score_fields(equations_, pixels_, FieldFrame(p_), step, scale_);
     scores_.bend /= square(noise_), scores_.light /= square(noise_);
-}
-
-bool PhotometricFitter::shows_fields() const {
-    if (allowed_ == AllowedFields::kNone) return false;
-    return scores_.bend > kUnlikelyField || (allowed_ == AllowedFields::kAll && scores_.light > kUnlikelyField);
+    return allowed_ == AllowedFields::kBend && scores_.bend > kUnlikelyField;
 }
 
 /// The prior information on each field.
@@ -89,7 +85,8 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
     }
     const Cholesky<kFields> factor(S);
     if (!factor.positive()) return false;
-    const Vector<kFields> change = factor.solve(right);
+    Vector<kFields> change = factor.solve(right);
+    if (allowed_ != AllowedFields::kAll) std::fill_n(change.begin(), size_t(kBend), 0.0);  // the prior forbids it
     for (size_t a = 0; a < kFields; ++a) {
         by_field_[a] = factor_->solve_tail<kCount>(half[a]);
         for (size_t i = 0; i < kCount; ++i) step[i] -= by_field_[a][i] * change[a];

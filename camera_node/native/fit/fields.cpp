@@ -49,6 +49,10 @@ bool Fields::any() const {
     return std::any_of(of.begin(), of.end(), [](double coefficient) { return coefficient != 0; });
 }
 
+bool Fields::has_light() const {
+    return std::any_of(of.begin(), of.begin() + kBend, [](double coefficient) { return coefficient != 0; });
+}
+
 double Fields::bend() const { return std::hypot(of[kBend], of[kBend + 1]); }
 
 double Fields::even_level(double x, double y, double level) const {

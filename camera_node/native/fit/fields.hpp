@@ -64,6 +64,7 @@ struct Fields {
     Vector<kFields> of{};
 
     bool any() const;
+    bool has_light() const;
     /// The bend, as the displacement that it makes at the outer edge: its share with three periods, minor
     /// half axes. The mean curvature, which the picture does not show, makes twice as much.
     double bend() const;

@@ -200,9 +200,12 @@ RoundelFit PhotometricFitter::fit() const {
 
 std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess) {
     PhotometricFitter fitter(image, guess);
-    if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
-    fitter.test_fields();
-    if (fitter.shows_fields() && !fitter.fit_fields()) return std::nullopt;
+    if (guess.fields == AllowedFields::kAll) {
+        if (!fitter.fit_fields()) return std::nullopt;
+    } else {
+        if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
+        if (fitter.shows_bend() && !fitter.fit_fields()) return std::nullopt;
+    }
     if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
     if (guess.shading_sigma > 0 && !fitter.knows_light()) fitter.allow_shading();
     return fitter.fit();

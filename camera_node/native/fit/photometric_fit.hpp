@@ -69,6 +69,7 @@ struct RoundelFit {
     Shading shading{};
     bool clipped = false;  // the paper is brighter than the camera can show
     bool uneven = false;   // the residuals show light that changes by more than the fit contains
+    double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
     Fields fields{};       // that the fit contains, in the image's frame
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.

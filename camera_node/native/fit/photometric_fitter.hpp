@@ -34,10 +34,9 @@ class PhotometricFitter : GaussNewton<kCount> {
     RoundelFit fit() const;
 
     // field_fit.cpp
-    /// Tests the residuals for uneven light and for bent paper.
-    void test_fields();
-    /// Whether the residuals show a disturbance that the guess allows.
-    bool shows_fields() const;
+    /// Tests the residuals for uneven light and for bent paper; whether the guess allows the latter and the
+    /// residuals show it.
+    bool shows_bend();
     /// Fits the fields with the parameters; false if that does not converge.
     bool fit_fields();
     /// Includes the two unknowns of a linear shading in the pose, after convergence.

@@ -34,6 +34,7 @@ constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped
 // Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
+constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
 constexpr double kMaxWrong = 0.2;  // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -137,6 +138,7 @@ TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceCo
     TestedFit tested{fit, std::nullopt, true, false};
     if (!is_explained_by_noise(fit, context.noise)) tested.misfit.emplace(image, fit.p, fit.fields);
     const auto& misfit = tested.misfit;
+    if (misfit) tested.fit.correlation = misfit->correlation(fit.noise, {});
     tested.elliptic = !misfit || has_elliptic_edges(*misfit, fit, context.noise);
     tested.accepted = tested.elliptic && passes(image, fit, context, {kMisfit, kMaxGrowth});
     tested.fit.unoccluded = tested.accepted &&
@@ -151,6 +153,8 @@ std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, 
     guess.outer = fit.outer, guess.model = fit.p, guess.noise = fit.noise, guess.fields = AllowedFields::kAll;
     const auto even = fit_photometric(image, guess);
     if (!even) return std::nullopt;
+    // Residuals that processing leaves around all of the ring remain.
+    if (!fit.uneven && even->edge_residual > kEvenResidual * fit.edge_residual) return std::nullopt;
     const TestedFit tested = test(image, *even, context);
     return tested.fit.unoccluded ? std::optional(tested) : std::nullopt;
 }
@@ -196,13 +200,19 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     const auto first = fit_photometric(image, guess);
     if (!first) return std::nullopt;
     TestedFit tested = test(image, *first, context);
-    if (first->uneven && is_within_limits(*first, context.limits))
-        if (const auto even = fit_uneven(image, guess, *first, context)) tested = *even;
+    // Before the camera is known, its tone curve and its processing look like uneven light.
+    if (context.edge_noise > 0 && (first->uneven || !tested.fit.unoccluded) &&
+        is_within_limits(*first, context.limits))
+        if (const auto even = fit_uneven(image, guess, *first, context);
+            even && (known || tested.accepted || is_certain_roundel(image, even->fit, guess, context.noise)))
+            tested = *even;
     auto& [fit, misfit, elliptic, accepted] = tested;
+    if (fit.fields.has_light())
+        fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));
     claim_misfit(fit, context.noise);
     if (fit.unoccluded || guess.model) return fit.unoccluded ? std::optional(fit) : std::nullopt;
     const double at_edges = std::max(context.noise, context.edge_noise);
-    const auto rest = fit_occluded(image, {guess, fit, misfit, at_edges, known || accepted});
+    const auto rest = fit_occluded(image, {guess, fit, misfit, at_edges, context.correlation, known || accepted});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
