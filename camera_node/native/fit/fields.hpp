@@ -19,6 +19,7 @@ struct FieldFrame {
     double x = 0, y = 0;          // of the disc's centre
     double minor = 1, major = 1;  // half axes
     double cos = 1, sin = 0;      // direction of the minor axis
+    double reach = 1;             // of the card, up to which only its own light shows, outer radii
 
     FieldFrame() = default;
     explicit FieldFrame(const Parameters& p);
@@ -38,7 +39,8 @@ class FieldPlane {
           yx_(float(-frame.sin / frame.major)),
           yy_(float(frame.cos / frame.major)),
           per_minor_(float(1 / square(frame.minor))),
-          per_major_(float(1 / square(frame.major))) {}
+          per_major_(float(1 / square(frame.major))),
+          reach_(float(square(frame.reach))) {}
     /// Replaces pixels by coordinates in the plane.
     ROUNDEL_INLINE void map(Lanes& x, Lanes& y) const {
         const Lanes dx = x - x_, dy = y - y_;
@@ -48,6 +50,8 @@ class FieldPlane {
     ROUNDEL_INLINE Lanes stretch(const Lanes& X, const Lanes& Y) const {
         return inverse_sqrt(per_minor_ * X * X + per_major_ * Y * Y + 1e-12f);
     }
+    /// Whether the light of the ground beyond the card does not show; -1 where it is true.
+    ROUNDEL_INLINE Bits is_card(const Lanes& squared) const { return squared < reach_; }
     ROUNDEL_INLINE static void functions_of_light(const Lanes& X, const Lanes& Y,
                                                   Lanes (&f)[kLightFields]) {
         const Lanes xx = X * X, yy = Y * Y;
@@ -55,7 +59,7 @@ class FieldPlane {
     }
 
   private:
-    float x_, y_, xx_, xy_, yx_, yy_, per_minor_, per_major_;
+    float x_, y_, xx_, xy_, yx_, yy_, per_minor_, per_major_, reach_;
 };
 
 /// The fields of a roundel. `frame` is in the image's frame.
