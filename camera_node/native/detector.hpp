@@ -76,7 +76,7 @@ class Detector {
     void fit_moving_streaks(FrameState& frame) const;
     void update_theta(const FrameState& frame);
     void mark_searched(const FrameState& frame);
-    bool explores();
+    bool explore();
     void learn_prints(const FrameState& frame);
     void use_prints();
     void learn_response(const FrameState& frame);
@@ -84,15 +84,18 @@ class Detector {
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const {
-        return {frame.limits, frame.noise, response_.edge_noise(), response_.shading_sigma(),
-                response_.curvature_sigma(), response_.correlation()};
+        return {frame.limits,
+                frame.noise,
+                response_.edge_noise(),
+                response_.shading_sigma(),
+                response_.curvature_sigma(),
+                response_.correlation()};
     }
 
     RoundelLimits limits_, any_limits_;
     std::optional<PrintRatios> print_ratios_;  // if they were not given
     double search_share_;
     ChordSearch chords_;
-    std::optional<ChordSearch> any_chords_;  // for any print
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
     CameraResponse response_;

@@ -68,12 +68,10 @@ ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels a
                 for (int k = 0; k < count; ++k) sum_of(a) += weighted[a][k] * column[k];
         };
         for (const int i : kBy<edge>)
-            multiply(chunks->by[i], [&](int a) __attribute__((always_inline)) -> Lanes& {
-                return sums.by[a][i];
-            });
-        multiply(chunks->residual, [&](int a) __attribute__((always_inline)) -> Lanes& {
-            return sums.residual[a];
-        });
+            multiply(chunks->by[i],
+                     [&](int a) __attribute__((always_inline)) -> Lanes& { return sums.by[a][i]; });
+        multiply(chunks->residual,
+                 [&](int a) __attribute__((always_inline)) -> Lanes& { return sums.residual[a]; });
     }
 }
 

@@ -63,8 +63,8 @@ bool PhotometricFitter::fit_fields() {
     return true;
 }
 
-/// With C the products of the fields' columns with those of the parameters, D their own, e their residuals and
-/// L their prior, eliminates the parameters:
+/// With C the products of the fields' columns with those of the parameters, D their own, e their residuals
+/// and L their prior, eliminates the parameters:
 ///   S = D + L - C^T H^-1 C,  fields <- fields + S^-1 (e - C^T step - L fields),
 /// and the parameters' step decreases by H^-1 C times that change.
 bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& moved) {
@@ -86,7 +86,8 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
     const Cholesky<kFields> factor(S);
     if (!factor.positive()) return false;
     Vector<kFields> change = factor.solve(right);
-    if (allowed_ != AllowedFields::kAll) std::fill_n(change.begin(), size_t(kBend), 0.0);  // the prior forbids it
+    if (allowed_ != AllowedFields::kAll)
+        std::fill_n(change.begin(), size_t(kBend), 0.0);  // the prior forbids it
     for (size_t a = 0; a < kFields; ++a) {
         by_field_[a] = factor_->solve_tail<kCount>(half[a]);
         for (size_t i = 0; i < kCount; ++i) step[i] -= by_field_[a][i] * change[a];
@@ -113,14 +114,12 @@ void PhotometricFitter::add_fields(PoseCovariance& inverse) const {
     const double w[] = {fields_.frame.cos, fields_.frame.sin};
     for (size_t i = 0; i < 2; ++i)
         for (size_t j = 0; j < 2; ++j)
-            inverse[kGx - kX + i][kGx - kX + j] +=
-                square(mean) * w[i] * w[j] + (i == j ? square(other) : 0);
+            inverse[kGx - kX + i][kGx - kX + j] += square(mean) * w[i] * w[j] + (i == j ? square(other) : 0);
     // The mean height moves the disc towards the camera.
     const double height = mean / std::max(kLeastTilt, fields_.frame.tilt()) * fields_.frame.major;
     const Parameter shape[] = {kAxx, kAxy, kAyy};
     for (const int i : shape)
-        for (const int j : shape)
-            inverse[i - kX][j - kX] += p_[i] * p_[j] * square(height / kShortestFocal);
+        for (const int j : shape) inverse[i - kX][j - kX] += p_[i] * p_[j] * square(height / kShortestFocal);
 }
 
 /// Includes the two unknowns of a linear shading in the pose, after convergence: with C the products of their

@@ -52,8 +52,7 @@ class FieldPlane {
     }
     /// Whether the light of the ground beyond the card does not show; -1 where it is true.
     ROUNDEL_INLINE Bits is_card(const Lanes& squared) const { return squared < reach_; }
-    ROUNDEL_INLINE static void functions_of_light(const Lanes& X, const Lanes& Y,
-                                                  Lanes (&f)[kLightFields]) {
+    ROUNDEL_INLINE static void functions_of_light(const Lanes& X, const Lanes& Y, Lanes (&f)[kLightFields]) {
         const Lanes xx = X * X, yy = Y * Y;
         f[0] = X, f[1] = Y, f[2] = xx - yy, f[3] = 2.0f * X * Y, f[4] = xx + yy;
     }

@@ -11,7 +11,7 @@ namespace roundel {
 
 /// Tukey's biweight is (1 - (r / c)^2)^2 for |r| < c = 6 scales and 0 beyond.
 constexpr float kTukey = 6;
-constexpr int kLevels = 3;     // columns of a single edge before those of its ellipse
+constexpr int kLevels = 3;  // columns of a single edge before those of its ellipse
 
 /// The parameters of a part's gradient: all, or those of a single edge, with its ellipse last.
 template <Edge edge>

@@ -13,12 +13,13 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2;       // half width of the band around an edge, pixels
-constexpr int kPixels = 1500;     // approximate number of pixels used
-constexpr double kChance = 4;     // standard deviations
-constexpr double kReach = 2;      // blur of an occluding object's edge, pixels
-constexpr int kAround = 2;        // sectors on either side that a mean includes
-constexpr double kAbsorbed = 2;   // twelve means over a sixth of the turn have about six degrees of freedom left
+constexpr double kBand = 2;    // half width of the band around an edge, pixels
+constexpr int kPixels = 1500;  // approximate number of pixels used
+constexpr double kChance = 4;  // standard deviations
+constexpr double kReach = 2;   // blur of an occluding object's edge, pixels
+constexpr int kAround = 2;     // sectors on either side that a mean includes
+constexpr double kAbsorbed =
+    2;  // twelve means over a sixth of the turn have about six degrees of freedom left
 constexpr double kMinSeen = 0.2;  // of the information in a mean if the whole edge is visible
 
 /// The direction of (x, y) in radians from -pi to pi, within 4e-4: a polynomial in the tangent or its

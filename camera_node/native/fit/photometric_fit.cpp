@@ -113,8 +113,8 @@ bool PhotometricFitter::iterate(const EdgePixels& pixels, int steps_to_go) {
         const double seen = edge_scale();
         if (resumed_ && coarse && seen < kSlackScale * scale_) return true;
         if (resumed_ && (k == kMaxResumedSteps || seen > kMaxResumedMisfit * contrast())) return false;
-        const double used =
-            coarse ? std::min(scale_, kStrictScale * seen) : std::clamp(scale_, kStrictScale * seen, kSlackScale * seen);
+        const double used = coarse ? std::min(scale_, kStrictScale * seen)
+                                   : std::clamp(scale_, kStrictScale * seen, kSlackScale * seen);
         if (!solve(used)) return false;
         const double left = square(advance(used)) / p_[kBlur];
         if (!is_sane(kFitLimits)) return false;

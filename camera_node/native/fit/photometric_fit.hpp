@@ -67,10 +67,10 @@ struct RoundelFit {
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
     Shading shading{};
-    bool clipped = false;  // the paper is brighter than the camera can show
-    bool uneven = false;   // the residuals show light that changes by more than the fit contains
+    bool clipped = false;    // the paper is brighter than the camera can show
+    bool uneven = false;     // the residuals show light that changes by more than the fit contains
     double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
-    Fields fields{};       // that the fit contains, in the image's frame
+    Fields fields{};         // that the fit contains, in the image's frame
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {

@@ -89,8 +89,8 @@ class PhotometricFitter : GaussNewton<kCount> {
     AllowedFields allowed_;
     FieldScores scores_{};
     bool has_fields_ = false;
-    Fields fields_;                              // in the image's frame
-    std::array<Parameters, kFields> by_field_{};  // the effect of each field's error on the estimate
+    Fields fields_;                                     // in the image's frame
+    std::array<Parameters, kFields> by_field_{};        // the effect of each field's error on the estimate
     std::array<Vector<kFields>, kFields> field_cov_{};  // in units of the noise
 };
 

@@ -35,7 +35,7 @@ constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
-constexpr double kMaxWrong = 0.2;  // share of samples of ring and hole with a wrong level
+constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
 struct Tolerance {
@@ -141,8 +141,9 @@ TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceCo
     if (misfit) tested.fit.correlation = misfit->correlation(fit.noise, {});
     tested.elliptic = !misfit || has_elliptic_edges(*misfit, fit, context.noise);
     tested.accepted = tested.elliptic && passes(image, fit, context, {kMisfit, kMaxGrowth});
-    tested.fit.unoccluded = tested.accepted &&
-                            !(misfit && shows_occlusion(*misfit, fit, likely_edge_noise(context, *misfit, fit)));
+    tested.fit.unoccluded =
+        tested.accepted &&
+        !(misfit && shows_occlusion(*misfit, fit, likely_edge_noise(context, *misfit, fit)));
     return tested;
 }
 
@@ -212,7 +213,8 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     claim_misfit(fit, context.noise);
     if (fit.unoccluded || guess.model) return fit.unoccluded ? std::optional(fit) : std::nullopt;
     const double at_edges = std::max(context.noise, context.edge_noise);
-    const auto rest = fit_occluded(image, {guess, fit, misfit, at_edges, context.correlation, known || accepted});
+    const auto rest =
+        fit_occluded(image, {guess, fit, misfit, at_edges, context.correlation, known || accepted});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;

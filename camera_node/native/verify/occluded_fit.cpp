@@ -50,8 +50,7 @@ class SectorView {
             const auto [x, y] = point_in_sector(fit_.p, s, radius);
             const float seen = sample(image_, x, y);
             const double level = fit_.fields.even_level(double(x), double(y), double(seen));
-            found |= Sectors(seen >= 0 && test((level - fit_.dark) / (fit_.bright - fit_.dark)))
-                     << s;
+            found |= Sectors(seen >= 0 && test((level - fit_.dark) / (fit_.bright - fit_.dark))) << s;
         }
         return found;
     }
@@ -165,7 +164,8 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     fit.correlation = EdgeMisfit(image, fit.p, fit.fields).correlation(fit.noise, guess.occlusion);
     fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / input.correlation));
-    return input.known || is_certain_roundel(image, fit, guess, input.noise) ? std::optional(fit) : std::nullopt;
+    return input.known || is_certain_roundel(image, fit, guess, input.noise) ? std::optional(fit)
+                                                                             : std::nullopt;
 }
 
 }  // namespace roundel

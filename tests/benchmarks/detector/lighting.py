@@ -59,7 +59,9 @@ def _surroundings(light: Array, cards: list[Card]) -> Iterator[tuple[Card, Array
     """For each card the coordinates of the pixels around it, relative to its centre."""
     for card in cards:
         rows, columns = _box(light, card)
-        y, x = np.mgrid[rows.start : min(rows.stop, light.shape[0]), columns.start : min(columns.stop, light.shape[1])]
+        y, x = np.mgrid[
+            rows.start : min(rows.stop, light.shape[0]), columns.start : min(columns.stop, light.shape[1])
+        ]
         yield card, x - card.uv[0], y - card.uv[1]
 
 
@@ -86,6 +88,8 @@ def measure(run: Run, console: Console) -> list[Verdict]:
     title = f"{run.name}: uneven light, {BAND[0]} to {BAND[1]} px, squared errors over claims"
     console.print(table(title, ("", "found", "centre²/claim", "size²/claim"), rows))
     return [
-        Verdict(f"{what}, squared error over claim", f"{e.centre:.1f}", f"<= {limit:g}", bool(e.centre <= limit))
+        Verdict(
+            f"{what}, squared error over claim", f"{e.centre:.1f}", f"<= {limit:g}", bool(e.centre <= limit)
+        )
         for (what, e), (_, _, limit) in zip(done.items(), KINDS.values(), strict=True)
     ]
