@@ -67,6 +67,12 @@ class WandSessionPanel:
         self._wand = WandDrawing(server.scene)
         self._trial: Rig | None = None
 
+    def next_action(self) -> str:
+        """What the operator should do in the session, or with its result; empty if there is none."""
+        if self._session.is_running:
+            return "a wand session runs: wave where the table in Calibrate says"
+        return "a new calibration is ready: decide in Calibrate whether to use it" if self._candidate else ""
+
     def update(self, state: ArenaState) -> None:
         """Enable the button while cameras send, and colour it while it is the next step."""
         step = next_step(state)
