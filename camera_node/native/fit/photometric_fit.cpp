@@ -15,7 +15,6 @@ namespace {
 // Half widths of the bands of pixels around an edge: at least so many pixels, and so many blurs.
 constexpr double kNarrow = 1.25, kNarrowBlurs = 1.5;
 constexpr double kWide = 2.5, kWideBlurs = 2.5;
-constexpr double kSeparateBlurs = 4;  // of wide bands that contain a single edge
 constexpr double kMinCardStep = 0.2;  // of the contrast: a smaller step from card to ground is not fitted
 
 constexpr int kCoarsePixels = 200;
@@ -33,7 +32,6 @@ constexpr double kNoiseFloor = 1;  // grey levels
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
-constexpr float kPlateau = 235;        // level that compression leaves of clipped paper
 
 /// Sets bright pixels to the scale's end if many are there, since compression scatters the levels of clipped
 /// paper; returns whether it did.
@@ -41,7 +39,7 @@ bool restore_clipped(EdgePixels& pixels) {
     float* const end = pixels.level + pixels.count;
     const auto clipped = std::count_if(pixels.level, end, [](float level) { return level > kSaturated; });
     if (double(clipped) < kClippedShare * pixels.used) return false;
-    std::replace_if(pixels.level, end, [](float level) { return level > kPlateau; }, 255.0f);
+    std::replace_if(pixels.level, end, [](float level) { return level > kClippedPlateau; }, 255.0f);
     return true;
 }
 
@@ -206,6 +204,7 @@ std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialG
         if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
         if (fitter.shows_bend() && !fitter.fit_fields()) return std::nullopt;
     }
+    fitter.use_plateaus();
     if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
     if (guess.shading_sigma > 0 && !fitter.knows_light()) fitter.allow_shading();
     return fitter.fit();

@@ -7,6 +7,7 @@
 #include "fit/gauss_newton.hpp"
 #include "fit/normal_equations.hpp"
 #include "fit/photometric_fit.hpp"
+#include "fit/plateaus.hpp"
 
 namespace roundel {
 
@@ -16,6 +17,9 @@ constexpr SanityLimits kFitLimits{
 // Bounds of the scale of residuals over that of the current ones: the upper one is the tolerance of a median
 // of few residuals.
 constexpr double kStrictScale = 0.5, kSlackScale = 1.3;
+
+constexpr double kSeparateBlurs = 4;    // of wide bands that contain a single edge, and of plateaus
+constexpr float kClippedPlateau = 235;  // level that compression leaves of clipped paper
 
 /// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 1100.
 constexpr double kUnlikelyField = 14;
@@ -43,6 +47,10 @@ class PhotometricFitter : GaussNewton<kCount> {
     void allow_shading();
     bool knows_light() const { return has_fields_ && allowed_ == AllowedFields::kAll; }
 
+    // plateau_prior.cpp
+    /// Conditions the estimate on the levels far from the edges.
+    void use_plateaus();
+
     // print_prior.cpp
     /// Conditions the estimate on a print.
     void use_print(const Print& print);
@@ -61,6 +69,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     void update_noise();
     EdgeBand whole_band() const;
 
+    bool condition_on_plateau(Parameter level, const Plateau& plateau, Parameters& g);
     bool condition_on_print(const Print& print);
     Parameters covariance_with_ratio() const;
     Parameters effect_of_curvature() const;
