@@ -2,7 +2,8 @@
 """Updates the states of robots with detections of which some may be wrong.
 
 A robot that its detections contradict keeps its prediction. If the residuals of all robots are unusual, the camera that
-causes them is left out of the frame set (`residual_monitor`).
+causes them is left out of the frame set (`residual_monitor`). Then detections are left out that contradict the others
+of their robot (`joint_compatibility`).
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,11 @@ from fusion.model.states import States
 from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
+from fusion.tracking.joint_compatibility import jointly_compatible
 
+SUSPICIOUS = (
+    4.0  # squared residual over that of calibration errors, from which a robot's detections are compared
+)
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
 
@@ -64,8 +69,8 @@ class RobustUpdate:
         """The updated states, and the assignments that fit."""
         fitted = self._fit(prediction, detections, assignments)
         if self._residuals.is_unusual(fitted.assignments.squared_px):
-            return self._leave_one_out(prediction, detections, assignments, fitted)
-        return fitted
+            fitted = self._leave_one_out(prediction, detections, assignments, fitted)
+        return self._without_incompatible(fitted, detections)
 
     def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
@@ -95,3 +100,29 @@ class RobustUpdate:
             self._residuals.learn(fitted.assignments.squared_px)
             return fitted
         return without[at_fault]
+
+    def _without_incompatible(self, fitted: RobustFit, detections: DetectionTable) -> RobustFit:
+        """The fit to detections that do not contradict the others of their robots; all keep their residuals."""
+        slack_px = self._residuals.slack_px
+        suspicious = fitted.assignments.squared_px > SUSPICIOUS * slack_px**2
+        if not suspicious.any():
+            return fitted
+        robot = self._markers.robot[fitted.assignments.marker]
+        rows = np.flatnonzero(np.isin(robot, robot[suspicious]))
+        assignments = fitted.assignments.select(rows)
+        observations = MatchedObservations.of(assignments, detections, self._markers)
+        compatible = jointly_compatible(self._estimator, fitted.prediction, observations, slack_px)
+        if compatible.all():
+            return fitted
+        changed = np.unique(robot[rows[~compatible]])
+        refitted, _ = self._estimator.update(fitted.prediction, observations.select(compatible))
+        states = fitted.states.with_rows(changed, refitted.select(changed))
+        residuals = self._estimator.residuals_px(states, observations)
+        others = np.setdiff1d(np.arange(len(robot)), rows)
+        return RobustFit(
+            states,
+            fitted.assignments.select(others).joined(assignments.with_residuals(residuals)),
+            fitted.prediction,
+            np.concatenate([fitted.squared[others], misfit(observations, residuals)]),
+            fitted.n_rejected,
+        )
