@@ -3,21 +3,46 @@
 
 A message's kind is its logger, its format string and its subject, so call `log.warning("camera %s ...", name)` with
 constant formats. Lines about cameras and robots that a file declares are of a kind for each: `extra=about(name)`.
+
+`LogLimits` bounds the lines of each kind and of the process, whatever a network sends. A line that a limit holds back
+is counted; the last one of its kind is written with the count as soon as the limits permit.
 """
 
+import contextlib
 import logging
 import os
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from camera_node.text import printable
+from camera_node.text import MAX_LINE, printable
 
-FIRST_S = 1.0  # least interval between lines of one kind; it doubles while they keep coming ...
-LONGEST_S = 60.0  # ... up to this
 MAX_KINDS = 256  # further ones are limited together
+DIGEST_KINDS = 16  # quoted in a digest ...
+DIGEST_TEXT = 100  # ... with so many characters of each
+DIGEST_LINE = 2500  # characters of a digest
+
+
+@dataclass(frozen=True)
+class LogLimits:
+    """How many lines are written at once, and how often after that.
+
+    Attributes:
+        spacing_s: between two lines of one kind.
+        kind_lines: of one kind at once ...
+        kind_s: ... then one in this time.
+        lines: of all kinds at once; those of a traceback count ...
+        digest_s: ... then one in this time, a digest of all kinds that were held back.
+    """
+
+    spacing_s: float = 1.0
+    kind_lines: int = 6
+    kind_s: float = 600.0
+    lines: int = 32
+    digest_s: float = 120.0
 
 
 def about(name: str) -> dict[str, str]:
@@ -40,79 +65,169 @@ class LineFormatter(logging.Formatter):
     """Writes a message on one line and escapes what is not printable; the lines of a traceback start with `| `."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        record.message = printable(record.message)
+        record.message = printable(record.message, getattr(record, "limit", MAX_LINE))
         return super().formatMessage(record)
 
     def formatException(self, ei: Any) -> str:
         return "\n".join(f"| {printable(line)}" for line in super().formatException(ei).splitlines())
 
 
-@dataclass
-class _Kind:
-    """Lines of one kind: when the next one may be written, and those held back until then."""
+class _Allowance:
+    """Lines that may be written: `lines` at once, then one in `refill_s`. More may be taken than there are."""
 
-    interval_s: float
-    due_s: float
-    held: int = 0
-    last: logging.LogRecord | None = None
+    def __init__(self, lines: int, refill_s: float) -> None:
+        self._lines, self._refill_s = lines, refill_s
+        self._left, self._at_s = float(lines), time.monotonic()
+
+    def left(self, now_s: float) -> float:
+        return min(self._lines, self._left + (now_s - self._at_s) / self._refill_s)
+
+    def is_full(self, now_s: float) -> bool:
+        return self.left(now_s) >= self._lines
+
+    def take(self, now_s: float, lines: int = 1) -> None:
+        self._left, self._at_s = self.left(now_s) - lines, now_s
+
+    @property
+    def due_s(self) -> float:
+        """When the next line may be written, by the monotonic clock."""
+        return self._at_s + max(0.0, 1.0 - self._left) * self._refill_s
+
+
+class _Kind:
+    """The lines of one kind: those that may be written, and those that are held back."""
+
+    def __init__(self, limits: LogLimits) -> None:
+        self._spacing_s = limits.spacing_s
+        self._written_s = -limits.spacing_s
+        self.allowance = _Allowance(limits.kind_lines, limits.kind_s)
+        self.held = 0
+        self.last: logging.LogRecord | None = None
+
+    @property
+    def due_s(self) -> float:
+        return max(self._written_s + self._spacing_s, self.allowance.due_s)
+
+    def hold(self, record: logging.LogRecord) -> None:
+        self.held, self.last = self.held + 1, record
+
+    def release(self, now_s: float) -> tuple[int, logging.LogRecord]:
+        """The last line, and the number of those that it stands for."""
+        assert self.last is not None
+        held, record = self.held, self.last
+        self.held, self.last, self._written_s = 0, None, now_s
+        self.allowance.take(now_s)
+        return held, record
 
 
 class LimitedHandler(logging.StreamHandler):
-    """Writes the first line of a kind at once, then the last of each interval with the number of those left out."""
+    """Writes the first line of a kind at once; `limits` bound those that follow."""
 
-    def __init__(self, stream: Any = None, first_s: float = FIRST_S) -> None:
+    def __init__(self, stream: Any = None, limits: LogLimits | None = None) -> None:
         super().__init__(stream)
-        self._first_s = first_s
+        self._limits = limits or LogLimits()
+        self._allowance = _Allowance(self._limits.lines, self._limits.digest_s)
         self._kinds: dict[object, _Kind] = {}
+        self._timer: threading.Timer | None = None
+        self._timer_s = 0.0
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the line, or hold it back; called with the handler's lock."""
         kind = self._kind_of(record)
-        if kind.last is None and time.monotonic() >= kind.due_s:
-            kind.due_s = time.monotonic() + kind.interval_s
-            super().emit(record)
-            return
-        kind.held += 1
-        if kind.last is None:
-            timer = threading.Timer(max(0.0, kind.due_s - time.monotonic()), self._release, [kind])
-            timer.daemon = True
-            timer.start()
-        kind.last = record
+        kind.hold(record)
+        if kind.held == 1:  # else a timer runs
+            self._write_due(time.monotonic())
 
     def close(self) -> None:
         """Write what is held back."""
-        for kind in list(self._kinds.values()):
-            self._release(kind)
+        with self._locked():
+            self._write(self._waiting(), time.monotonic())
+            if self._timer is not None:
+                self._timer.cancel()
         super().close()
 
-    def _release(self, kind: _Kind) -> None:
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
         self.acquire()
         try:
-            record, held, kind.last, kind.held = kind.last, kind.held, None, 0
-            kind.interval_s = min(2 * kind.interval_s, LONGEST_S)
-            kind.due_s = time.monotonic() + kind.interval_s
-            if record is not None:
-                super().emit(_counted(record, held))
+            yield
         finally:
             self.release()
 
+    def _waiting(self) -> list[_Kind]:
+        return [kind for kind in self._kinds.values() if kind.held]
+
+    def _write_due(self, now_s: float) -> None:
+        """Write the kinds whose time has come, if the process may write; start a timer for the others."""
+        waiting = self._waiting()
+        if now_s >= self._allowance.due_s:
+            self._write([kind for kind in waiting if kind.due_s <= now_s], now_s)
+            waiting = self._waiting()
+        if waiting:
+            self._start_timer(max(self._allowance.due_s, min(kind.due_s for kind in waiting)), now_s)
+
+    def _write(self, kinds: list[_Kind], now_s: float) -> None:
+        """Write a line for each kind, or one for all if the process may not write as many."""
+        as_digest = len(kinds) > max(1.0, self._allowance.left(now_s))
+        released = [kind.release(now_s) for kind in kinds]
+        try:
+            for record in [_digest(released)] if as_digest else [_counted(*pair) for pair in released]:
+                self._allowance.take(now_s, 1 + self.format(record).count("\n"))
+                super().emit(record)
+        except Exception:  # of a format string that does not fit its arguments
+            self.handleError(released[0][1])
+
+    def _start_timer(self, due_s: float, now_s: float) -> None:
+        if self._timer is not None and self._timer_s <= due_s:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer, self._timer_s = threading.Timer(max(0.0, due_s - now_s), self._expire), due_s
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _expire(self) -> None:
+        with self._locked():
+            self._timer = None
+            self._write_due(time.monotonic())
+
     def _kind_of(self, record: logging.LogRecord) -> _Kind:
-        """The kind of a record; one that was silent for longer than its interval starts again."""
-        now_s = time.monotonic()
+        """The kind of a record. Kinds without lines of late make room for others."""
         key = (record.name, record.levelno, record.msg, getattr(record, "subject", None))
         if key not in self._kinds and len(self._kinds) >= MAX_KINDS:
-            self._kinds = {k: kind for k, kind in self._kinds.items() if kind.last or now_s < kind.due_s}
-            key = key if len(self._kinds) < MAX_KINDS else None
-        kind = self._kinds.setdefault(key, _Kind(self._first_s, 0.0))
-        if kind.last is None and now_s > kind.due_s + kind.interval_s:
-            kind.interval_s = self._first_s
-        return kind
+            now_s = time.monotonic()
+            used = {
+                k: kind for k, kind in self._kinds.items() if kind.held or not kind.allowance.is_full(now_s)
+            }
+            self._kinds = used
+            key = key if len(used) < MAX_KINDS else None
+        if key not in self._kinds:
+            self._kinds[key] = _Kind(self._limits)
+        return self._kinds[key]
 
 
-def _counted(record: logging.LogRecord, held: int) -> logging.LogRecord:
+def _counted(held: int, record: logging.LogRecord) -> logging.LogRecord:
     """The record with the number of lines that it stands for."""
     if held == 1:
         return record
     counted = logging.makeLogRecord(record.__dict__)
-    counted.msg, counted.args = f"{record.getMessage()} ({held} lines like this)", ()
+    counted.msg, counted.args = record.getMessage() + _count(held), ()
     return counted
+
+
+def _count(held: int) -> str:
+    return f" ({held} lines like this)" if held > 1 else ""
+
+
+def _digest(released: list[tuple[int, logging.LogRecord]]) -> logging.LogRecord:
+    """One line for several kinds: the severe ones first, then the rare ones, which repetitions must not hide."""
+    ordered = sorted(released, key=lambda pair: (-pair[1].levelno, pair[0]))
+    texts = [printable(r.getMessage(), DIGEST_TEXT) + _count(held) for held, r in ordered[:DIGEST_KINDS]]
+    if len(ordered) > DIGEST_KINDS:
+        texts.append(f"{len(ordered) - DIGEST_KINDS} other kinds")
+    total, level = sum(held for held, _ in released), ordered[0][1].levelno
+    text = f"{total} lines of {len(released)} kinds: {'; '.join(texts)}"
+    return logging.makeLogRecord(
+        {"name": "log", "levelno": level, "levelname": logging.getLevelName(level)}
+        | {"msg": text, "limit": DIGEST_LINE}
+    )

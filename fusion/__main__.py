@@ -18,7 +18,7 @@ COMMANDS = {  # and their modules in fusion.commands
     "run": "run",
     "replay": "replay",
     "record": "record",
-    "recordings": "record",
+    "recordings": "recordings",
     "repair": "repair",
     "trim": "trim",
     "health": "health",

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 BACKGROUND = (3, 3, 4)
 CAMERA, LABELED, UNLABELED = (122, 162, 247), (255, 255, 255), (150, 150, 150)
+CARD, CARD_UNSEEN = (255, 255, 255), (40, 40, 40)  # linear light
 TRUE_POINT, SELECTED, PREVIEW = (235, 238, 245), (255, 214, 64), (255, 214, 64)
 MASK, WAND_TRAIL = (239, 91, 91), (64, 200, 170)
 COASTING, LOST = (222, 99, 10), (40, 20, 20)

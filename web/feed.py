@@ -17,7 +17,8 @@ from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
 from camera_node.protocol.relative import RelativePositions
 from camera_node.text import printable
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose
+from fusion.model.robots import Robot
+from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, robots_key
 from web.coverage_picture import CoveragePicture
 from web.messages import DemoProgress, progress_key
 
@@ -53,6 +54,9 @@ class ArenaState:
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
+    declared: dict[str, Robot] = field(
+        default_factory=dict
+    )  # the server's robots; another object if one changed
     rig: Rig | None = None
     rig_t_ns: int | None = None  # since when it is in force, server's time
     history: RigHistory | None = None  # the versions of the server's rig
@@ -120,13 +124,15 @@ class Feed:
             keys.relative(): (RelativePositions, self._store_relative),
             keys.preview(): (Preview, self._store_preview),
             keys.rig: (RigMessage, self._store_rig),
+            robots_key(arena): (Robots, self._store_robots),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
         }
 
     @property
     def key_exprs(self) -> tuple[str, ...]:
         """The Zenoh key expressions of all messages that the feed decodes, without those that are sent on demand."""
-        return tuple(key for key in self._kinds if key != self.keys.preview())
+        on_demand = self.keys.preview(), robots_key(self.keys.arena)
+        return tuple(key for key in self._kinds if key not in on_demand)
 
     def receive(self, key_expr: str, key: str, data: bytes) -> None:
         """Store a message; `key_expr` is the one of `key_exprs` that includes its `key`."""
@@ -174,6 +180,11 @@ class Feed:
         """Store the versions of the rig, which the server sends on request."""
         with self._lock:
             self._state.history = history
+
+    def store_robots(self, robots: Robots) -> None:
+        """Store the declared robots, which the server sends on request."""
+        with self._lock:
+            self._store_robots(robots, "")
 
     def clear(self) -> None:
         """Discard all messages; fault counts and the server's presence remain."""
@@ -239,6 +250,10 @@ class Feed:
         if message.t_ns == state.rig_t_ns and message.rig == state.rig:  # a query repeats the one in force
             return
         state.rig, state.rig_t_ns = message.rig, message.t_ns
+
+    def _store_robots(self, message: Robots, key: str) -> None:
+        if message.robots != self._state.declared:
+            self._state.declared = message.robots
 
     def _store_named(
         self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str

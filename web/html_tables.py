@@ -7,13 +7,20 @@ from dataclasses import dataclass
 COLOURS = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b", "wait": "#9aa0ac"}  # by level
 MARGIN_PX = 10
 CELL = "padding:3px 6px 3px 0"
-# On a phone Viser's panel is 20em wide and covers the scene: it takes the full width and the lower part instead.
-STYLE = """<style>
-@media (max-width: 36em) { [style*="width: 20em"] { width: 100vw !important } }
-th[title] { cursor: help; text-decoration: underline dotted #8886; text-underline-offset: 3px }
-.roundel-pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); gap: 6px }
-.roundel-pictures figure { margin: 0; font-size: 11px }
-.roundel-pictures img { width: 100%; display: block; border-radius: 3px; background: #000; min-height: 60px }
+# On a phone Viser lays its panel, 20em wide, over the lower part of the scene. Here both are in one column: the scene
+# has the height that the panel leaves, at least 45 %, and almost all once a tap on the title folds the panel.
+PANEL = '[style*="position: fixed"][style*="width: 20em"]'
+STYLE = f"""<style>
+@media (max-width: 36em) {{
+  [style*="width: 20em"] {{ width: 100vw !important }}
+  div:has(> {PANEL}) {{ flex-direction: column }}
+  div:has(> {PANEL}) > :not({PANEL}) {{ height: auto !important; min-height: 0 }}
+  {PANEL} {{ position: relative !important; max-height: 55vh !important; flex: none }}
+}}
+th[title] {{ cursor: help; text-decoration: underline dotted #8886; text-underline-offset: 3px }}
+.roundel-pictures {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); gap: 6px }}
+.roundel-pictures figure {{ margin: 0; font-size: 11px }}
+.roundel-pictures img {{ width: 100%; display: block; border-radius: 3px; background: #000; min-height: 60px }}
 </style>"""
 READ_ONLY_STYLE = """<style>
 .mantine-Button-root, input, textarea, .mantine-Checkbox-root, .mantine-Slider-root, .mantine-Select-root {

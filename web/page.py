@@ -71,7 +71,7 @@ def add_live_page(
         controls = ReplayControls(gui)
         shown = ShownRecording(view, header, controls)
         closing.callback(shown.show, None)
-        view.add(RecordingList(gui, folder, shown.show), is_live=True)
+        view.add(RecordingList(gui, folder, shown.show, recorder), is_live=True)
         view.add(controls)
     with header.tabs["Status"]:
         view.add(StatusTab(gui, endpoint, view.feed.keys.arena), is_live=True)

@@ -13,11 +13,12 @@ import zenoh
 
 from calib.rig.recording import read_messages
 from camera_node.errors import ConfigError
+from fusion.protocol.messages import robots_key
 from web.feed import Feed
 
 LEAD_S = 2.0  # a jump also replays the messages of so long before it: one status of every program
 STEP_S = 1 / 60
-ARENA = re.compile(r"(.+?)/(?:camera/[^/]+/|robot/[^/]+/|fusion/|markers$|rig$)")
+ARENA = re.compile(r"(.+?)/(?:camera/[^/]+/|robot/[^/]+/|fusion/|markers$|rig$|robots$)")
 
 
 class RecordingPlayer:
@@ -30,22 +31,25 @@ class RecordingPlayer:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the recording once, for its time span, its arena and its calibrations.
+        """Read the recording once, for its time span, its arena, its calibrations and its robots.
 
         Raises:
             ConfigError: the file is missing, or is not a recording of an arena.
         """
         self.path = path
         self.faults: Counter[str] = Counter()
-        self._rigs: list[tuple[int, str, bytes]] = []
+        self._held: dict[str, list[tuple[int, str, bytes]]] = {
+            "rig": [],
+            "robots": [],
+        }  # what holds until the next one
         times: list[int] = []
         arenas: Counter[str] = Counter()
         for key, data, t_ns in read_messages(path, self.faults):
             times = [min(t_ns, *times), max(t_ns, *times)] if times else [t_ns, t_ns]
             if found := ARENA.match(key):
                 arenas[found[1]] += 1
-                if key == f"{found[1]}/rig":
-                    self._rigs.append((t_ns, key, data))
+                if (held := key.removeprefix(f"{found[1]}/")) in self._held:
+                    self._held[held].append((t_ns, key, data))
         if not arenas:
             raise ConfigError(f"{path} has no messages of an arena; record it with roundel record {path}")
         self.arena = arenas.most_common(1)[0][0]
@@ -128,11 +132,11 @@ class RecordingPlayer:
                 stop.set()
 
     def messages(self, from_s: float) -> Iterator[tuple[float, str, bytes]]:
-        """Yield seconds, key and bytes from a position on, after the calibration that was in use at that position."""
+        """Yield seconds, key and bytes from a position on, after the calibration and the robots of that position."""
         from_ns = self._start_ns + round(from_s * 1e9)
-        rigs_before = bisect_right(self._rigs, from_ns, key=lambda rig: rig[0])
-        if rigs_before:
-            yield from_s, *self._rigs[rigs_before - 1][1:]
+        for held in self._held.values():
+            if n_before := bisect_right(held, from_ns, key=lambda message: message[0]):
+                yield from_s, *held[n_before - 1][1:]
         for key, data, t_ns in read_messages(self.path, Counter()):
             if t_ns >= from_ns:
                 yield (t_ns - self._start_ns) / 1e9, key, data
@@ -155,7 +159,7 @@ class RecordingPass:
     def __init__(self, messages: Iterator[tuple[float, str, bytes]], feed: Feed) -> None:
         self._feed, self._messages = feed, messages
         self._next = next(self._messages, None)
-        self._expressions = [zenoh.KeyExpr(text) for text in feed.key_exprs]
+        self._expressions = [zenoh.KeyExpr(text) for text in (*feed.key_exprs, robots_key(feed.keys.arena))]
         self._expression_of: dict[str, str | None] = {}  # by key
 
     def advance(self, seconds: float) -> None:

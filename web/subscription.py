@@ -27,6 +27,9 @@ from web.feed import Feed
 REQUEST_TIMEOUT_S = 2.0
 RIG_REQUESTS_HZ = 1.0  # however many status messages arrive
 RIG_TIMEOUT_S = 5.0
+ROBOTS_S = (
+    5.0  # from one request for the declared robots to the next; their markers may change without a message
+)
 
 
 class Subscription:
@@ -42,6 +45,7 @@ class Subscription:
         self._previews: zenoh.Subscriber | None = None
         self._watched, self._closed = False, False
         self._rig_requests = RateLimit(RIG_REQUESTS_HZ, 2.0)
+        self._robots_requests = RateLimit(1 / ROBOTS_S, 2.0)
         connection.when_open(self._declare)
 
     @property
@@ -88,15 +92,20 @@ class Subscription:
     def change_robots(self, request: RobotsRequest) -> Robots:
         """Have the server change its robots; returns all robots and raises as `define`."""
         request = msgspec.structs.replace(request, source=RequestSource.of("web"))
-        return change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S)
+        return self._stored(change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S))
 
     def reframe_robot(self, name: str, change: Callable[[Robot], Robot]) -> Robots:
         """Have the server replace a robot by `change` of it; returns all robots and raises as `define`."""
-        return reframe_robot(self.session, self.feed.keys.arena, name, change, "web", REQUEST_TIMEOUT_S)
+        arena = self.feed.keys.arena
+        return self._stored(reframe_robot(self.session, arena, name, change, "web", REQUEST_TIMEOUT_S))
 
     def declared_robots(self) -> Robots:
         """All robots of the server. Raises NetworkError if it does not answer."""
         return request_robots(self.session, self.feed.keys.arena, REQUEST_TIMEOUT_S)
+
+    def _stored(self, robots: Robots) -> Robots:
+        self.feed.store_robots(robots)
+        return robots
 
     def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
         """Have the server undo the last change of its rig; return the outcome as text.
@@ -153,6 +162,7 @@ class Subscription:
             t_ns = decode(sample.payload.to_bytes(), FusionStatus).rig_t_ns
             if t_ns is not None and self._is_new_rig(t_ns):
                 self._request_rig(session)
+            self._request_robots(session)
 
     def _is_new_rig(self, t_ns: int) -> bool:
         """Whether the feed lacks the rig in force since `t_ns`, or its history."""
@@ -173,3 +183,14 @@ class Subscription:
         # In a thread: Zenoh's thread, which calls this method, must not wait for replies.
         request_rig = guarded("a request for the rig", request)
         threading.Thread(target=request_rig, args=[self.feed.keys.arena], name="rig", daemon=True).start()
+
+    def _request_robots(self, session: zenoh.Session) -> None:
+        if not self._robots_requests.passes():
+            return
+
+        def request(arena: str) -> None:
+            with contextlib.suppress(RoundelError):  # a later status asks again
+                self.feed.store_robots(request_robots(session, arena, REQUEST_TIMEOUT_S))
+
+        ask = guarded("a request for the robots", request)
+        threading.Thread(target=ask, args=[self.feed.keys.arena], name="robots", daemon=True).start()

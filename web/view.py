@@ -19,7 +19,8 @@ from web.scene.cameras import CameraDrawing
 from web.scene.markers import MarkerCloud, MarkerDiscs, TruePoints
 from web.scene.relative import RelativeFrames
 from web.scene.robots import RobotDrawing
-from web.scene.surroundings import FIELD_OF_VIEW, add_floor, add_lights, default_viewpoint
+from web.scene.surroundings import add_floor, add_lights
+from web.scene.viewpoint import Viewpoints
 
 PERIOD_S = 1 / 30
 SLOW_INTERVAL = 3  # drawings from one update of trails and labels to the next
@@ -65,8 +66,7 @@ class View:
         self._relative = RelativeFrames(self.server.scene)
         add_lights(self.server.scene)
         add_floor(self.server.scene)
-        self.server.initial_camera.fov = FIELD_OF_VIEW
-        self.reset_view()
+        self._viewpoints = Viewpoints(self.server)
 
     def run(self, stop: threading.Event) -> None:
         """Draw until `stop` is set; late drawings are skipped. Each drawing is progress of the service."""
@@ -112,12 +112,7 @@ class View:
 
     def reset_view(self) -> None:
         """Show the whole arena in all browsers, present and future."""
-        position, target = default_viewpoint(self._rig)
-        self.server.initial_camera.position = position
-        self.server.initial_camera.look_at = target
-        for client in self.server.get_clients().values():
-            client.camera.position = position
-            client.camera.look_at = target
+        self._viewpoints.reset(self._rig)
 
     def _draw_rig(self, rig: Rig | None) -> None:
         first, self._rig = self._rig is None, rig

@@ -16,7 +16,8 @@ constexpr size_t kMaxRoundels = 4096;  // limit of a message
 constexpr int kMaxFits = 512;          // of seeds in a frame
 constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are searched with motion blur
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
-constexpr int kMaxFailures = 3;        // of which so many may fail
+constexpr int kMaxFailures = 3;        // of which so many may fail; but one, unless one succeeded,
+constexpr double kPoorMisfit = 0.085;  // from this misfit on: 5 % of moving roundels have more, and clutter
 
 // Least contrast of the further rings of a bullseye: blur makes thin rings, and paper between them, grey.
 // Both are tried for a ring of no known print, which is more often one of a bullseye.
@@ -51,7 +52,7 @@ FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    const bool any = explores();
+    const bool any = explore();
     FrameState frame(linear, any ? any_limits_ : limits_);
     fit_tracked(frame);
     if (paper_)
@@ -79,15 +80,13 @@ void Detector::fit_tracked(FrameState& frame) const {
             frame.lost.push_back(expected);
 }
 
-/// Whether this frame is searched for any print, as the second one is and one in 128 thereafter: twice the
-/// clutter looks like rings of any ratio as of two.
-bool Detector::explores() {
-    any_chords_.reset();
-    if (!print_ratios_ || explore_in_-- > 0) return false;
-    explore_in_ = kExploreInterval - 1;
-    any_chords_.emplace(any_limits_, true);
-    n_frames_ = kSearchInterval;
-    return true;
+/// Decides whether this frame is searched for any print, as the second one is and one in 128 thereafter:
+/// twice the clutter looks like rings of any ratio as of two.
+bool Detector::explore() {
+    const bool any = print_ratios_ && explore_in_-- <= 0;
+    chords_.set_limits(any ? any_limits_ : limits_, any);
+    if (any) explore_in_ = kExploreInterval - 1, n_frames_ = kSearchInterval;
+    return any;
 }
 
 void Detector::search_by_chords(FrameState& frame) {
@@ -132,11 +131,11 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
 /// Collects the seeds and streaks of a part.
 void Detector::search_part(const Box& part, FrameState& frame) {
     const ImageView view = window(frame.image, part);
-    ChordSearch& chords = any_chords_ ? *any_chords_ : chords_;
-    chords.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
+    chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
     const float left = float(part.left), top = float(part.top);
-    for (Seed seed : chords.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
-    for (Streak streak : chords.streaks()) streak.x += left, streak.y += top, frame.streaks.push_back(streak);
+    for (Seed seed : chords_.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
+    for (Streak streak : chords_.streaks())
+        streak.x += left, streak.y += top, frame.streaks.push_back(streak);
 }
 
 /// Fits the seeds. If there are more than the fits allowed, the next frame begins with those that are left.
@@ -192,7 +191,8 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
               [](const auto& a, const auto& b) { return a.misfit < b.misfit; });
     int fits = 0, failures = 0;
     for (const auto& [guess, misfit] : matches) {
-        if (failures == kMaxFailures || fits == kMaxMovingFits) break;
+        const int may_fail = misfit < kPoorMisfit || fits > failures ? kMaxFailures : 1;
+        if (failures >= may_fail || fits == kMaxMovingFits) break;
         if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
         ++fits, failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
     }
@@ -212,7 +212,7 @@ void Detector::learn_prints(const FrameState& frame) {
 void Detector::use_prints() {
     limits_.prints = print_ratios_->prints(), limits_.any_print = !print_ratios_->decided();
     any_limits_.prints = limits_.prints;
-    chords_ = ChordSearch(limits_, false), matcher_ = MotionBlurMatcher(limits_);
+    matcher_.use_prints(limits_.prints);
 }
 
 /// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.

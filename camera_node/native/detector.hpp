@@ -76,7 +76,7 @@ class Detector {
     void fit_moving_streaks(FrameState& frame) const;
     void update_theta(const FrameState& frame);
     void mark_searched(const FrameState& frame);
-    bool explores();
+    bool explore();
     void learn_prints(const FrameState& frame);
     void use_prints();
     void learn_response(const FrameState& frame);
@@ -92,7 +92,6 @@ class Detector {
     std::optional<PrintRatios> print_ratios_;  // if they were not given
     double search_share_;
     ChordSearch chords_;
-    std::optional<ChordSearch> any_chords_;  // for any print
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
     CameraResponse response_;

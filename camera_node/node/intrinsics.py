@@ -2,6 +2,7 @@
 """Follows the calibration in force, so that a node's detections use the camera's lens."""
 
 import logging
+from collections.abc import Callable
 
 import zenoh
 
@@ -23,9 +24,18 @@ class RigLens:
     """The lens of one camera in the server's rig, as it changes; detections are unchanged while there is none.
 
     The server is asked whenever it appears, and publishes each change.
+
+    Args:
+        session: an open Zenoh session.
+        keys: the arena's.
+        camera: its name.
+        on_refusal: called after a message that is no rig, on Zenoh's thread.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, camera: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, camera: str, on_refusal: Callable[[], object] = lambda: None
+    ) -> None:
+        self._on_refusal = on_refusal
         self._session, self._key, self._camera = session, keys.rig, camera
         self._known: KnownLens | None = None
         self._reported = False  # that the lens is wrong
@@ -100,5 +110,7 @@ class RigLens:
             if not self._closed and (lens is None or known is None or lens != known.lens):
                 self._reported = False
                 self._known = KnownLens(lens) if lens is not None else None
-        except (MessageError, ConfigError) as error:
+        except MessageError:
+            self._on_refusal()
+        except ConfigError as error:
             log.warning("the lens of %s in the rig is not used: %s", self._camera, error)

@@ -212,7 +212,7 @@ class Node:
             session, keys.preview(name), name, self._latest, lambda: self._clock.to_server(time.time_ns())
         )
         stack.callback(previews.close)
-        self._rig_lens = RigLens(session, keys, name)
+        self._rig_lens = RigLens(session, keys, name, self._statistics.count_refusal)
         stack.callback(self._rig_lens.close)
         if self._options.localizer is not None:
             self._relative = RelativePublisher(session, keys.relative(name), self._options.localizer)

@@ -67,7 +67,7 @@ class NodeStatistics:
             self.latest = detected
 
     def count_refusal(self) -> None:
-        """Count a refused request."""
+        """Count a refused request, or a refused message of the server."""
         with self._lock:
             self._refused += 1
 

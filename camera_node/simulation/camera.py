@@ -36,7 +36,10 @@ class SimulatedCamera(Source):
         while self._wait_until(self._end_ns(index)):
             t_s = self._camera.exposure_middle_s(index)
             image = self._renderer.render(t_s, index)
-            yield Frame(image, self._epoch_ns + round(t_s * 1e9), self._camera.exposure_us)
+            camera = self._camera
+            yield Frame(
+                image, self._epoch_ns + round(t_s * 1e9), camera.exposure_us, readout_us=camera.readout_us
+            )
             newest = self._newest()
             self.dropped += max(0, newest - index - 1)
             index = max(index + 1, newest)
@@ -51,7 +54,8 @@ class SimulatedCamera(Source):
         return max(-1, math.floor(elapsed_s * self._camera.fps))
 
     def _end_ns(self, index: int) -> int:
-        t_s = self._camera.exposure_middle_s(index) + self._camera.exposure_us * 0.5e-6
+        camera = self._camera
+        t_s = camera.exposure_middle_s(index) + (camera.exposure_us + abs(camera.readout_us)) * 0.5e-6
         return self._epoch_ns + round(t_s * 1e9)
 
     def _wait_until(self, t_ns: int) -> bool:

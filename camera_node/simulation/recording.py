@@ -84,6 +84,7 @@ def _describe_camera(camera: SceneCamera) -> dict:
         "T_cam_world": invert(camera.T_world_cam).tolist(),
         "fps": camera.fps,
         "phase_ms": camera.phase_ms,
+        "readout_us": camera.readout_us,
     }
 
 

@@ -3,61 +3,27 @@
 
 The images test detectors, so the renderer shares no model with them: it contains no ellipse and no edge model. The
 viewing ray of each sub-sample of a pixel is intersected with a disc's plane, at some distance from the disc's centre.
+With a rolling shutter, the disc is where it is when the pixel's row is read.
 """
 
 import math
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 
 from camera_node.arrays import Array, Grey
-from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert, rotation_with_z
+from camera_node.geometry.pose import invert
 from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
+from camera_node.simulation.discs import Disc, RollingDisc, discs_while_read, place_discs
 from camera_node.simulation.scene import Scene, SceneCamera
 
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print without vignetting
 SUBSAMPLES = 3  # each pixel has 3 x 3 sub-samples; the error at edges is then below 0.5 % of the contrast
 NEAR_M = 0.05  # discs that come nearer to the camera's plane are not drawn
-EDGE_ON = 0.02  # rad; discs seen at smaller angles are not drawn: they are less than half a pixel high
-CORNERS = np.linspace(0, math.tau, 12, endpoint=False)
-# A polygon around the unit circle.
-POLYGON = np.column_stack([np.cos(CORNERS), np.sin(CORNERS)]) / math.cos(math.pi / 12)
 NOISE_SHIFTS = 128  # pixels; all frames use one noise image, shifted at random by less than this
-
-
-@dataclass(frozen=True, slots=True)
-class Disc:
-    """A printed roundel in front of a camera: T_cam_disc (4, 4), and radii of card, black and white disc, metres."""
-
-    T: Array
-    radii: tuple[float, float, float]
-
-    @property
-    def faces_camera(self) -> bool:
-        """Whether the camera sees the printed side at an angle of more than EDGE_ON radians."""
-        t = self.T[:3, 3]
-        return float(self.T[:3, 2] @ t) < -EDGE_ON * float(np.linalg.norm(t))
-
-    def outline(self) -> Array:
-        """(12, 3) corners of a polygon around the card, camera frame, metres."""
-        return self.radii[0] * POLYGON @ self.T[:3, :2].T + self.T[:3, 3]
-
-
-def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
-    """The roundels of a body at T_cam_body (4, 4), visible or not."""
-    outer = body.diameter_m / 2
-    radii = (outer * body.surround_ratio, outer, outer * body.inner_ratio)
-    points, normals, half = body.points, body.unit_normals, thickness_of(body) / 2
-    if half:
-        points = np.concatenate([points + half * normals, points - half * normals])
-        normals = np.concatenate([normals, -normals])
-    T_body_disc = np.tile(np.eye(4), (len(points), 1, 1))
-    T_body_disc[:, :3, :3], T_body_disc[:, :3, 3] = rotation_with_z(normals), points
-    return [Disc(T, radii) for T in T_cam_body @ T_body_disc]
 
 
 class ImageModel:
@@ -86,7 +52,7 @@ class ImageModel:
         sharp = np.ascontiguousarray(seen[m:-m, m:-m])
         return cv2.GaussianBlur(sharp, (0, 0), self.camera.blur_px) * self._gain
 
-    def paint(self, image: Picture, samples: list[Disc]) -> None:
+    def paint(self, image: Picture, samples: Sequence[Disc | RollingDisc]) -> None:
         """Draw one roundel, at all sample times of the exposure.
 
         It replaces the light of each pixel in proportion to the card's share of the pixel.
@@ -111,7 +77,7 @@ class ImageModel:
             return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)  # rounds and saturates
         return self.camera.sensor_model.develop(image, noise)
 
-    def _bound(self, samples: list[Disc]) -> tuple[int, int, int, int] | None:
+    def _bound(self, samples: Sequence[Disc | RollingDisc]) -> tuple[int, int, int, int] | None:
         """Columns and rows u0, v0, u1, v1 that the discs may cover, within the range of `_rays`; None without any."""
         points = np.concatenate([disc.outline() for disc in samples])
         z, radii = points[:, 2], np.hypot(points[:, 0], points[:, 1])
@@ -127,13 +93,17 @@ class ImageModel:
             return None
         return (*np.maximum(low, -known).tolist(), *np.minimum(high, size + known).tolist())
 
-    def _trace(self, disc: Disc, box: tuple[int, int, int, int]) -> Picture:
+    def _trace(self, disc: Disc | RollingDisc, box: tuple[int, int, int, int]) -> Picture:
         """(h, w, 2) of a box: the card's share of each pixel and the light from that share, both blurred."""
         u0, v0, u1, v1 = box
         m = self._margin - 1  # one more pixel on each side for the gradient
         rays = self._rays[v0 + m : v1 + m + 2, u0 + m : u1 + m + 2]
         fine = cv2.resize(rays, None, fx=SUBSAMPLES, fy=SUBSAMPLES, interpolation=cv2.INTER_LINEAR)
-        radius = trace_radius(disc, np.asarray(fine, np.float32))
+        rows = np.arange(v0 - 1, v1 + 1).repeat(
+            SUBSAMPLES
+        )  # all sub-samples of a pixel have the time of its row
+        heights = self.camera.image_row(np.column_stack([rows, rows]))
+        radius = disc.intersect(np.asarray(fine, np.float32), heights)
         rim = SUBSAMPLES - 1
         card, black, white = covered_shares(radius[rim:-rim, rim:-rim], disc.radii)
         layers = cv2.merge([card, WHITE * card - (WHITE - BLACK) * (black - white)])
@@ -166,26 +136,21 @@ class Renderer:
             self._model.paint(image, samples)
         return self._model.expose(image, frame)
 
-    def _visible_discs(self, t_s: float) -> list[list[Disc]]:
+    def _visible_discs(self, t_s: float) -> list[list[Disc | RollingDisc]]:
         """The roundels that face the camera, farthest first, each as its discs at all sample times of the exposure."""
-        n, exposure_s = self.camera.motion_samples, self.camera.exposure_us * 1e-6
-        samples = [self._discs_at(t_s + ((k + 0.5) / n - 0.5) * exposure_s) for k in range(n)]
+        camera = self.camera
+        n, exposure_s, readout_s = camera.motion_samples, camera.exposure_us * 1e-6, camera.readout_us * 1e-6
+        times = [t_s + ((k + 0.5) / n - 0.5) * exposure_s for k in range(n)]
+        samples = [discs_while_read(self._discs_at, t, readout_s) for t in times]
         middle = {key: disc for key, disc in samples[n // 2].items() if disc.faces_camera}
-        farthest_first = sorted(middle, key=lambda key: -float(np.linalg.norm(middle[key].T[:3, 3])))
+        farthest_first = sorted(middle, key=lambda key: -middle[key].distance_m)
         return [[discs.get(key, middle[key]) for discs in samples] for key in farthest_first]
 
-    def _discs_at(self, t_s: float) -> dict[tuple[str, int], Disc]:
+    def _discs_at(self, t_s: float) -> Mapping[tuple[str, int], Disc]:
         """Every roundel in the arena, by the name of its body and its number."""
         bodies = self.scene.bodies_at(t_s).items()
         discs = ((name, place_discs(body, self._T_cam_world @ T)) for name, (body, T) in bodies)
         return {(name, k): disc for name, own in discs for k, disc in enumerate(own)}
-
-
-def trace_radius(disc: Disc, rays: Picture) -> Picture:
-    """Distances (h, w) from the disc's centre, metres, at which rays (h, w, 2: x/z, y/z) intersect its plane."""
-    to_plane = np.linalg.inv(np.column_stack([disc.T[:3, :2], disc.T[:3, 3]]))  # p = [e1 e2 t] (a, b, 1) s
-    points = cv2.perspectiveTransform(rays, to_plane)
-    return np.asarray(cv2.magnitude(points[..., 0], points[..., 1]), np.float32)
 
 
 def covered_shares(radius: Picture, radii: tuple[float, ...]) -> list[Picture]:

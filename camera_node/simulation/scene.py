@@ -75,8 +75,9 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         fps: frames per second; cameras are free-running, so each has its own rate and phase.
-        phase_ms: time of the middle of the first exposure, after the epoch.
+        phase_ms: time of the middle of the first exposure, after the epoch; with a rolling shutter of its middle row.
         exposure_us: exposure time.
+        readout_us: time in which a rolling shutter reads all rows (`Detections`); 0 of a global shutter.
         motion_samples: number of times within an exposure whose images are averaged; 1 gives no motion blur.
         blur_px: standard deviation of the lens's blur, pixels.
         noise: standard deviation of a pixel's noise, grey levels of 255, of a clean sensor.
@@ -88,6 +89,7 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fps: float = 30.0
     phase_ms: float = 0.0
     exposure_us: float = 2000.0
+    readout_us: float = 0.0
     motion_samples: int = 1
     blur_px: float = 0.7
     noise: float = 2.5
@@ -97,6 +99,8 @@ class SceneCamera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True):
         super().__post_init__()
         if not (0.1 <= self.fps <= 1000 and 0 <= self.exposure_us <= 1e6 / self.fps):
             raise ValueError("fps must be in [0.1, 1000], and exposure_us no longer than a frame")
+        if not abs(self.readout_us) <= 1e6 / self.fps:
+            raise ValueError("readout_us must be no longer than a frame")
         if not (0.2 <= self.blur_px <= 5 and 0 <= self.noise <= 50 and 1 <= self.motion_samples <= 64):
             raise ValueError("blur_px must be in [0.2, 5], noise in [0, 50] and motion_samples in [1, 64]")
         look_at(self.position_m, self.look_at_m)

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import zenoh
 
@@ -56,20 +57,20 @@ class Ros2Node:
     def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
         """Publish `<robot>/pose`, `<robot>/odometry` of the robots that are not lost, and all of them in one `tf`."""
         shown = [pose for pose in poses if pose.state != "lost" and self._has_topics(pose.robot)]
+        if not shown:
+            return
         robots = [self._robots[pose.robot] for pose in shown]
         names = [robot.name for robot in robots]
-        for pose, robot, odom in zip(shown, robots, odometries(shown, frame, names), strict=True):
-            robot.odometry.put(odom)
-            robot.pose.put(pose_stamped(pose, frame))
-        if shown:
-            self._topic("tf", "tf2_msgs/msg/TFMessage").put(transforms(shown, frame, names))
+        _send([robot.odometry for robot in robots], odometries(shown, frame, names))
+        _send([robot.pose for robot in robots], [pose_stamped(pose, frame) for pose in shown])
+        _send([self._topic("tf", "tf2_msgs/msg/TFMessage")], [transforms(shown, frame, names)])
 
     def publish_relative(self, message: RelativePositions) -> None:
         """Publish `<camera>/relative`: one message for each roundel that the camera locates, in its optical frame."""
         name = ros_name(message.camera)
         topic = self._topic(f"{self._namespace}/{name}/relative".lstrip("/"), RELATIVE)
-        for data in relative_poses(message, f"{name}_optical_frame"):
-            topic.put(data)
+        messages = relative_poses(message, f"{name}_optical_frame")
+        _send([topic] * len(messages), messages)
 
     def _has_topics(self, robot: str) -> bool:
         """Whether the robot has topics or gets them now; if another one has its name in ROS, its poses are counted."""
@@ -112,15 +113,31 @@ class Ros2Topic:
     """A publisher as in rmw_zenoh_cpp: the attachment of each message has its number, its time and the sender's id."""
 
     def __init__(self, session: zenoh.Session, key: str, entity: str) -> None:
+        self._session, self._key = session, key
         self._publisher = session.declare_publisher(key)
         self._token = session.liveliness().declare_token(entity)
         self._gid = hashlib.blake2b(entity.encode(), digest_size=16).digest()
         self._count = 0
 
-    def put(self, data: bytes) -> None:
+    @cached_property
+    def _express(self) -> zenoh.Publisher:
+        return self._session.declare_publisher(self._key, express=True)
+
+    def put(self, data: bytes, is_last: bool) -> None:
+        """Send a message; if it `is_last` of a burst, without waiting for more."""
         self._count += 1
         attachment = struct.pack("<qqB16s", self._count, time.time_ns(), len(self._gid), self._gid)
-        self._publisher.put(data, attachment=attachment)
+        (self._express if is_last else self._publisher).put(data, attachment=attachment)
+
+
+def _send(topics: Sequence[Ros2Topic], messages: Sequence[bytes]) -> None:
+    """Put one message on each topic, as a burst.
+
+    Zenoh waits one or more milliseconds for further messages of a burst, here and in each router, until one of them is
+    express: then it sends all that it has.
+    """
+    for number, (topic, message) in enumerate(zip(topics, messages, strict=True), 1):
+        topic.put(message, is_last=number == len(topics))
 
 
 @dataclass(frozen=True, slots=True)

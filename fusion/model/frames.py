@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames of calibrated cameras, and frame sets."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from calib.rig.camera import Camera
@@ -65,6 +65,12 @@ class CalibratedFrame:
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
         return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **timing)
+
+    def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
+        """The frame by another calibration of its camera."""
+        shift_ns = round((new.time_offset_ms - old.time_offset_ms) * 1e6)
+        xy, scale = undistort(new, self.roundels.uv)
+        return replace(self, t_ns=self.t_ns + shift_ns, xy=xy, scale=scale)
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""

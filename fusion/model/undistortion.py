@@ -6,6 +6,8 @@ coordinates, fitted to the exact inverse. Cells with errors above `TOLERANCE_PX`
 a fisheye image. Pixels in empty cells or outside the image use the lens model.
 """
 
+import math
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +17,7 @@ from camera_node.geometry.lens import Lens
 from fusion import _core
 
 CELL_PX, FINE_CELL_PX = 32, 16
+MAX_CELLS = 1 << 14  # of `CELL_PX`; larger images than 4096 x 4096 px have larger cells
 ENOUGH = 0.99  # share of accurate cells; below it, the table uses the finer cells
 TOLERANCE_PX = 1e-3  # 1 % of the noise of a good detection
 TOLERANCE_SCALE = 1e-3  # relative, of the Jacobian
@@ -63,6 +66,12 @@ def _table_of(lens: Lens) -> "UndistortionTable":
     return UndistortionTable(lens)
 
 
+def prepare_lenses(lenses: Iterable[Lens]) -> None:
+    """Make the tables of lenses, so that `undistort` finds them; callable on any thread."""
+    for lens in lenses:
+        table_of(lens)
+
+
 class UndistortionTable:
     """The cells of a lens, surrounded by a ring of empty cells.
 
@@ -72,10 +81,11 @@ class UndistortionTable:
     """
 
     def __init__(self, lens: Lens) -> None:
-        self.cell_px = CELL_PX
+        larger = max(1, math.ceil(math.sqrt(lens.width * lens.height / MAX_CELLS) / CELL_PX))
+        self.cell_px = larger * CELL_PX
         fitted, share = _fit(lens, self.cell_px)
         if share < ENOUGH:
-            self.cell_px = FINE_CELL_PX
+            self.cell_px = larger * FINE_CELL_PX
             fitted, _ = _fit(lens, self.cell_px)
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)

@@ -201,6 +201,10 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M,) index into `robots`, -1 for unlabeled markers."""
         return np.frombuffer(self.robot, "<i4")
 
+    def marker_index(self) -> NDArray[np.int32]:
+        """(M,) index in the robot's markers, -1 for unlabeled markers."""
+        return np.frombuffer(self.marker, "<i4")
+
     def unlabeled(self) -> Index:
         """(F,) rows of the unlabeled markers that more than one camera sees."""
         is_single_view = np.isfinite(self.normal_candidates()).any((1, 2))

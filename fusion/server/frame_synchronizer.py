@@ -87,6 +87,10 @@ class FrameSynchronizer:
         self._newest_ns = max(self._newest_ns, frame.t_ns)
         return True
 
+    def replace_frames(self, replaced: Callable[[CalibratedFrame], CalibratedFrame | None]) -> None:
+        """Replace the waiting frames after a change of the calibration; None drops one. Their cameras' rates stay."""
+        self._waiting = [frame for frame in map(replaced, self._waiting) if frame is not None]
+
     def ignore(self, name: str) -> None:
         """Wait no longer for the frames of a camera, until one is added again."""
         if name in self._cameras:

@@ -128,6 +128,7 @@ class TrackingPipeline:
         try:
             if not in_place:
                 self._start(placed)
+                self.synchronizer = synchronizer if self.tracker and tracker else self.synchronizer
             elif tracker is not None:
                 for name in changed:
                     tracker.place(name, placed[name], pinned=name == pinned)
@@ -141,6 +142,21 @@ class TrackingPipeline:
                 raise
             log.exception("a rig can't be used")
             raise FusionError(f"the rig can't be used: {type(error).__name__}: {error}") from None
+        self._recalibrate_frames(old, placed)
+
+    def _recalibrate_frames(self, old: dict[str, Camera], new: dict[str, Camera]) -> None:
+        """Frames that wait for their set have the new calibration; the set is not lost, and its rhythm stays."""
+
+        def recalibrated(frame: CalibratedFrame) -> CalibratedFrame | None:
+            name = frame.camera
+            if new.get(name) == old[name]:
+                return frame
+            return frame.recalibrated(old[name], new[name]) if name in new else None
+
+        for name in old.keys() - new.keys():
+            self.synchronizer.ignore(name)
+        self.synchronizer.replace_frames(recalibrated)
+        self.early = None
 
     def _start(self, cameras: dict[str, Camera]) -> None:
         """Restart tracking."""

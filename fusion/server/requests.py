@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The queries that the server answers: its time, the rig and the robots, and changes of both."""
 
+import contextlib
 import logging
 from collections.abc import Callable
 from functools import partial
@@ -26,6 +27,7 @@ from camera_node.protocol.requests import (
     parse_request,
     payload_of,
 )
+from fusion.model.undistortion import prepare_lenses
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
@@ -73,12 +75,12 @@ class RequestHandlers:
         arena = self._keys.arena
         transport.answer(self._keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
         transport.answer_on_server_thread(rig_history_key(arena), self._answer_history)
-        for key, change, answer in (
-            (set_rig_key(arena), "change of the rig", self._set_rig),
-            (undo_rig_key(arena), "undo of the rig", self._undo_rig),
-            (redo_rig_key(arena), "redo of the rig", self._redo_rig),
+        for key, change, answer, prepare in (
+            (set_rig_key(arena), "change of the rig", self._set_rig, _prepare_lenses),
+            (undo_rig_key(arena), "undo of the rig", self._undo_rig, self._prepare_step),
+            (redo_rig_key(arena), "redo of the rig", self._redo_rig, self._prepare_step),
         ):
-            transport.answer_on_server_thread(key, audit.audited(change, answer))
+            transport.answer_on_server_thread(key, audit.audited(change, answer), prepare)
 
     def _answer_clock(self, clock: ServerClock, query: zenoh.Query) -> None:
         query.reply(self._keys.clock, encode(clock.reply()))
@@ -104,6 +106,10 @@ class RequestHandlers:
         request = _parse_step(query)
         self._pipeline.redo_rig(self._clock.now_ns(), request.source)
         return self._announce_rig(query, "set to the one that was undone", request.source)
+
+    def _prepare_step(self, payload: bytes) -> None:
+        for rig in self._pipeline.active_rig.neighbours():
+            prepare_lenses(rig.placed().values())
 
     def _announce_rig(self, query: zenoh.Query, change: str, source: RequestSource | None) -> bytes:
         """Publish and log the rig in force; returns the reply to the request that changed it."""
@@ -133,6 +139,11 @@ class RequestHandlers:
         request = parse_request(payload, RobotsRequest)
         self._publisher.stop_robots(self._pipeline.change_robots(request))
         return self._robots_reply(payload)
+
+
+def _prepare_lenses(payload: bytes) -> None:
+    with contextlib.suppress(RequestError):  # which the answer to the request reports
+        prepare_lenses(parse_request(payload, RigRequest).rig.placed().values())
 
 
 def _parse_step(query: zenoh.Query) -> RigStepRequest:

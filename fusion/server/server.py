@@ -18,6 +18,7 @@ from camera_node.protocol.session import listening_endpoints
 from camera_node.service import ServiceManager
 from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
+from fusion.model.undistortion import prepare_lenses
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.health import describe_status
 from fusion.protocol.messages import FusionStatus, ShardPoses, TrackingState, shard_key
@@ -124,7 +125,7 @@ class Server:
             cameras.declare(transport, audit)
             transport.declare_alive(keys.fusion_alive)
         else:
-            transport.subscribe(keys.rig, self._follow_rig)
+            transport.subscribe(keys.rig, self._follow_rig, _prepare_lenses)
             transport.subscribe(keys.fusion_status, self._request_new_rig)
 
     @contextlib.contextmanager
@@ -257,7 +258,7 @@ class Server:
         with contextlib.suppress(MessageError):
             active, t_ns = self.pipeline.active_rig.message, decode(data, FusionStatus).rig_t_ns
             if t_ns is not None and (active is None or active.t_ns != t_ns):
-                self.transport.request(self.keys.rig, self._follow_rig)
+                self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
 
     def _receive_shard(self, data: bytes, key: str, received_ns: int) -> None:
         """Receive the poses of another shard's robots."""
@@ -272,6 +273,11 @@ class Server:
             self.statistics.count_fault("implausible time")
         else:
             self.pipeline.add_shard_poses(poses)
+
+
+def _prepare_lenses(data: bytes) -> None:
+    with contextlib.suppress(MessageError):  # which the server's thread counts
+        prepare_lenses(decode(data, RigMessage).rig.placed().values())
 
 
 @contextlib.contextmanager

@@ -17,11 +17,12 @@ from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import encode
 from camera_node.protocol.rate_limit import RateLimit
-from camera_node.protocol.requests import REQUEST_S, respond
+from camera_node.protocol.requests import REQUEST_S, payload_of, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
+from fusion.server.preparation import Preparation
 from fusion.server.server_clock import ServerClock
 from fusion.server.task_queue import Task, TaskQueue
 
@@ -33,6 +34,7 @@ ABOVE_QUOTA = "frames above the quota"
 TOO_SLOW = "messages that the server was too slow for"
 INTERNAL_ERROR = "internal error"
 MessageHandler = Callable[[bytes, str, int], None]
+Prepare = Callable[[bytes], object]
 T = TypeVar("T")
 
 
@@ -73,14 +75,23 @@ class Transport:
         self.session = session
         self._clock, self._count_fault, self._closing = clock, count_fault, closing
         self._tasks = TaskQueue()
+        self._preparation = Preparation()
+        closing.callback(self._preparation.close)
         self.received_ns = 0  # arrival time of the last message that was handled
         self._publishers: dict[str, zenoh.Publisher] = {}
 
-    def subscribe(self, key: str, handle: MessageHandler) -> None:
-        """Call `handle(data, key, received_ns)` for each message, on the server's thread."""
+    def subscribe(self, key: str, handle: MessageHandler, prepare: Prepare | None = None) -> None:
+        """Call `handle(data, key, received_ns)` for each message, on the server's thread.
+
+        Args:
+            key: of the messages.
+            handle: uses a message.
+            prepare: is called first, with the message, on a thread for work ahead.
+        """
 
         def enqueue(sample: zenoh.Sample) -> None:
-            self._enqueue(str(sample.key_expr), sample.payload.to_bytes(), handle, key, MESSAGES)
+            data, sender = sample.payload.to_bytes(), str(sample.key_expr)
+            self._after(prepare, sender, data, partial(self._enqueue, sender, data, handle, key, MESSAGES))
 
         self._declare_subscriber(key, enqueue)
 
@@ -97,13 +108,16 @@ class Transport:
 
         self._declare_subscriber(key, enqueue)
 
-    def request(self, key: str, handle: MessageHandler) -> None:
-        """Query a key; call `handle(data, key, received_ns)` for each reply, on the server's thread."""
+    def request(self, key: str, handle: MessageHandler, prepare: Prepare | None = None) -> None:
+        """Query a key; call `handle(data, key, received_ns)` for each reply, on the server's thread.
+
+        `prepare` as in `subscribe`.
+        """
 
         def enqueue(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                key = str(reply.ok.key_expr)
-                self._enqueue(key, reply.ok.payload.to_bytes(), handle, key, MESSAGES)
+                key, data = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+                self._after(prepare, key, data, partial(self._enqueue, key, data, handle, key, MESSAGES))
 
         self.session.get(key, self._guarded(key, enqueue), timeout=REQUEST_S)
 
@@ -121,14 +135,22 @@ class Transport:
         queryable = self.session.declare_queryable(key, self._guarded(key, take))
         self._closing.callback(queryable.undeclare)
 
-    def answer_on_server_thread(self, key: str, answer: Callable[[zenoh.Query], bytes]) -> None:
-        """Answer queries on the server's thread; a RoundelError becomes the reply."""
+    def answer_on_server_thread(
+        self, key: str, answer: Callable[[zenoh.Query], bytes], prepare: Prepare | None = None
+    ) -> None:
+        """Answer queries on the server's thread; a RoundelError becomes the reply. `prepare` as in `subscribe`."""
 
         def enqueue(query: zenoh.Query) -> None:
             run, drop = partial(respond, query, answer), partial(self._refuse, query)
             self._put(Task(key, self._clock.now_ns(), run, drop, is_request=True), REQUESTS)
 
-        self.answer(key, enqueue)
+        def take(query: zenoh.Query) -> None:
+            if prepare is None:
+                enqueue(query)
+            elif not self._preparation.put(partial(prepare, payload_of(query)), partial(enqueue, query)):
+                self._refuse(query)
+
+        self.answer(key, take)
 
     def watch_token(self, key: str, handle: Callable[[bool], object]) -> None:
         """Call `handle` on the server's thread with whether the liveliness token is there, now and on each change."""
@@ -182,6 +204,13 @@ class Transport:
 
     def _guarded(self, key: str, callback: Callable[[T], object]) -> Callable[[T], None]:
         return guarded(f"a message on {key}", callback, partial(self._count_fault, INTERNAL_ERROR, key))
+
+    def _after(self, prepare: Prepare | None, key: str, data: bytes, enqueue: Callable[[], object]) -> None:
+        """Call `enqueue` after the preparation, or at once without one."""
+        if prepare is None:
+            enqueue()
+        elif not self._preparation.put(partial(prepare, data), enqueue):
+            self._count_fault(TOO_SLOW, key)
 
     def _enqueue(self, key: str, data: bytes, handle: MessageHandler, sender: str, limit: int) -> None:
         received_ns = self._clock.now_ns()

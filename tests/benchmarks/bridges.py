@@ -2,7 +2,8 @@
 """Latency that a bridge adds, and its share of a core, with 50 robots at 60 Hz: `python -m tests.benchmarks.bridges`.
 
 A process publishes poses by the server's own code. This process receives each pose twice: over Zenoh, and through the
-bridge. The added latency is the difference of both times of arrival. Each bridge is a process of its own.
+bridge. The added latency is the difference of both times of arrival. Each bridge is a process of its own. Beside other
+programs, run it with `chrt -r 1`: otherwise it measures their share of the processor.
 """
 
 import contextlib

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The log: one line for each message, escaped, and one line of a kind in each interval with a count."""
+"""The log: one line for each message, escaped, and few lines of each kind and process however much happens."""
 
 import io
 import logging
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 
 import pytest
 
-from camera_node.logs import LONGEST_S, MAX_KINDS, LimitedHandler, LineFormatter, about
-from tests.waiting import wait_for
+from camera_node.logs import MAX_KINDS, LimitedHandler, LineFormatter, LogLimits, about
+from tests.waiting import repeating, wait_for
 
-INTERVAL_S = 0.05
+FAST = LogLimits(spacing_s=0.05)
+RECORD = {"name": "tested", "levelno": logging.WARNING, "levelname": "WARNING"}
 FLOOD = """
 import logging, sys
 from camera_node.logs import set_up_logging
@@ -29,7 +31,7 @@ log.warning("other")
 def stream() -> Iterator[io.StringIO]:
     """What the logger `tested` writes."""
     stream, log = io.StringIO(), logging.getLogger("tested")
-    handler = LimitedHandler(stream, INTERVAL_S)
+    handler = LimitedHandler(stream, FAST)
     handler.setFormatter(LineFormatter("%(message)s"))
     log.addHandler(handler)
     log.propagate = False
@@ -78,13 +80,78 @@ def test_a_traceback_cannot_forge_a_line(stream: io.StringIO):
     assert "\x1b" not in stream.getvalue()
 
 
-def test_ever_new_kinds_are_limited_together():
-    """As of a library that formats its messages itself."""
+def lines_counted(text: str) -> int:
+    """How many lines the written ones stand for."""
+    count = 0
+    for line in text.splitlines():
+        digest = re.match(r"(\d+) lines of \d+ kinds: ", line)
+        counted = re.search(r"\((\d+) lines like this\)$", line)
+        count += int(digest[1]) if digest else int(counted[1]) if counted else 1
+    return count
+
+
+def attacked(limits: LogLimits, kinds: int, seconds: float) -> tuple[str, int]:
+    """What a handler writes while lines of so many kinds arrive all the time, and how many arrived."""
     stream = io.StringIO()
-    handler = LimitedHandler(stream, LONGEST_S)
+    handler, sent = LimitedHandler(stream, limits), [0]
+    handler.setFormatter(LineFormatter("%(message)s"))
+
+    def send() -> None:
+        for k in range(kinds):
+            handler.handle(logging.makeLogRecord(RECORD | {"msg": "camera %s", "args": (k,), "subject": k}))
+            sent[0] += 1
+
+    with repeating(send, 0.001):
+        end_s = time.monotonic() + seconds
+        wait_for(lambda: time.monotonic() > end_s)
+    handler.close()
+    return stream.getvalue(), sent[0]
+
+
+@pytest.mark.parametrize("kinds", [1, 5, 60])
+def test_lines_under_attack_are_bounded_and_none_is_uncounted(kinds: int):
+    """However many kinds and messages: those at once, one each time of the refill, and one at the end."""
+    limits, seconds = LogLimits(0.001, kind_lines=4, kind_s=0.1, lines=12, digest_s=0.05), 0.5
+    text, sent = attacked(limits, kinds, seconds)
+    of_kinds = kinds * (limits.kind_lines + seconds / limits.kind_s)
+    of_process = limits.lines + seconds / limits.digest_s
+    assert (
+        len(text.splitlines()) <= min(of_kinds, of_process) * 1.3 + 1
+    )  # a busy machine takes longer than `seconds`
+    assert lines_counted(text) == sent
+
+
+def test_the_real_limits_leave_an_hour_of_attack_below_a_hundred_lines():
+    limits = LogLimits()
+    assert limits.lines + 3600 / limits.digest_s < 100
+
+
+def test_a_rare_line_is_quoted_in_the_digest_of_a_flood(stream: io.StringIO):
+    """A camera that fails during an attack is in the next line that may be written."""
+    log.handlers[0].close()
+    handler = LimitedHandler(stream, LogLimits(0.0, kind_lines=1000, lines=3, digest_s=0.1))
+    handler.setFormatter(LineFormatter("%(levelname)s %(message)s"))
+    log.handlers[:] = [handler]
+    for k in range(4000):
+        log.warning("refused: %d", k, extra=about(str(k % 40)))
+    log.warning("camera %s was moved", "north")
+    wait_for(lambda: "north" in stream.getvalue())
+    line = next(line for line in stream.getvalue().splitlines() if "north" in line)
+    assert re.match(
+        r"WARNING \d+ lines of \d+ kinds: camera north was moved; refused: \d+ \(\d+ lines like this\); ",
+        line,
+    )
+    handler.close()
+    assert len(stream.getvalue().splitlines()) < 10
+
+
+def test_ever_new_kinds_are_limited_together():
+    """As of a library that formats its messages itself: no memory for each of them."""
+    handler = LimitedHandler(io.StringIO(), LogLimits(spacing_s=60.0))
     for k in range(10 * MAX_KINDS):
-        handler.handle(logging.makeLogRecord({"name": "tested", "msg": f"message {k}"}))
-    assert len(stream.getvalue().splitlines()) == MAX_KINDS + 1
+        handler.handle(logging.makeLogRecord(RECORD | {"msg": f"message {k}"}))
+    assert len(handler._kinds) <= MAX_KINDS + 1
+    handler.close()
 
 
 def test_a_process_that_ends_in_a_flood_tells_the_count():
@@ -93,9 +160,7 @@ def test_a_process_that_ends_in_a_flood_tells_the_count():
         [sys.executable, "-c", FLOOD], capture_output=True, text=True, timeout=60, check=True
     )
     assert len(done.stderr.splitlines()) < 10
-    written = [line for line in done.stderr.splitlines() if "refused" in line]
-    counts = [int(n) for n in re.findall(r"\((\d+) lines like this\)", done.stderr)]
-    assert sum(counts) + sum("(" not in line for line in written) == 85_804
+    assert lines_counted(done.stderr) == 85_804 + 1
 
 
 def test_a_line_about_one_camera_holds_back_none_about_another(stream: io.StringIO):

@@ -50,7 +50,9 @@ COMMAND_TESTS = {
     "robots save": ("tests/fusion/model/test_robot_frame.py", 'robots("save"'),
     "define": ("tests/fusion/client/test_measure.py", '"define"'),
     "record": ("tests/fusion/recordings/test_exact_replay.py", '"record"'),
-    "recordings": ("tests/web/test_record_tab.py", "recordings(folder)"),
+    "recordings list": ("tests/web/test_record_tab.py", 'recordings("list"'),
+    "recordings rename": ("tests/web/test_record_tab.py", 'recordings("rename"'),
+    "recordings remove": ("tests/web/test_record_tab.py", 'recordings("remove"'),
     "view": ("tests/web/test_replay.py", "headless"),
     "trim": ("tests/web/test_replay.py", "trim("),
     "replay": ("tests/fusion/recordings/test_record.py", "replay(tmp_path"),
@@ -75,7 +77,7 @@ def controls_of(page_rows: Iterator[tuple[str, str, str]]) -> set[tuple[str, str
 def commands() -> set[str]:
     """The words before the first argument, of all commands."""
     words = [shlex.split(command)[1:] for _, _, command in rows() if command != PAGE_ONLY]
-    two = ("cameras", "robots", "calibrate")
+    two = ("cameras", "robots", "calibrate", "recordings")
     return {" ".join(each[:2] if each[0] in two else each[:1]) for each in words}
 
 

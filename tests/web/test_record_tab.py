@@ -2,16 +2,21 @@
 """The tabs Record and Status: record, list, replay in the page and export, by clicks, with a real server."""
 
 import math
+import re
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from playwright.sync_api import Locator
 
+from camera_node.errors import ConfigError
 from camera_node.protocol.connection import ServerConnection
-from fusion.commands.record import recordings
+from fusion.commands.recordings import recordings
 from fusion.recordings.summary import list_recordings
+from tests.conftest import ROOT
 from tests.fusion.serving import serving_an_unknown_robot
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
@@ -47,9 +52,7 @@ def middle_left_of(thumb: Locator, by_px: float = 60.0) -> tuple[float, float]:
     return box["x"] + box["width"] / 2 - by_px, box["y"] + box["height"] / 2
 
 
-def test_a_recording_is_made_shown_and_exported(
-    view: View, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_recording_is_made_shown_exported_renamed_and_deleted(view: View, tmp_path: Path):
     """Its messages are counted; the page shows it in the place of the arena, and the arena again."""
     folder = tmp_path / "recordings"
     with browsing(view) as page:
@@ -87,11 +90,46 @@ def test_a_recording_is_made_shown_and_exported(
         assert view.shown is view.feed
         page.get_by_role("button", name="Export poses").click()
         page.get_by_text(f"wrote {summary.path.with_suffix('.csv')}").wait_for(timeout=EXPORT_MS)
+        page.locator("xpath=//*[text()='New file name']/following::input[1]").fill("tuesday")
+        wait_for(lambda: value_of(view, "New file name") == "tuesday")
+        selected = value_of(view, "Recording")
+        page.get_by_role("button", name="Rename the recording").click()
+        page.get_by_text(f"{selected} is called tuesday.mcap").wait_for()
+        assert (folder / "tuesday.mcap").exists()
+        wait_for(lambda: value_of(view, "Recording") != selected)
+        deleted = folder / value_of(view, "Recording")
+        page.get_by_role("button", name="Delete the recording").click()
+        page.get_by_text(f"click again to delete {deleted.name}").wait_for()
+        page.get_by_role("button", name="Delete: click again").click()
+        page.get_by_text(f"{deleted.name} is deleted").wait_for()
+        assert not deleted.exists()
+    assert len(list_recordings(folder)) == 1
     assert summary.path.with_suffix(".csv").read_text().startswith("t_ns,robot,x,y,z")
-    capsys.readouterr()
-    recordings(folder)
-    assert f"{summary.path.name}: {summary.seconds:.1f} s" in capsys.readouterr().out
-    assert len(list_recordings(folder)) == 2
+
+
+def test_recordings_are_listed_renamed_and_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A name that is taken, a path in the place of a name and a file that is no recording are refused."""
+    for name in ("monday.mcap", "sunday.mcap", "rig.yaml"):
+        shutil.copy(ROOT / "docs" / "sample.mcap", tmp_path / name)
+    monday = str(tmp_path / "monday.mcap")
+    recordings("list", (str(tmp_path),))
+    assert re.search(
+        r"^monday\.mcap: \d+\.\d s, .* 4 cameras, robots drone", capsys.readouterr().out, re.MULTILINE
+    )
+    refused: tuple[tuple[Literal["list", "rename", "remove"], tuple[str, ...], str], ...] = (
+        ("rename", (monday, "sunday"), "exists"),
+        ("rename", (monday, "../tuesday"), "a recording"),
+        ("rename", (monday,), "FILE NAME"),
+        ("remove", (str(tmp_path / "rig.yaml"),), "no recording"),
+        ("remove", (str(tmp_path / "tuesday.mcap"),), "does not exist"),
+        ("list", (monday,), "not a folder"),
+    )
+    for action, words, fault in refused:
+        with pytest.raises(ConfigError, match=fault):
+            recordings(action, words)
+    recordings("rename", (monday, "tuesday.mcap"))
+    recordings("remove", (str(tmp_path / "sunday.mcap"),))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml", "tuesday.mcap"]
 
 
 def test_a_file_without_an_index_is_listed(tmp_path: Path):

@@ -10,7 +10,10 @@ import pytest
 
 from calib.rig.recording import RecordingWriter
 from camera_node.errors import ConfigError
+from camera_node.protocol.messages import encode
 from fusion.commands.trim import trim
+from fusion.model.robots import Robot
+from fusion.protocol.messages import Robots, robots_key
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
@@ -23,6 +26,7 @@ from web.tabs.record import ReplayControls
 from web.view import View
 
 HZ, SECONDS = 10, 20
+ROBOTS = Robots(robots={"rover": Robot(diameter_m=0.09)})
 START_NS = 1_700_000_000 * 10**9
 
 
@@ -43,6 +47,7 @@ def recording(tmp_path: Path) -> Path:
     with RecordingWriter(path) as writer:
         arena, rig = RecordedArena(writer), four_cameras()
         arena.rig(rig)
+        arena.put(robots_key("test"), encode(ROBOTS))
         for k in range(HZ * SECONDS + 1):
             arena.now_s = k / HZ
             arena.pose("rover", (arena.now_s, 0.0, 0.0))
@@ -88,7 +93,7 @@ def test_a_recording_plays_at_its_own_speed_or_faster(recording: Path):
 
 @pytest.mark.parametrize(("seconds", "calibrated"), [(15.0, 3), (5.0, 4), (0.0, 4), (99.0, 3)])
 def test_a_jump_restores_the_state(recording: Path, seconds: float, calibrated: int):
-    """While paused: the latest pose and rig at that position, and no message becomes too old."""
+    """While paused: the latest pose, rig and robots at that position, and no message becomes too old."""
     with playing(recording) as (player, feed):
         player.play(False)
         player.seek(12.0)
@@ -100,6 +105,7 @@ def test_a_jump_restores_the_state(recording: Path, seconds: float, calibrated: 
         assert len(state.rig.placed()) == calibrated
         assert state.now_s == feed.state().now_s == min(seconds, player.duration_s)
         assert tabulate_robots(state).rows[0].cells[1] == "tracked"
+        assert state.declared == ROBOTS.robots
         assert state.server_alive
         assert not state.faults
 

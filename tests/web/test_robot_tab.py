@@ -57,9 +57,14 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
     client, view = arena
     with browsing(view) as page:
         open_editor(page)
+        wait_for(lambda: view.feed.state().declared == {"a": TRIANGLE})  # requested from the server
         page.get_by_role("button", name="Turn the heading").click()
         page.get_by_text("turned by 90 degrees").wait_for()
-        assert client.declared_robots().robots == {"a": turn_heading(TRIANGLE, 90.0)}
+        assert (
+            client.declared_robots().robots
+            == view.feed.state().declared
+            == {"a": turn_heading(TRIANGLE, 90.0)}
+        )
         page.get_by_role("button", name="Move the pivot").click()
         page.get_by_text("the origin of a moved by 0, 0, 0 m").wait_for()
         page.get_by_text("New name").locator("xpath=ancestor::*[.//input][1]").locator("input:visible").fill(

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from camera_node.geometry.pose import rotation_from_wxyz
+from calib.rig.camera import Camera
+from calib.rig.rig import Rig
+from camera_node.geometry.pose import Pose, look_at, rotation_from_wxyz
 from camera_node.protocol.messages import encode
 from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
@@ -20,8 +22,7 @@ from tests.web.browser import browsing, loopback
 from web.errors import WebError
 from web.feed import Feed
 from web.messages import DemoProgress, progress_key
-from web.scene.robots import cylinder_mesh
-from web.scene.surroundings import default_viewpoint
+from web.scene.viewpoint import FIELD_OF_VIEW, MARGIN, USUAL_ROOM, default_viewpoint
 from web.tabs.cameras import decode_jpeg
 from web.view import View, check_port
 
@@ -51,6 +52,29 @@ def sending(arena: LiveArena) -> Iterator[None]:
     """Send the state ten times a second."""
     with repeating(lambda: send_state(arena), 0.1):
         yield
+
+
+def require_one_column(view: View, page: Page) -> None:
+    """At 420 pixels the scene ends at the panel, has the height that a folded panel leaves, and is fitted to it."""
+    page.set_viewport_size({"width": 420, "height": 850})
+    page.get_by_role("tab", name="Cameras").wait_for()
+    (client,) = view.server.get_clients().values()
+    for least_height in (0.44 * 850, 0.9 * 850):
+        page.wait_for_function(
+            f"Math.max(...[...document.querySelectorAll('canvas')].map(c => c.clientHeight)) >= {least_height}"
+        )
+        scene = (
+            "Math.max(...[...document.querySelectorAll('canvas')].map(c => c.getBoundingClientRect().bottom))"
+        )
+        title = "[...document.querySelectorAll('div')].filter(d => d.innerText?.startsWith('Roundel: test')).at(-1)"
+        page.wait_for_function(f"{scene} <= {title}.getBoundingClientRect().top")
+        wait_for(
+            lambda: np.allclose(
+                client.camera.position, default_viewpoint(four_cameras(), client.camera.aspect)[0], atol=0.05
+            )
+        )
+        page.get_by_text("Roundel: test").first.click()  # folds the panel
+    assert client.camera.aspect < 1
 
 
 def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
@@ -90,6 +114,7 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "the page is not blank"
+    require_one_column(view, page)
     assert not view.feed.state().faults
     for entity in (camera, queryable, token):
         entity.undeclare()
@@ -176,20 +201,27 @@ def test_a_port_in_use_is_an_error():
         check_port("127.0.0.1", 70_000)
 
 
-def test_the_default_viewpoint_is_outside_of_the_rig():
-    """It looks down at the arena from 3 to 12 m, also without a rig."""
-    for rig in (four_cameras(), None):
-        position, target = (np.array(point) for point in default_viewpoint(rig))
-        assert position[2] > target[2] > 0
-        assert 3 < np.linalg.norm(position - target) < 12
-
-
-def test_the_mesh_of_a_robot_is_closed():
-    """Each edge belongs to two faces, once in each direction."""
-    _, faces = cylinder_mesh(0.1, 0.03)
-    edges = [tuple(edge) for face in faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
-    assert sorted(edges) == sorted((b, a) for a, b in edges)
-    assert len(set(edges)) == len(edges)
+@pytest.mark.parametrize("aspect", [2.0, 1.0, 0.5])
+@pytest.mark.parametrize("rig", [four_cameras(), None])
+def test_the_default_viewpoint_shows_the_whole_rig(rig: Rig | None, aspect: float):
+    """Pictures of any shape show all cameras and the floor below them; the outermost point is at the margin."""
+    position, target = (np.array(point) for point in default_viewpoint(rig, aspect))
+    assert position[2] > target[2] > 0
+    focal = 1 / np.tan(FIELD_OF_VIEW / 2)
+    eye = Camera(
+        width=1,
+        height=1,
+        fx=focal,
+        fy=focal,
+        cx=0,
+        cy=0,
+        T_world_cam=Pose.from_matrix(look_at(position, target)),
+    )
+    centres = np.array(
+        [camera.matrix()[:3, 3] for camera in (rig.placed() if rig else {}).values()] or USUAL_ROOM
+    )
+    seen = np.abs(eye.project_world(np.vstack([centres, centres * [1, 1, 0]]))) / (aspect, 1)
+    np.testing.assert_allclose(seen.max(), MARGIN, atol=0.02)
 
 
 @pytest.mark.parametrize("data", [None, b"", b"not an image", bytes(100)])

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import viser
 
-from camera_node.arrays import Array
+from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from web.colours import LABELED, TRUE_POINT, UNLABELED
 from web.feed import ArenaState
-from web.scene.robots import cylinder_mesh
+from web.scene.bodies import cylinder_mesh
 
 MARKERS_S = 0.5  # markers disappear after so long without a message
 DISC_RADIUS_M, DISC_HEIGHT_M = 0.03, 0.002
@@ -20,8 +20,18 @@ NO_SIZE = 1e-6
 TRUE_POINTS_S = 1.0  # true positions disappear after so long without a message
 
 
+def free_markers(state: ArenaState) -> Mask:
+    """(M,) the latest markers that are no prints of declared robots, which `RobotDrawing` draws; none if not recent."""
+    if state.markers is None or state.age_s(state.markers) > MARKERS_S:
+        return np.zeros(0, bool)
+    message = state.markers.message
+    is_declared = np.array([robot in state.declared for robot in message.robots] + [False])
+    return ~is_declared[message.robot_index()]  # -1, of unlabeled markers, is the last one
+
+
 class MarkerCloud:
-    """All markers as one point cloud: white if a robot has the marker, grey if it is unlabeled."""
+    """Markers as one point cloud: white if a robot has the marker, grey if it is unlabeled. Prints of declared robots
+    are not in it."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._cloud = scene.add_point_cloud(
@@ -36,18 +46,17 @@ class MarkerCloud:
 
     def draw(self, state: ArenaState) -> None:
         """Draw the latest markers, if they are recent."""
-        timed = state.markers
-        recent = timed is not None and state.age_s(timed) < MARKERS_S
-        points = timed.message.positions() if timed is not None and recent else np.empty((0, 3))
-        self._cloud.visible = len(points) > 0
-        if timed is not None and len(points):
-            labeled = timed.message.robot_index() >= 0
-            self._cloud.points = points.astype(np.float32)
+        free = free_markers(state)
+        self._cloud.visible = bool(free.any())
+        if state.markers is not None and free.any():
+            message = state.markers.message
+            labeled = message.robot_index()[free] >= 0
+            self._cloud.points = message.positions()[free].astype(np.float32)
             self._cloud.colors = np.where(labeled[:, None], LABELED, UNLABELED).astype(np.uint8)
 
 
 class MarkerDiscs:
-    """Discs at the markers with a known normal, printed side outwards: one batch for all."""
+    """Discs at the markers of the cloud with a known normal, printed side outwards: one batch for all."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
@@ -56,11 +65,12 @@ class MarkerDiscs:
 
     def draw(self, state: ArenaState) -> None:
         """Draw the latest markers, if they are recent."""
-        timed = state.markers
+        free = free_markers(state)
         positions, normals = np.empty((2, 0, 3))
-        if timed is not None and state.age_s(timed) < MARKERS_S:
-            positions, normals = timed.message.positions(), timed.message.normals().astype(float)
-            is_known = np.isfinite(positions).all(1) & np.isfinite(normals).all(1)
+        if state.markers is not None and free.any():
+            message = state.markers.message
+            positions, normals = message.positions(), message.normals().astype(float)
+            is_known = free & np.isfinite(positions).all(1) & np.isfinite(normals).all(1)
             positions, normals = positions[is_known], normals[is_known]
         if not len(positions) and not self.count:
             return

@@ -1,22 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The floor, the world's axes, the light, and the viewpoint from which the whole arena is visible."""
+"""The floor, the world's axes and the light."""
 
-import math
-
-import numpy as np
 import viser
 
-from calib.rig.rig import Rig
 from camera_node.arrays import Array
 from camera_node.geometry.pose import wxyz_from_rotation
 from web.colours import PREVIEW
 
 AXES_M = 0.5
 LABEL_SCALE = 0.7
-FIELD_OF_VIEW = math.radians(42)
-DISTANCE = 2.5  # of the initial viewpoint, in radii of the rig
-MIN_RADIUS_M = 1.5
-DIRECTION = np.array([-0.45, 0.78, -0.43])  # in which the initial view looks
 
 
 def add_lights(scene: viser.SceneApi) -> None:
@@ -83,14 +75,3 @@ class WorldPreview:
         )
         label = self._scene.add_label("/new_world/name", "new origin", font_screen_scale=LABEL_SCALE)
         self._handles = [label, grid, frame]
-
-
-def default_viewpoint(
-    rig: Rig | None,
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return a position and a target, metres, from which the whole rig is visible."""
-    centres = [camera.matrix()[:3, 3] for camera in (rig.placed() if rig else {}).values()]
-    low, high = (np.min(centres, 0), np.max(centres, 0)) if centres else (np.full(3, -2.0), np.full(3, 2.0))
-    distance = DISTANCE * max(MIN_RADIUS_M, float(np.linalg.norm(high - low)) / 2)
-    target = np.array([*(low + high)[:2] / 2, 0.45 * high[2]])
-    return tuple((target - distance * DIRECTION).tolist()), tuple(target.tolist())

@@ -11,8 +11,8 @@ from pathlib import Path
 import viser
 
 from calib.rig.recording import RecordingWriter
-from camera_node.config import require_name
 from camera_node.errors import ConfigError, RoundelError
+from fusion.recordings.files import recording_path, remove_recording, rename_recording
 from fusion.recordings.record import ArenaRecorder
 from fusion.recordings.summary import RecordingSummary, list_recordings
 from web.errors import WebError
@@ -26,6 +26,7 @@ SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")
 STEP_S = 1 / 30  # of the button Step
 LIST_INTERVAL = 9  # updates from one look at the folder to the next: about 3 s
 NO_RECORDING = "no recording yet"
+DELETE, CONFIRM = "Delete the recording", "Delete: click again"
 EXPORT_S = 1800.0
 CLOSE_S = 5.0  # for a recording to be completed when the page closes
 RECORDING_COLUMNS = (
@@ -133,6 +134,12 @@ class Recorder:
         self._answer = Answer(gui)
         self._button = ActionButton(gui, "Start recording", self.toggle, self._answer)
 
+    @property
+    def written(self) -> Path | None:
+        """The file that is being written; None for none."""
+        is_running = self._thread is not None and self._thread.is_alive()
+        return self._writer.path if self._writer is not None and is_running else None
+
     def toggle(self) -> str:
         """Start recording, or stop; returns the outcome. Raises ConfigError if the file can't be written."""
         with self._lock:
@@ -141,7 +148,7 @@ class Recorder:
                 self._thread.join(CLOSE_S)
                 return self._describe("recorded")
             name = self._name.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-            path = self._folder / f"{require_name(name, 'a recording').removesuffix('.mcap')}.mcap"
+            path = recording_path(self._folder, name)
             self._folder.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 raise ConfigError(f"{path} exists; give another name")
@@ -154,7 +161,7 @@ class Recorder:
 
     def update(self, state: ArenaState) -> None:
         """Show the progress."""
-        is_running = self._thread is not None and self._thread.is_alive()
+        is_running = self.written is not None
         label = "Stop recording" if is_running else "Start recording"
         self._button.show(enabled=is_running or state.server_alive, primary=is_running, label=label)
         if is_running:
@@ -181,18 +188,22 @@ class Recorder:
 
 
 class RecordingList:
-    """The recordings of a folder; the selected one can be played in the place of the arena, or exported.
+    """The recordings of a folder; the selected one can be played in the place of the arena, exported, renamed, deleted.
 
     Args:
         gui: where the controls are added.
         folder: the folder.
         show: plays a recording in the page, or shows the arena again for None.
+        recorder: which may be writing one of them.
     """
 
-    def __init__(self, gui: viser.GuiApi, folder: Path, show: Callable[[Path | None], None]) -> None:
-        self._folder, self._show = folder, show
+    def __init__(
+        self, gui: viser.GuiApi, folder: Path, show: Callable[[Path | None], None], recorder: Recorder
+    ) -> None:
+        self._folder, self._show, self._recorder = folder, show, recorder
         self._updates = 0
-        self._is_shown = False
+        self._shown: Path | None = None
+        self._confirmed: Path | None = None  # the recording that the next click deletes
         with gui.add_folder("Recordings"):
             self._table = gui.add_html("")
             self._selected = gui.add_dropdown("Recording", [NO_RECORDING])
@@ -201,31 +212,32 @@ class RecordingList:
             self._live = ActionButton(gui, "Back to the arena", self.back, answer)
             hint = "fuses the recording again and writes poses as CSV beside it"
             self._export = ActionButton(gui, "Export poses", self.export, answer, hint)
+            self._new_name = gui.add_text("New file name", "", hint="of the selected recording")
+            self._rename = ActionButton(gui, "Rename the recording", self.rename, answer)
+            self._delete = ActionButton(gui, DELETE, self.delete, answer, "for good, with the second click")
 
     def update(self, state: ArenaState) -> None:
         """Look at the folder every few seconds."""
         if self._updates % LIST_INTERVAL == 0:
-            found = list_recordings(self._folder)
-            set_content(self._table, tabulate_recordings(found).html())
-            names = tuple(summary.path.name for summary in found) or (NO_RECORDING,)
-            if names != tuple(self._selected.options):
-                self._selected.options = names
+            self._list()
         self._updates += 1
         is_any = self._selected.value != NO_RECORDING
-        self._replay.show(enabled=is_any)
-        self._export.show(enabled=is_any)
-        self._live.show(enabled=self._is_shown, primary=self._is_shown)
+        for button in (self._replay, self._export, self._rename):
+            button.show(enabled=is_any)
+        is_asked = is_any and self._confirmed == self._folder / str(self._selected.value)
+        self._delete.show(enabled=is_any, label=CONFIRM if is_asked else DELETE)
+        self._live.show(enabled=self._shown is not None, primary=self._shown is not None)
 
     def replay(self) -> str:
         """Play the selected recording."""
         self._show(self._path)
-        self._is_shown = True
+        self._shown = self._path
         return f"the page shows {self._path.name}"
 
     def back(self) -> str:
         """Show the arena."""
         self._show(None)
-        self._is_shown = False
+        self._shown = None
         return "the page shows the arena"
 
     def export(self) -> str:
@@ -233,6 +245,41 @@ class RecordingList:
         out = self._path.with_suffix(".csv")
         export_poses(self._path, out)
         return f"wrote {out}"
+
+    def rename(self) -> str:
+        """Give the selected recording another name."""
+        old = self._release()
+        new = rename_recording(old, str(self._new_name.value).strip())
+        self._new_name.value = ""
+        self._list()
+        return f"{old.name} is called {new.name} from now on"
+
+    def delete(self) -> str:
+        """Delete the selected recording, with the second click."""
+        path = self._path
+        if self._confirmed != path:
+            self._confirmed = path
+            return f"click again to delete {path.name} for good"
+        self._confirmed = None
+        remove_recording(self._release())
+        self._list()
+        return f"{path.name} is deleted"
+
+    def _release(self) -> Path:
+        """The selected recording, which is no longer played. Raises WebError while it is written."""
+        path = self._path
+        if path == self._recorder.written:
+            raise WebError(f"{path.name} is being recorded; stop the recording first")
+        if path == self._shown:
+            self.back()
+        return path
+
+    def _list(self) -> None:
+        found = list_recordings(self._folder)
+        set_content(self._table, tabulate_recordings(found).html())
+        names = tuple(summary.path.name for summary in found) or (NO_RECORDING,)
+        if names != tuple(self._selected.options):
+            self._selected.options = names
 
     @property
     def _path(self) -> Path:

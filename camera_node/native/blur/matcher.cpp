@@ -88,11 +88,33 @@ bool is_symmetric(const ImageView& image, const Streak& s, float min_contrast) {
            *most - *least < kMaxAsymmetry * contrast;
 }
 
+/// The points of a new roundel's templates, in steps from the middle along and across the motion.
+struct TemplateGrid {
+    std::array<float, NewTemplate::kPadded> along{}, across{};
+};
+constexpr TemplateGrid kTemplateGrid = [] {
+    TemplateGrid grid;
+    for (int k = 0; k < NewTemplate::kPoints; ++k) {
+        grid.along[size_t(k)] = float(k % NewTemplate::kAlong - NewTemplate::kAlong / 2);
+        grid.across[size_t(k)] = float(k / NewTemplate::kAlong - NewTemplate::kAcross / 2);
+    }
+    return grid;
+}();
+
+ROUNDEL_INLINE Lanes between(const Lanes& x, const Lanes& most) {
+    const Lanes positive = x > 0.0f ? x : all(0);
+    return positive < most ? positive : most;
+}
+
 }  // namespace
 
-MotionBlurMatcher::MotionBlurMatcher(const RoundelLimits& limits)
-    : min_contrast_(float(limits.min_contrast)) {
-    for (const Print& print : limits.prints)
+void MotionBlurMatcher::use_prints(std::span<const Print> prints) {
+    constexpr size_t kOfPrint = std::size(kLengths);
+    const auto is_same = [&](size_t k) { return templates_[k * kOfPrint].ratio == prints[k].ratio; };
+    size_t same = 0;
+    while (same < std::min(prints.size(), templates_.size() / kOfPrint) && is_same(same)) ++same;
+    templates_.erase(templates_.begin() + std::ptrdiff_t(same * kOfPrint), templates_.end());
+    for (const Print& print : prints.subspan(same))
         for (const double length : kLengths) templates_.emplace_back(print.ratio, length);
 }
 
@@ -121,19 +143,19 @@ std::vector<MovingMatch> MotionBlurMatcher::match_known(const ImageView& image, 
 }
 
 /// Nearest pixels; the image's border is repeated.
-void MotionBlurMatcher::sample(const ImageView& image, const DiscPlace& p, NewTemplate::Column& levels) {
-    constexpr int kAlong = NewTemplate::kAlong, kAcross = NewTemplate::kAcross;
+ROUNDEL_CLONES void MotionBlurMatcher::sample(const ImageView& image, const DiscPlace& p,
+                                              NewTemplate::Column& levels) {
     const auto c = float(std::cos(p.angle)), s = float(std::sin(p.angle));
-    const auto along = float(NewTemplate::kReachAlong / (kAlong / 2) * p.along / 2);
-    const auto across = float(NewTemplate::kReachAcross / (kAcross / 2) * p.across / 2);
-    const auto right = float(image.width - 1), bottom = float(image.height - 1);
-    for (int j = 0, k = 0; j < kAcross; ++j)
-        for (int i = 0; i < kAlong; ++i, ++k) {
-            const float a = along * float(i - kAlong / 2), b = across * float(j - kAcross / 2);
-            const float x = std::clamp(float(p.x) + a * c - b * s + 0.5f, 0.0f, right);
-            const float y = std::clamp(float(p.y) + a * s + b * c + 0.5f, 0.0f, bottom);
-            levels.at[size_t(k)] = float(image.row(int(y))[int(x)]);
-        }
+    const auto along = float(NewTemplate::kReachAlong / (NewTemplate::kAlong / 2) * p.along / 2);
+    const auto across = float(NewTemplate::kReachAcross / (NewTemplate::kAcross / 2) * p.across / 2);
+    const Lanes right = all(float(image.width - 1)), bottom = all(float(image.height - 1));
+    for (size_t k = 0; k < NewTemplate::kPadded; k += kLanes) {
+        const Lanes a = along * load(&kTemplateGrid.along[k]), b = across * load(&kTemplateGrid.across[k]);
+        const Lanes x = between(float(p.x) + a * c - b * s + 0.5f, right);
+        const Lanes y = between(float(p.y) + a * s + b * c + 0.5f, bottom);
+        const Bits column = __builtin_convertvector(x, Bits), row = __builtin_convertvector(y, Bits);
+        for (int n = 0; n < kLanes; ++n) levels.at[k + size_t(n)] = float(image.row(row[n])[column[n]]);
+    }
 }
 
 /// Replaces the best match by better ones among the selected templates.

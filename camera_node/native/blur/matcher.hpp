@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "blur/fit.hpp"
@@ -20,7 +21,11 @@ struct MovingMatch {
 /// Finds moving roundels by comparing the image with templates (see templates.hpp).
 class MotionBlurMatcher {
   public:
-    explicit MotionBlurMatcher(const RoundelLimits& limits);
+    explicit MotionBlurMatcher(const RoundelLimits& limits) : min_contrast_(float(limits.min_contrast)) {
+        use_prints(limits.prints);
+    }
+    /// New roundels are of these prints from now on.
+    void use_prints(std::span<const Print> prints);
 
     /// A roundel of the last frame, by its picture at the predicted position: the best three matches within
     /// `reach` pixels of it on a grid of a seventh of the minor axis, best first.

@@ -56,12 +56,6 @@ class Ray {
         while (t < last && !is_there()) ++t, u += du_, v += dv_;
         return t_ = t, t < last ? t : -1;
     }
-    /// The same with subpixel interpolation.
-    float turn(bool dark, float theta, float limit) {
-        const int below = int(std::ceil(theta)),
-                  pixel = dark ? walk<true>(below, limit) : walk<false>(below, limit);
-        return pixel < 0 ? -1 : between(pixel, theta);
-    }
     /// The position at which the level is theta, near the pixel that a walk found.
     float between(int pixel, float theta) const {
         float t = float(std::max(pixel - 2, 0)), before = level(t);
@@ -91,17 +85,25 @@ class Ray {
     int t_ = 0;
 };
 
-/// Grey levels at kRays points on the ellipse scaled by `scale`; negative outside of the image.
-inline std::array<float, kRays> levels_on(const ImageView& image, const Ellipse& e, double scale) {
-    std::array<float, kRays> levels;
-    const double c = std::cos(e.angle), s = std::sin(e.angle);
-    for (int k = 0; k < kRays; ++k) {
-        const Direction d = kDirections[size_t(k)];
-        const double along = scale * e.major / 2 * double(d.x), across = scale * e.minor / 2 * double(d.y);
-        levels[size_t(k)] =
-            sample(image, float(e.x + c * along - s * across), float(e.y + s * along + c * across));
+/// An ellipse of which levels are read.
+class EllipseLevels {
+  public:
+    explicit EllipseLevels(const Ellipse& e) : e_(e), cos_(std::cos(e.angle)), sin_(std::sin(e.angle)) {}
+    /// Grey levels at kRays points on the ellipse scaled by `scale`; negative outside of the image.
+    std::array<float, kRays> at(const ImageView& image, double scale) const {
+        std::array<float, kRays> levels;
+        const double a = scale * e_.major / 2, b = scale * e_.minor / 2;
+        for (size_t k = 0; k < kRays; ++k) {
+            const double along = a * double(kDirections[k].x), across = b * double(kDirections[k].y);
+            levels[k] = sample(image, float(e_.x + cos_ * along - sin_ * across),
+                               float(e_.y + sin_ * along + cos_ * across));
+        }
+        return levels;
     }
-    return levels;
-}
+
+  private:
+    const Ellipse& e_;
+    double cos_, sin_;
+};
 
 }  // namespace roundel

@@ -100,12 +100,14 @@ template <typename Work>
 void ChangeMask::visit(const Ellipse& e, const Work& work) {
     const double along = (kCard * e.major + kMargin) / 2, across = (kCard * e.minor + kMargin) / 2;
     const double c = std::cos(e.angle), s = std::sin(e.angle);
+    const double ux = c / along, uy = s / along, vx = -s / across, vy = c / across;
     const auto first = [&](double at) { return std::max(int((at - along) / kTile), 0); };
     const auto last = [&](double at, int count) { return std::min(int((at + along) / kTile), count - 1); };
-    for (int y = first(e.y); y <= last(e.y, rows_); ++y)
-        for (int x = first(e.x); x <= last(e.x, columns_); ++x) {
+    const int left = first(e.x), right = last(e.x, columns_), bottom = last(e.y, rows_);
+    for (int y = first(e.y); y <= bottom; ++y)
+        for (int x = left; x <= right; ++x) {
             const double dx = (x + 0.5) * kTile - e.x, dy = (y + 0.5) * kTile - e.y;
-            const double u = (c * dx + s * dy) / along, v = (c * dy - s * dx) / across;
+            const double u = ux * dx + uy * dy, v = vx * dx + vy * dy;
             if (u * u + v * v < 1) work(size_t(y) * size_t(columns_) + size_t(x));
         }
 }

@@ -124,7 +124,7 @@ int darkest(const Level& level, int begin, int end) {
 
 }  // namespace
 
-ChordSearch::ChordSearch(const RoundelLimits& limits, bool any) {
+void ChordSearch::set_limits(const RoundelLimits& limits, bool any) {
     const auto [low, high] = limits.ratio_range(any);
     const double r = std::max(0.05, low), R = std::min(0.95, high);
     // The shortest chord through the centre is the minor axis.

@@ -45,7 +45,8 @@ struct Proportions {
 class ChordSearch {
   public:
     /// Searches for the prints in use, or for `any` print.
-    ChordSearch(const RoundelLimits& limits, bool any);
+    ChordSearch(const RoundelLimits& limits, bool any) { set_limits(limits, any); }
+    void set_limits(const RoundelLimits& limits, bool any);
     void run(const ImageView& image, const ThresholdMap& threshold);
     /// The seeds of the last image; a roundel may have several.
     const std::vector<Seed>& seeds() const { return seeds_; }
@@ -80,7 +81,7 @@ class ChordSearch {
 
     Proportions fine_{}, coarse_{}, limits_{};  // for rows and columns; for diagonals; for the current scan
     Raster raster_{};
-    int min_contrast_;  // grey levels
+    int min_contrast_ = 0;  // grey levels
     BitImage rows_, columns_, sparse_, diagonals_;
     std::unique_ptr<int[]> edges_;    // begin, end, begin, end, ... of the dark runs of some lines
     std::unique_ptr<int[]> numbers_;  // of the bright runs with diametral proportions

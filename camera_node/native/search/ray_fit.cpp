@@ -62,8 +62,8 @@ Crossings cast(const ImageView& image, const Seed& seed, const RatioRange& ratio
     return crossings;
 }
 
-double median_level(const ImageView& image, const Ellipse& e, double scale) {
-    auto levels = levels_on(image, e, scale);
+double median_level(const ImageView& image, const EllipseLevels& on, double scale) {
+    auto levels = on.at(image, scale);
     std::nth_element(levels.begin(), levels.begin() + kRays / 2, levels.end());
     return double(levels[kRays / 2]);
 }
@@ -76,8 +76,9 @@ std::optional<InitialGuess> cast_and_fit(const ImageView& image, const Seed& see
     auto [outer, ratio] = *circles;
     if (!(std::hypot(outer.x, outer.y) < outer.major)) return std::nullopt;
     outer.x += double(seed.x), outer.y += double(seed.y);
-    return InitialGuess{outer, ratio, median_level(image, outer, (1 + ratio) / 2),
-                        median_level(image, outer, ratio / 3)};
+    const EllipseLevels on(outer);
+    return InitialGuess{outer, ratio, median_level(image, on, (1 + ratio) / 2),
+                        median_level(image, on, ratio / 3)};
 }
 
 bool is_plausible(const InitialGuess& guess, const RoundelLimits& limits) {

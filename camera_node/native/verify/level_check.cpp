@@ -12,9 +12,10 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
     const double contrast = fit.contrast(), edge = 2 * fit.blur;  // levels further away are constant
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
+    const EllipseLevels on(e);
     LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
-        for (const float value : levels_on(image, e, scale)) {
+        for (const float value : on.at(image, scale)) {
             if (value < 0) continue;
             const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
             ++samples.total, samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
@@ -29,17 +30,19 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
 
 bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
     const float theta = float(fit.bright - depth * fit.contrast());
+    const int below = int(std::ceil(theta));
     const Ellipse& e = fit.outer;
+    const double c = std::cos(e.angle), s = std::sin(e.angle);
     float least = 1e9f, most = 0;
     for (int k = 0; k < kRays; k += 2) {
         Ray ray(image, float(e.x), float(e.y), kDirections[size_t(k)]);
         const auto limit = float(4 * e.major);
-        float edge = 0;
-        for (int ring = 0; ring < 3 && edge >= 0; ++ring)
-            if (ray.turn(true, theta, limit) < 0 || (edge = ray.turn(false, theta, limit)) < 0) return false;
+        int pixel = 0;
+        for (int ring = 0; ring < 3; ++ring)
+            if (ray.walk<true>(below, limit) < 0 || (pixel = ray.walk<false>(below, limit)) < 0) return false;
+        const float edge = ray.between(pixel, theta);
         const double u = double(kDirections[size_t(k)].x), v = double(kDirections[size_t(k)].y);
-        const double along = u * std::cos(e.angle) + v * std::sin(e.angle);
-        const double across = v * std::cos(e.angle) - u * std::sin(e.angle);
+        const double along = u * c + v * s, across = v * c - u * s;
         const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
         least = std::min(least, share), most = std::max(most, share);
     }

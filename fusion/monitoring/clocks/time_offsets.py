@@ -113,26 +113,90 @@ def offset_information(
     if not len(observations):
         return OffsetInformation.none(n)
     A, g, e = _equations(cameras, states, observations, single)
-    body = np.unique(observations.discs.body, return_inverse=True)[1]
     camera = observations.detections.camera
-    J = _jacobian(A, np.concatenate([g[:, :, None], _whitened_shifts(observations)], 2), body, camera, n)
-    k, weights = J.shape[2] - 3 * n, np.ones(len(e))
-    states_prior = np.tile(np.repeat([WEAK, WEAK, 1 / sigma_v**2], 3), k // len(FREE))
-    prior = np.concatenate([states_prior, np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
-    H, right = _normal_equations(J, e, weights)
+    D = np.concatenate([A, g[:, :, None], _whitened_shifts(observations), e[:, :, None]], 2)
+    rows = OffsetEquations.of(D, observations.discs.body, camera, n)
+    states_prior = np.repeat([WEAK, WEAK, 1 / sigma_v**2], 3)
+    prior = np.concatenate([np.full(n, 1.0), np.full(2 * n, 1 / SHIFT_PX**2)])
+    reduced, by_pose = rows.eliminate(np.ones(len(e)), states_prior)
     for _ in range(REWEIGHTED):
-        solution = np.linalg.solve(H + np.diag(prior), right)
-        weights = 1 / (1 + np.sum((e - J @ solution) ** 2, 1) / CAUCHY**2)
-        H, right = _normal_equations(J, e, weights)
-    H[np.arange(k), np.arange(k)] += states_prior
-    by_pose = np.linalg.solve(H[:k, :k], np.column_stack([H[:k, k:], right[:k]]))
-    motion = np.sum(g**2, axis=1) * _variance_px2(observations)
+        solution = np.asarray(np.linalg.solve(reduced[:, :-1] + np.diag(prior), reduced[:, -1]), float)
+        squared = rows.squared_residuals(solution, by_pose[:, :, -1] - by_pose[:, :, :-1] @ solution)
+        reduced, by_pose = rows.eliminate(1 / (1 + squared / CAUCHY**2), states_prior)
     return OffsetInformation(
-        H[k:, k:] - H[k:, :k] @ by_pose[:, :-1],
-        right[k:] - H[k:, :k] @ by_pose[:, -1],
-        np.bincount(camera, motion, n).astype(float),
+        reduced[:, :-1],
+        reduced[:, -1],
+        np.bincount(camera, np.sum(g**2, axis=1) * _variance_px2(observations), n).astype(float),
         np.bincount(camera, minlength=n).astype(float),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OffsetEquations:
+    """Linear equations of N detections, in the order of B bodies and, for each, of C cameras.
+
+    The unknowns are the free states of the bodies, then the time offsets of the cameras, then their image shifts. A
+    detection concerns one body and one camera, so the normal equations are sums over the P pairs of both, and the
+    bodies are eliminated one by one (Hartley and Zisserman, A6.3).
+
+    Attributes:
+        D: (N, 2, 13) derivatives by the state of the body, by offset and shift of the camera, and the residuals.
+        pair: (N,) of each detection.
+        body: (P,) of each pair.
+        columns: (P, 3) of each pair's camera, among offsets and shifts.
+        n_columns: 3 C.
+    """
+
+    D: Array
+    pair: Index
+    body: Index
+    columns: Index
+    n_columns: int
+
+    @classmethod
+    def of(cls, D: Array, body: Index, camera: Index, n_cameras: int) -> "OffsetEquations":
+        """From `D` in any order, and the body and the camera (N,) of each detection."""
+        key = np.unique(body, return_inverse=True)[1] * n_cameras + camera
+        order = np.argsort(key)
+        pairs, pair = np.unique(key[order], return_inverse=True)
+        camera = pairs % n_cameras
+        columns = np.stack([camera, n_cameras + 2 * camera, n_cameras + 2 * camera + 1], 1)
+        return cls(D[order], pair, pairs // n_cameras, columns, 3 * n_cameras)
+
+    def eliminate(self, weights: Array, states_prior: Array) -> tuple[Array, Array]:
+        """Eliminate the states of the bodies from the weighted normal equations.
+
+        Args:
+            weights: (N,) of the detections.
+            states_prior: (9,) information about each body's state.
+
+        Returns:
+            reduced: (3 C, 3 C + 1) matrix of the offsets and shifts, and their right side.
+            by_pose: (B, 9, 3 C + 1) inverse of each body's block times its border and its right side.
+        """
+        k, m = len(FREE), self.n_columns
+        weighted = self.D * weights[:, None, None]
+        sums = np.add.reduceat(self.D.transpose(0, 2, 1) @ weighted, _firsts(self.pair))
+        bodies = np.add.reduceat(sums, _firsts(self.body))
+        border = np.zeros((len(bodies), k, m + 1))
+        border[self.body[:, None], :, self.columns] = sums[:, :k, k:-1].transpose(0, 2, 1)
+        border[:, :, -1] = bodies[:, :k, -1]
+        by_pose: Array = np.asarray(np.linalg.solve(bodies[:, :k, :k] + np.diag(states_prior), border), float)
+        reduced: Array = np.zeros((m, m + 1))
+        np.add.at(reduced, (self.columns[:, :, None], self.columns[:, None]), sums[:, k:-1, k:-1])
+        np.add.at(reduced[:, -1], self.columns, sums[:, k:-1, -1])
+        reduced -= border[:, :, :-1].reshape(-1, m).T @ by_pose.reshape(-1, m + 1)
+        return reduced, by_pose
+
+    def squared_residuals(self, by_camera: Array, states: Array) -> Array:
+        """(N,) squared residuals of a solution: offsets and shifts (3 C,), and states (B, 9)."""
+        unknowns = np.concatenate([states[self.body], by_camera[self.columns]], 1)[self.pair]
+        return np.sum((self.D[:, :, -1] - (self.D[:, :, :-1] @ unknowns[:, :, None])[:, :, 0]) ** 2, 1)
+
+
+def _firsts(sorted_indices: Index) -> Index:
+    """The first place of each value in an ascending list."""
+    return np.flatnonzero(np.diff(sorted_indices, prepend=-1))
 
 
 def disagreement(info: OffsetInformation, min_shift_px: float) -> Disagreement | None:
@@ -208,35 +272,10 @@ def _equations(
     return rows[:, :, FREE], g, rows[:, :, 12]
 
 
-def _jacobian(A: Array, by_camera: Array, body: Index, camera: Index, n_cameras: int) -> Array:
-    """(N, 2, 9 B + 3 C): the free states of B bodies, then the time offsets of C cameras, then their image shifts.
-
-    Args:
-        A: (N, 2, 9) by the free states.
-        by_camera: (N, 2, 3) by the time offset and the image shift.
-        body, camera: (N,).
-        n_cameras: C.
-    """
-    size = A.shape[2]
-    k = size * (int(body.max()) + 1)
-    J, rows = np.zeros((len(A), 2, k + 3 * n_cameras)), np.arange(len(A))[:, None]
-    J[rows, :, size * body[:, None] + np.arange(size)] = A.transpose(0, 2, 1)
-    shift = k + n_cameras + 2 * camera
-    columns = np.stack([k + camera, shift, shift + 1], 1)
-    J[rows, :, columns] = by_camera.transpose(0, 2, 1)
-    return J
-
-
 def _whitened_shifts(observations: MatchedObservations) -> Array:
     """(N, 2, 2) whitened derivatives by a shift of the image: L^-1, where L L^T is the covariance."""
     cov = observations.detections.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov.transpose(2, 0, 1))), float)
-
-
-def _normal_equations(J: Array, e: Array, weights: Array) -> tuple[Array, Array]:
-    flat, root = J.reshape(-1, J.shape[2]), np.repeat(np.sqrt(weights), 2)
-    weighted = flat * root[:, None]
-    return weighted.T @ weighted, weighted.T @ (e.reshape(-1) * root)
 
 
 def _variance_px2(observations: MatchedObservations) -> Array:

@@ -2,6 +2,7 @@
 """The active rig and the history of its changes: loads, saves, undoes and redoes them."""
 
 import atexit
+import contextlib
 import logging
 import shutil
 import tempfile
@@ -125,6 +126,14 @@ class ActiveRig:
     def next(self) -> Rig:
         """The rig that `redo` restores; raises as `previous`."""
         return load_rig(self._history.next())
+
+    def neighbours(self) -> list[Rig]:
+        """The rigs in the files to which undo and redo would go; those that can't be read are left out."""
+        rigs = []
+        for path in () if self._is_unsaved else (*self._history.older()[-1:], *self._history.undone()[-1:]):
+            with contextlib.suppress(RoundelError):
+                rigs.append(load_rig(path))
+        return rigs
 
     def history(self) -> RigHistory:
         """All versions of the rig.

@@ -150,10 +150,11 @@ class Fuzzer:
     def _send_ghost_output(self) -> None:
         """To viewer, client and recorder: results of a server."""
         name = self.rng.choice(GHOSTS)
+        pose = self._sample("/pose") | {"robot": name}
         key, message = self.rng.choice(
             (
-                (self.keys.robot_pose(name), self._sample("/pose") | {"robot": name}),
-                (self.keys.poses, {"version": 1, "poses": [msgspec.msgpack.encode(self._sample("/pose"))]}),
+                (self.keys.robot_pose(name), pose),
+                (self.keys.poses, {"version": 1, "poses": [mutate(pose, self.rng)]}),
                 (assigned_key(self.arena, name), {"version": 1, "id": name, "name": name, "settings": {}}),
                 (self.keys.markers, self._sample("/markers")),
                 (self.keys.fusion_status, self._sample("/fusion/status")),

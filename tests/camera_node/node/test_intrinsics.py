@@ -62,13 +62,14 @@ def is_refined(roundels, found: DetectedRoundels) -> bool:
     return bool(np.allclose(roundels.cov, expected.cov, rtol=1e-5))
 
 
-def test_the_lens_is_asked_for_and_followed(network, eventually, found):
-    """The server is asked when it appears. A change is followed; what is no rig is ignored and logged; a rig without
-    the camera, or for images of another size, leaves the detections as measured."""
+def test_the_lens_is_asked_for_and_followed(network, eventually, found, caplog):
+    """The server is asked when it appears. A change is followed; what is no rig is counted and not logged; a rig
+    without the camera, or for images of another size, leaves the detections as measured."""
     router = network.router()
     queryable = router.declare_queryable(KEYS.rig, lambda query: query.reply(KEYS.rig, rig_of(LENS)))
     session = network.client()
-    lens = RigLens(session, KEYS, "cam0")
+    refused: list[None] = []
+    lens = RigLens(session, KEYS, "cam0", lambda: refused.append(None))
     assert lens.refine(found, SIZE) is found
     token = router.liveliness().declare_token(KEYS.fusion_alive)
     assert eventually(lambda: is_refined(lens.refine(found, SIZE), found))
@@ -81,6 +82,8 @@ def test_the_lens_is_asked_for_and_followed(network, eventually, found):
     publisher.put(rig_of(other))
     assert eventually(lambda: not is_refined(lens.refine(found, SIZE), found))
     assert lens.refine(found, SIZE) is not found
+    assert eventually(lambda: len(refused) == 4)
+    assert "is not used:" not in caplog.text
     publisher.put(encode(RigMessage(t_ns=1, rig=Rig(cameras={"north": LENS}))))
     assert eventually(lambda: lens.refine(found, SIZE) is found)
     token.undeclare()

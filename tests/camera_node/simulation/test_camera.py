@@ -50,6 +50,17 @@ def test_frames_have_the_cameras_exposure_times(scene_path):
     assert camera.dropped == (steps - 1).sum()
 
 
+def test_a_frame_of_a_rolling_shutter_arrives_when_its_last_row_is_read(tmp_path):
+    """It states the readout time, and its stamp is that of the middle row."""
+    camera = CAMERA | {"fps": 40.0, "readout_us": -20000.0, "exposure_us": 4000.0}
+    path = write_scene(tmp_path, {"disc": DISC}, {"disc": {}}, {"cam0": camera})
+    source = SimulatedCamera(path, "cam0", time.time_ns())
+    for frame in islice(source, 2):
+        assert time.time_ns() >= frame.t_ns + 12_000_000
+        assert frame.readout_us == -20000.0
+    source.close()
+
+
 def test_a_slow_reader_gets_the_newest_frame_and_the_others_are_counted(scene_path):
     """After five frame periods of other work, the next frame is at most one period old, plus its rendering."""
     epoch_ns = time.time_ns()

@@ -12,7 +12,7 @@ from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import load_lens
 from camera_node.geometry.pose import invert
-from camera_node.simulation.renderer import place_discs
+from camera_node.simulation.discs import place_discs
 from camera_node.simulation.scene import Scene, SceneCamera
 from tests.camera_node.scenes import CAMERA, DISC, load_disc, write_scene
 from tests.conftest import ROOT

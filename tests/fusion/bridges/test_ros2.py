@@ -224,6 +224,23 @@ def test_robots_with_equal_ros_names_are_counted():
         assert node.faults == {"poses of 'rover_2', which has the same ROS name as 'rover-2'": 2}
 
 
+def test_the_last_message_of_each_burst_is_express():
+    """Zenoh waits for more messages of a burst otherwise: 5 ms with 50 robots, `python -m tests.benchmarks.bridges`."""
+    received, names = queue.Queue(), ["a", "b", "c"]
+    with routing() as (session, _):
+        subscriber = session.declare_subscriber("0/**", received.put)
+        Ros2Node(session).publish([draw_pose(name) for name in names], "world")
+        samples = [received.get(timeout=DEADLINE_S) for _ in range(2 * len(names) + 1)]
+        subscriber.undeclare()
+    topics = [f"{name}/{kind}" for kind in ("odometry", "pose") for name in names] + ["tf"]
+    assert ["/".join(str(sample.key_expr).split("/")[1:-2]) for sample in samples] == topics
+    assert [topic for topic, sample in zip(topics, samples, strict=True) if sample.express] == [
+        "c/odometry",
+        "c/pose",
+        "tf",
+    ]
+
+
 @pytest.mark.parametrize("domain", ["-1", "233", "lab"])
 def test_an_invalid_domain_is_refused(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)

@@ -7,7 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.geometry.lens import Lens
-from fusion.model.undistortion import TOLERANCE_PX, TOLERANCE_SCALE, table_of, undistort
+from fusion.model.undistortion import (
+    MAX_CELLS,
+    TOLERANCE_PX,
+    TOLERANCE_SCALE,
+    UndistortionTable,
+    table_of,
+    undistort,
+)
 
 SIZE = {"width": 800, "height": 600, "cx": 402.0, "cy": 297.0}
 LENSES = {
@@ -58,3 +65,17 @@ def test_any_pixel_is_accepted(uv):
     xy, scale = undistort(lens, np.array(uv).reshape(-1, 2))
     assert xy.shape == (2, len(uv))
     assert (np.isfinite(scale).all((0, 1)) == np.isfinite(xy[0])).all()
+
+
+def test_the_largest_image_has_a_small_table():
+    """Before: 800 MB while the table of the largest image was made that a rig may contain."""
+    lens = Lens(
+        width=32768, height=32768, fx=3e4, fy=3e4, cx=16e3, cy=16e3, distortion=(-0.2, 0.05, 0.0, 0.0)
+    )
+    table = UndistortionTable(lens)
+    assert table.coefficients.nbytes < 8 * 20 * (2 * MAX_CELLS)
+    uv = np.random.default_rng(0).uniform(0, 32768, (200, 2))
+    xy, _ = table.look_up(uv)
+    known = np.isfinite(xy[0])
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(xy[:, known].T, lens.normalise(uv[known]), atol=2 * TOLERANCE_PX / 3e4)

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The points that show what the cameras see, in a real Viser server."""
 
-from collections.abc import Iterator
-
 import numpy as np
-import pytest
 import viser
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.geometry.pose import Pose, look_at
-from tests.conftest import free_port
 from tests.waiting import wait_for
 from web.feed import ArenaState
 from web.scene.coverage import MANY, SINGLE, CoverageVolume, colours, covered_points
@@ -39,13 +35,6 @@ def test_points_are_those_in_the_images_of_as_many_cameras():
 def test_a_rig_without_poses_has_no_points():
     points, count = covered_points(Rig(cameras={"c0": Camera(**LENS)}))
     assert (points.shape, count.shape) == ((0, 3), (0,))
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
-    yield server
-    server.stop()
 
 
 def test_the_check_box_shows_and_hides_the_points(server: viser.ViserServer):

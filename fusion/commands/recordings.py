@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`fusion recordings`: lists, renames and removes the recordings of a folder."""
+
+from pathlib import Path
+from typing import Literal
+
+from camera_node.errors import ConfigError
+from camera_node.terminal import say
+from fusion.recordings.files import remove_recording, rename_recording
+from fusion.recordings.summary import RecordingSummary, list_recordings
+
+USES = {"list": "[FOLDER]", "rename": "FILE NAME", "remove": "FILE..."}
+COUNTS = {"list": (0, 1), "rename": (2, 2), "remove": (1, 1000)}
+
+
+def recordings(
+    action: Literal["list", "rename", "remove"] = "list",
+    arguments: tuple[str, ...] = (),
+    /,
+) -> int:
+    """List the recordings (*.mcap) of a folder with length, size, cameras and robots, the newest first, or change them.
+
+    Args:
+        action: list [FOLDER]; rename FILE NAME, in the same folder; remove FILE... deletes them for good.
+        arguments: as the action needs them.
+    """
+    counts = COUNTS[action]
+    if not counts[0] <= len(arguments) <= counts[1]:
+        raise ConfigError(f"{len(arguments)} arguments; use roundel recordings {action} {USES[action]}")
+    paths = [Path(word) for word in arguments]
+    if action == "rename":
+        say(f"{paths[0]} is called {rename_recording(paths[0], arguments[1])} from now on")
+    elif action == "remove":
+        for path in paths:
+            remove_recording(path)
+            say(f"removed {path}")
+    else:
+        _list(paths[0] if paths else Path())
+    return 0
+
+
+def _list(folder: Path) -> None:
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder; name one with recordings")
+    for summary in list_recordings(folder):
+        say(_line(summary))
+
+
+def _line(summary: RecordingSummary) -> str:
+    length = "no index: roundel repair restores it" if summary.seconds is None else f"{summary.seconds:.1f} s"
+    names = f"{len(summary.cameras)} cameras, robots {', '.join(summary.robots) or 'none'}"
+    return f"{summary.path.name}: {length}, {summary.size_bytes / 1e6:.1f} MB, {names}"
