@@ -11,6 +11,7 @@ since noise of 0.1 px makes all detections outliers of a prediction that is 1 px
 import numpy as np
 
 from camera_node.arrays import Array, Mask
+from fusion import _core
 from fusion.model.observations import MatchedObservations
 from fusion.tracking.estimator import Estimator, Prediction
 
@@ -34,25 +35,39 @@ def jointly_compatible(
     variance = (cov[0, 0] + cov[1, 1]) / 2
     share = np.sqrt(variance / (variance + slack_px**2))[:, None]
     A, nu = A.reshape(-1, 2, 12) * share[:, :, None], nu.reshape(-1, 2) * share
+    order = np.argsort(observations.discs.body, kind="stable")
+    bodies, first, count = np.unique(observations.discs.body[order], return_index=True, return_counts=True)
+    row = np.repeat(np.arange(len(bodies)), count)
+    at = row, np.arange(len(order)) - first[row]
+    tables = np.zeros((len(bodies), int(count.max()), 2, 12)), np.zeros((len(bodies), int(count.max()), 2))
+    tables[0][at], tables[1][at] = A[order], nu[order]
     compatible = np.ones(len(nu), bool)
-    for body in np.unique(observations.discs.body).tolist():
-        rows = np.flatnonzero(observations.discs.body == body)
-        compatible[rows] = _compatible(A[rows], nu[rows], prediction.information[body])
+    compatible[order] = _compatible(*tables, prediction.information[bodies])[at]
     return compatible
 
 
 def _compatible(A: Array, nu: Array, information: Array) -> Mask:
-    """(N,) of one body, with whitened derivatives A (N, 2, 12), innovations nu (N, 2) and prior information."""
-    used = np.ones(len(nu), bool)
-    while used.any():
-        J = A[used].reshape(-1, 12)
-        covariance = np.linalg.inv(information + J.T @ J)
-        deviation = nu - A @ (covariance @ (J.T @ nu[used].ravel()))
-        explained = A @ covariance @ A.transpose(0, 2, 1)
-        S = np.eye(2) - explained[used]  # of residuals: the others predict nu with S^-1 - I more variance
-        d2 = np.einsum("ni,ni->n", deviation[used], np.linalg.solve(S, deviation[used][:, :, None])[:, :, 0])
-        worst = int(np.argmax(d2))
-        if d2[worst] <= MAX_DEVIATION:
-            break
-        used[np.flatnonzero(used)[worst]] = False
+    """(B, N) of B bodies: whitened derivatives A (B, N, 2, 12), innovations nu (B, N, 2) and prior information.
+
+    Rows of zeros, which fill the table, are compatible.
+    """
+    used, bodies = np.ones(nu.shape[:2], bool), np.arange(len(nu))
+    while len(bodies):
+        rows = used[bodies][:, :, None]
+        deviation = _deviations(A[bodies] * rows[..., None], nu[bodies] * rows, information[bodies])
+        worst = np.argmax(deviation, 1)
+        found = deviation[np.arange(len(bodies)), worst] > MAX_DEVIATION
+        bodies, worst = bodies[found], worst[found]
+        used[bodies, worst] = False
     return used
+
+
+def _deviations(A: Array, nu: Array, information: Array) -> Array:
+    """(B, N) squared deviations of each observation from the prediction and all others; 0 for rows of zeros."""
+    J, shape = A.reshape(len(A), -1, 12), nu.shape
+    CJ = J @ _core.inverses(information + J.transpose(0, 2, 1) @ J)
+    solution = J.transpose(0, 2, 1) @ nu.reshape(len(A), -1, 1)
+    u, v = np.moveaxis(nu - (CJ @ solution).reshape(shape), 2, 0)
+    (Bu, Bv), (Au, Av) = np.moveaxis(CJ.reshape(A.shape), 2, 0), np.moveaxis(A, 2, 0)
+    S_uu, S_vv, S_uv = 1 - (Bu * Au).sum(2), 1 - (Bv * Av).sum(2), -(Bu * Av).sum(2)  # of the residuals
+    return (S_vv * u * u - 2 * S_uv * u * v + S_uu * v * v) / (S_uu * S_vv - S_uv**2)
