@@ -79,8 +79,8 @@ class ExpectedMarkers:
 class Viewpoints:
     """The cameras of F frames."""
 
-    def __init__(self, camera: Index, centres: Array, moved: Array, /) -> None:
-        """Camera (F,), a row of the centres (C, 3); moved (F,) metres of the fastest marker until the frame."""
+    def __init__(self, camera: Index, centres: Array, /) -> None:
+        """Camera (F,), a row of the centres (C, 3)."""
 
 class MarkerCloud:
     """N triangulated markers, among which constellations are searched for."""
@@ -146,16 +146,23 @@ def inverses(information: Array, /) -> Array:
     """(K, 12, 12) inverses of positive definite matrices; raises RuntimeError for others."""
 
 def densest_ranges(
-    frames: Viewpoints, frame: Index, direction: Array, reach: Array, ranges: Array, /
+    frames: Viewpoints, frame: Index, direction: Array, reach: Array, moved: Array, ranges: Array, /
 ) -> Array:
     """(N,) range of each ray at which most rays of other cameras intersect it; NaN without intersections.
 
-    By ray: frame (N,), direction (N, 3), reach (N,) in metres per metre, ranges (N, K, 2): see
-    `native/ray_intersections.hpp`.
+    By ray: frame (N,), direction (N, 3), reach (N,) in metres per metre, moved (N,) metres of the fastest marker until
+    the ray's time, ranges (N, K, 2): see `native/ray_intersections.hpp`.
     """
 
 def ray_pairs(
-    frames: Viewpoints, frame: Index, direction: Array, reach: Array, ranges: Array, most: float, /
+    frames: Viewpoints,
+    frame: Index,
+    direction: Array,
+    reach: Array,
+    moved: Array,
+    ranges: Array,
+    most: float,
+    /,
 ) -> tuple[Index, Array]:
     """Rows (2, K) of rays of different cameras that miss each other by less than `most` tolerances.
 

@@ -15,6 +15,7 @@ import tyro
 import yaml
 
 from calib.rig.rig import load_rig
+from calib.wand.quality.grade import LIMITS
 from camera_node.commands.camera import JoinArena
 from tests.calib.stick import LENGTH_M, write_stick
 from tests.conftest import ROOT
@@ -127,6 +128,25 @@ def test_the_site_builds_in_strict_mode(tmp_path: Path):
     assert "WARNING" not in done.stderr, done.stderr
     assert "not included" not in done.stderr, done.stderr
     assert (tmp_path / "first_arena.html").exists()
+
+
+def test_the_calibration_page_has_the_limits_of_every_figure():
+    """In a row of its table, in pixels or percent."""
+    rows = re.findall(
+        r"^\| [^|]+ \|((?: [0-9.]+ (?:px|%) \|){3})", (ROOT / "docs" / "calibration.md").read_text(), re.M
+    )
+    stated = {tuple(float(x) for x in re.findall(r"[0-9.]+", row)) for row in rows}
+    shown = {
+        tuple((1 if name.endswith("px") else 100) * x for x in limits) for name, limits in LIMITS.items()
+    }
+    assert sum(sorted(stated), ()) == pytest.approx(sum(sorted(shown), ()))
+
+
+@pytest.mark.slow
+def test_the_accuracy_page_has_the_table_of_its_script():
+    script = [sys.executable, str(ROOT / "docs" / "accuracy_table.py")]
+    done = subprocess.run(script, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout in (ROOT / "docs" / "accuracy.md").read_text()
 
 
 def test_the_first_arena_has_the_commands_of_the_readme():

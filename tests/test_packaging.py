@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The wheel works outside of the checkout and contains the right files."""
 
+import importlib.metadata
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -69,3 +73,49 @@ def test_a_wheel_contains_the_programs_only(wheel: Path):
 def test_the_native_module_computes():
     """A disc of 0.14 m whose major axis is 0.028 in the normalised image plane has a distance of 5 m."""
     assert abs(_core.distance_by_principal_axis(0.14, 0.028) - 5.0) < 1e-12
+
+
+ABSENT_SERVER = "tcp/127.0.0.1:9"
+ALONE = {
+    "mavlink": ("fusion mavlink rover --to udp:127.0.0.1:9 --connect", "none answers at tcp/127.0.0.1:9"),
+    "foxglove": ("fusion foxglove --port 0 --connect", "Foxglove at ws://127.0.0.1:"),
+    "streams": (
+        "camera_node --source rtsp://127.0.0.1:9/live --name north --connect",
+        "rtsp://127.0.0.1:9/live",
+    ),
+}
+
+
+def import_names(requirements: list[str]) -> set[str]:
+    """The top-level modules of required distributions that are installed."""
+    wanted = {re.split(r"[^A-Za-z0-9_.-]", text)[0].lower() for text in requirements}
+    found = importlib.metadata.packages_distributions().items()
+    return {name for name, owners in found if wanted & {owner.lower() for owner in owners}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", ALONE)
+def test_each_extra_works_without_the_packages_of_the_others(extra: str):
+    """The program starts: it says what it serves, or that its server or camera does not answer."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    others = import_names([text for name, texts in extras.items() if name != extra for text in texts])
+    absent = others - import_names([*project["dependencies"], *extras[extra]])
+    assert {"gtsam", "scipy", "viser", "mcap"} <= absent
+    line, expected = ALONE[extra]
+    program, *words = [*line.split(), ABSENT_SERVER]
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({sorted(absent)}); "
+        f"from {program}.__main__ import main; main()"
+    )
+    command = [sys.executable, "-c", code, *words]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            said = next((line for line in islice(process.stdout, 4) if expected in line), "")
+        finally:
+            process.kill()
+    assert said
+    assert "pip install" not in said

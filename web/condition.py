@@ -24,16 +24,17 @@ class Condition:
     text: str
 
 
-def assess(state: ArenaState, endpoint: str) -> Condition:
+def assess(state: ArenaState, endpoint: str, calibrating: str = "") -> Condition:
     """The worst fault of an arena, or its figures if it has none.
 
     Args:
         state: of a feed.
         endpoint: where the server is expected.
+        calibrating: what the operator should do in a calibration that began on this page; empty for none.
     """
     if is_relative(state):
         return _relative_condition(state)
-    faults = [*_server_faults(state, endpoint), *_camera_faults(state), *_robot_faults(state)]
+    faults = [*_server_faults(state, endpoint), *_camera_faults(state, calibrating), *_robot_faults(state)]
     for level in ("wait", "bad", "warn"):
         found = [fault for fault in faults if fault.level == level]
         if found:
@@ -84,15 +85,18 @@ def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
         yield Condition("bad", f"the server is silent for {age_s:.0f} s: check that it runs at {endpoint}")
 
 
-def _camera_faults(state: ArenaState) -> Iterator[Condition]:
+def _camera_faults(state: ArenaState, calibrating: str) -> Iterator[Condition]:
     if state.age_s(state.status) > STALE_S:
         return
     yield from _silent_cameras(state)
     if not state.cameras:
         yield Condition("warn", "no camera sends anything: start one with roundel camera")
         return
-    if state.rig is None or not state.rig.placed():
+    if calibrating:
+        yield Condition("warn", calibrating)
+    elif state.rig is None or not state.rig.placed():
         yield Condition("warn", "the cameras are not calibrated: open Calibrate and record a wand")
+    if state.rig is None or not state.rig.placed():
         return
     for row in tabulate_cameras(state).rows:
         if row.note and camera_silence_s(state, row.cells[0]) is None:

@@ -57,6 +57,7 @@ def add_live_page(
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
+            header.calibrating = panel.next_action
             closing.callback(panel.close)
             view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistoryPanel(gui, subscription), is_live=True)

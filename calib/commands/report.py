@@ -7,7 +7,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from calib.live.wand_session import SessionProgress
+from calib.live.session_progress import SessionProgress
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
@@ -114,6 +114,8 @@ def _remarks(report: WandReport) -> list[str]:
             f"standard deviation {report.length_std_mm:.2f} mm"
         )
     lines += _scale_remarks(report)
+    if report.background is not None:
+        lines.append(report.background.sentence())
     if left_out := report.left_out():
         lines.append("unused frames: " + ", ".join(f"{n} {reason}" for reason, n in left_out.most_common()))
     if report.outliers:

@@ -19,7 +19,8 @@ from calib.errors import CalibrationError
 from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
 from calib.live.camera_sizes import running_camera_sizes
 from calib.live.collect import CollectedFrames
-from calib.live.wand_session import MAX_SECONDS, WandSession, run_wand_session
+from calib.live.trials import MAX_SECONDS, WandSession
+from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
@@ -31,6 +32,7 @@ from calib.wand.scale import Distance
 from camera_node.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from camera_node.sources.observations import read_observations
 from camera_node.terminal import console, progress_console, say
 
 PROGRAM = "calib wand"
@@ -68,6 +70,9 @@ class Wand(WandOptions):
     """Collect for this long; by default until more frames would not improve the result, at most three minutes."""
     only: str | None = None
     """Calibrate the pose of this camera only, from a short recording; the other cameras keep theirs."""
+    background: Path | None = None
+    """Points beside the wand, at unknown places, that stand still or move: a CSV as for --observations, in which marker
+    is the number of the point, the same in all cameras. They make the cameras accurate where nobody waves the wand."""
     widen_lenses: float = 1.0
     """Multiply the standard deviations of the lenses by this, 1 or more: for lenses that changed since they were
     calibrated, or that are farther off than usual."""
@@ -85,6 +90,8 @@ class Wand(WandOptions):
             raise ConfigError(
                 "--distance and --only exclude each other: the rig's other cameras keep its scale"
             )
+        if self.background is not None and self.only is not None:
+            raise ConfigError("--background and --only exclude each other: calibrate all cameras with it")
         if self.live:
             self._calibrate_live(rig, wand)
             return
@@ -116,7 +123,8 @@ class Wand(WandOptions):
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> Rig:
         with progress_console().status("calibrating camera poses"):
-            result = calibrate(rig, wand, messages, distance, self.synchronised)
+            beside = self._read_background(rig)
+            result = calibrate(rig, wand, messages, distance, self.synchronised, beside)
         quality = assess(result, wand, self.height)
         print_report(result, quality)
         if self.maps is not None:
@@ -125,6 +133,17 @@ class Wand(WandOptions):
         if "lenses" in rig.calibration:
             figures["lenses"] = rig.calibration["lenses"]
         return msgspec.structs.replace(result.rig, calibration=figures)
+
+    def _read_background(self, rig: Rig) -> Sequence[Detections]:
+        """The images of the background points.
+
+        Raises:
+            ConfigError: the file is not usable.
+        """
+        if self.background is None:
+            return ()
+        sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
+        return read_observations(self.background, sizes, self.fps)
 
     def _calibrate_one(self, rig: Rig, wand: Body, messages: Sequence[Detections], name: str) -> Rig:
         with progress_console().status(f"calibrating the pose of {name}"):

@@ -19,7 +19,7 @@ from calib.intrinsics.adjustment import (
 )
 from calib.intrinsics.board import BoardFinder, CharucoFinder
 from calib.intrinsics.calibrated_lens import CalibratedLens, aspect_ratio, projection_sigma_px
-from calib.rig.camera import Camera
+from calib.rig.camera import Camera, stated_sigma
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.rig import Rig
 from camera_node.arrays import Array, Grey
@@ -103,7 +103,7 @@ class BoardViews:
             _check_lens(adjusted, coverage, sigma_px)
         except CalibrationError as error:
             raise CalibrationError(f"camera '{self.camera}': {error}") from None
-        lens_sigma = tuple(float(x) for x in np.sqrt(np.diag(adjusted.covariance)))
+        lens_sigma = stated_sigma(adjusted.lens, np.sqrt(np.diag(adjusted.covariance)).tolist())
         camera = Camera(**msgspec.structs.asdict(adjusted.lens), lens_sigma=lens_sigma)
         return CalibratedLens(camera, adjusted, views, self.frames, rejected, coverage, sigma_px)
 

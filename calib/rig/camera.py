@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera: a lens with a pose and a clock offset, and the Jacobians of its pixels."""
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -17,6 +18,10 @@ AnyLens = TypeVar("AnyLens", bound=Lens)
 # cy, k1, log fx / fy, and the four distortion coefficients after k1, of which a fisheye has three.
 POSE, OFFSET, DRIFT, READOUT, LENS = tuple(range(6)), (6,), (7,), (8,), tuple(range(9, 18))
 PER_CAMERA = 18
+
+# How far focus, temperature and remounting move a lens from its own calibration: relative focal length, pixels of the
+# principal point, and distortion coefficients (k1, k2, p1, p2, k3 of a pinhole lens).
+FOCAL_STABILITY, CENTRE_STABILITY, DISTORTION_STABILITY = 5e-4, 0.3, (5e-4, 2e-4, 2e-5, 2e-5, 2e-4)
 
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -69,6 +74,14 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         if self.T_world_cam is None:
             raise ValueError("the camera has no pose")
         return self.T_world_cam.matrix()
+
+
+def stated_sigma(lens: Lens, sigma: Sequence[float]) -> tuple[float, ...]:
+    """`Camera.lens_sigma` of a lens whose own calibration has standard deviations `sigma`, in the order of its
+    `parameters`: those, but not below the stability of a lens in use, because who reads the file takes it literally."""
+    rest = (*DISTORTION_STABILITY, *[0.0] * len(sigma))
+    stability = (FOCAL_STABILITY * lens.fx, FOCAL_STABILITY * lens.fy, *[CENTRE_STABILITY] * 2, *rest)
+    return tuple(float(max(pair)) for pair in zip(sigma, stability, strict=False))
 
 
 def transform(T: Array, points: ArrayLike) -> Array:

@@ -22,7 +22,7 @@ from calib.wand.bundle_adjustment.problem import (
     State,
     WandObservations,
 )
-from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
+from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, add_background, build_problem
 from calib.wand.quality.checks import check_agreement, check_clocks, check_lenses, check_sizes, check_spacing
 from calib.wand.quality.held_out import triangulated_residuals
 from calib.wand.result import Validation
@@ -182,7 +182,7 @@ def _prepare_fine(
     problem = start.problem.with_free(POSE, LENS, *clocks.free)
     problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
     observations = with_disc_centres(problem, state, start.observations, recording.wand)
-    return Estimate(problem, state, observations)
+    return add_background(recording, Estimate(problem, state, observations))
 
 
 def _adjust_finely(fine: Estimate, inflation: float) -> Solution:

@@ -15,13 +15,14 @@ from calib.errors import CalibrationError, CameraFault
 from calib.rig.rig import Rig
 from calib.rig.wand_file import check_diameter
 from calib.wand.adjustment import RoughRig, Solution, adjust_rig
+from calib.wand.background import gather_background
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.conclusion import Placement, conclude
 from calib.wand.detections import count_frames
 from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
 from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
 from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO, TwoViewGeometry
-from calib.wand.labeling import WandRecording
+from calib.wand.labeling.labels import WandRecording
 from calib.wand.quality.checks import check_motion
 from calib.wand.quality.exchanges import FoundExchanges, find_exchanges
 from calib.wand.result import NOT_RECORDED, Exchange, WandCalibration
@@ -41,6 +42,7 @@ def calibrate(
     messages: Sequence[Detections],
     distance: Distance | None = None,
     synchronous: bool = False,
+    background: Sequence[Detections] = (),
 ) -> WandCalibration:
     """Estimate the poses and clocks of a rig's cameras from a wand recording.
 
@@ -50,6 +52,8 @@ def calibrate(
         messages: detections of all cameras, in any order; the `id` of a roundel, if given, is its marker number.
         distance: measured between two cameras: the scale for a wand of one marker, else compared with the wand.
         synchronous: frames with equal stamps are simultaneous; without this, the recording decides.
+        background: images of points beside the wand, at unknown positions, in the same clocks; the `id` of a roundel is
+            the number of its point in all cameras.
 
     Returns:
         the rig with poses and time offsets of all cameras that could be placed, and the report.
@@ -58,10 +62,15 @@ def calibrate(
         CalibrationError: the recording or the wand does not place two cameras, or most cameras contradict each other.
     """
     check_recording(rig, messages)
+    check_cameras(rig, background, "the background points")
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
     recording, timing = label_by_timing(rig, wand, messages, synchronous)
+    start_ns = min(message.t_ns for message in messages)
+    lenses = [rig.cameras[name] for name in recording.names]
+    beside = gather_background(background, recording.names, lenses, start_ns)
+    recording = replace(recording, background=beside)
     if not len(recording.detections):
         raise CalibrationError(_explain_no_wand(recording))
     check_motion(recording.detections, recording.names, recording.lenses)
@@ -74,11 +83,7 @@ def calibrate(
 def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
     """Raise CalibrationError if a recording does not fit the rig, or has fewer than two cameras."""
     sizes = {message.camera: (message.width, message.height) for message in messages}
-    if unknown := sorted(set(sizes) - set(rig.cameras)):
-        raise CalibrationError(
-            f"camera '{unknown[0]}' of the recording is not in the rig, which has "
-            f"{', '.join(sorted(rig.cameras))}; run roundel calibrate intrinsics --camera {unknown[0]}"
-        )
+    check_cameras(rig, messages, "the recording")
     if len(sizes) < 2:
         only = f"one camera, '{next(iter(sizes))}'" if sizes else "no camera"
         raise CalibrationError(f"the recording has {only}; a wand calibration needs two or more")
@@ -89,6 +94,15 @@ def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
                 f"camera '{name}' delivers {width} x {height} pixels, its intrinsics are for "
                 f"{lens.width} x {lens.height}; record at that size or calibrate the lens again"
             )
+
+
+def check_cameras(rig: Rig, messages: Sequence[Detections], of: str) -> None:
+    """Raise CalibrationError if messages come from a camera that is not in the rig."""
+    if unknown := sorted({message.camera for message in messages} - set(rig.cameras)):
+        raise CalibrationError(
+            f"camera '{unknown[0]}' of {of} is not in the rig, which has "
+            f"{', '.join(sorted(rig.cameras))}; run roundel calibrate intrinsics --camera {unknown[0]}"
+        )
 
 
 @dataclass(slots=True)

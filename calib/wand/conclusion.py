@@ -11,13 +11,14 @@ from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera
 from calib.rig.rig import Rig
 from calib.wand.adjustment import Solution
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.bundle_adjustment.eliminated_points import point_residuals
 from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import State, WandObservations
 from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lenses import find_lens_changes
-from calib.wand.result import CameraReport, Exchange, Outlier, WandCalibration, WandReport
+from calib.wand.result import BackgroundReport, CameraReport, Exchange, Outlier, WandCalibration, WandReport
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
 from calib.world.world_frame import move_rig, upright_frame
 from camera_node.arrays import Array
@@ -145,7 +146,17 @@ def _build_report(solution: Solution, covariance: CameraCovariance, placement: P
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },
         exchanges=list(placement.exchanges),
+        background=_report_background(adjusted),
     )
+
+
+def _report_background(adjusted: Adjusted) -> BackgroundReport | None:
+    problem, used = adjusted.problem, adjusted.background_used
+    if not len(used):
+        return None
+    errors = point_residuals(problem, adjusted.state)[used]
+    rms = float(np.sqrt((errors**2).sum(axis=1).mean())) if used.any() else float("nan")
+    return BackgroundReport(len(problem.background), len(used), float(1 - used.mean()), rms)
 
 
 def _report_camera(

@@ -21,7 +21,7 @@ from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_p
 from calib.wand.calibrate import check_recording
 from calib.wand.conclusion import adjusted_camera, clock_values
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling import WandRecording, label_recording
+from calib.wand.labeling.labels import WandRecording, label_recording
 from calib.wand.quality.checks import check_agreement, check_lenses
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body

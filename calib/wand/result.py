@@ -110,6 +110,39 @@ class Validation:
 
 
 @dataclass(frozen=True, slots=True)
+class BackgroundReport:
+    """Points beside the wand.
+
+    Attributes:
+        points: number of positions of points that were matched and located.
+        images: number of their images.
+        rejected: share of the images that contradict the rig.
+        residual_px: RMS distance of the others from their points.
+    """
+
+    points: int
+    images: int
+    rejected: float
+    residual_px: float
+
+    def sentence(self) -> str:
+        """State the figures."""
+        return (
+            f"{self.points} positions of background points in {self.images} images, {self.rejected:.1%} of these "
+            f"rejected: residual {self.residual_px:.3f} px"
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the entry for the `calibration` map of `rig.yaml`."""
+        return {
+            "points": self.points,
+            "images": self.images,
+            "rejected": round(self.rejected, 4),
+            "residual_px": round(self.residual_px, 4),
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class WandReport:
     """Figures of a wand calibration.
 
@@ -127,6 +160,7 @@ class WandReport:
         timing: whether the cameras are taken as synchronous, and why.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
         exchanges: cameras under whose names there are points of others; these were left out.
+        background: the points beside the wand, if any are given.
     """
 
     cameras: list[CameraReport]
@@ -144,6 +178,7 @@ class WandReport:
     timing: str
     adjusted_lenses: dict[str, Any]
     exchanges: list[Exchange]
+    background: BackgroundReport | None = None
 
     @property
     def residual_px(self) -> float:
@@ -179,6 +214,7 @@ class WandReport:
             "left_out": dict(self.left_out()),
             "unplaced": dict(self.unplaced),
             **self._exchanged(),
+            **({"background": self.background.as_dict()} if self.background else {}),
         }
 
     def _validation(self) -> dict[str, Any]:

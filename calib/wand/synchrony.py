@@ -16,7 +16,7 @@ from calib.wand.adjustment import RoughRig, adjust_coarsely, scale_rig
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.initialization.initial_rig import build_initial_rig
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling import WandRecording, label_recording
+from calib.wand.labeling.labels import WandRecording, label_recording
 from calib.wand.quality.held_out import triangulated_residuals
 from calib.wand.timing import MIN_COINCIDENT, coincident_share
 from camera_node.arrays import Mask

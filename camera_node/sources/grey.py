@@ -23,7 +23,8 @@ BAYER = {
     "GBRG": cv2.COLOR_BayerGR2GRAY,
     "BA81": cv2.COLOR_BayerRG2GRAY,  # SBGGR8
 }
-RAW = (*LUMA, *BAYER, "GREY", "Y10 ", "Y12 ", "Y16 ")
+DEPTH = {"Y10 ": 10, "Y12 ": 12}  # bits; Y16 states none, because sensors of fewer bits deliver it, too
+RAW = (*LUMA, *BAYER, *DEPTH, "GREY", "Y16 ")
 
 
 def to_grey(image: NDArray, fourcc: str | None = None) -> Grey:
@@ -41,18 +42,20 @@ def to_grey(image: NDArray, fourcc: str | None = None) -> Grey:
     elif fourcc in BAYER:
         image = cv2.cvtColor(image, BAYER[fourcc])
     if image.dtype == np.uint16:
-        return narrow(image)
+        return narrow(image, DEPTH.get(fourcc or ""))
     return image if image.strides[1] == image.itemsize == 1 else np.ascontiguousarray(image, np.uint8)
 
 
-def narrow(image: NDArray[np.uint16]) -> Grey:
+def narrow(image: NDArray[np.uint16], bits: int | None = None) -> Grey:
     """Scale grey of 10 to 16 bits (h, w) to 8 bits, rounded; full scale becomes 255.
 
-    Full scale is that of the smallest of 8, 10, 12, 14 and 16 bits that holds the brightest pixel, because uint16
-    arrays and image files do not state their depth.
+    Args:
+        image: grey levels.
+        bits: of full scale. None: the smallest of 8, 10, 12, 14 and 16 that holds the brightest pixel, because uint16
+            arrays and image files do not state their depth.
     """
     if not image.size:
         return np.empty(image.shape, np.uint8)
     brightest = int(image.max())
-    full = next(2**bits - 1 for bits in DEPTHS if brightest < 2**bits)
-    return cv2.convertScaleAbs(image, alpha=255 / full).astype(np.uint8, copy=False)
+    bits = bits or next(depth for depth in DEPTHS if brightest < 2**depth)
+    return cv2.convertScaleAbs(image, alpha=255 / (2**bits - 1)).astype(np.uint8, copy=False)

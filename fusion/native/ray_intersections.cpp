@@ -17,7 +17,11 @@ using Intersections = std::vector<std::vector<Intersection>>;  // by ray
 struct FrameRays {
     std::vector<size_t> ray;
     std::vector<double> x, y, z;
-    double reach = 0;  // largest tolerance, at the largest range
+    double reach = 0;                 // largest tolerance, at the largest range
+    double earliest = 0, latest = 0;  // of `Rays::moved`
+
+    /// The largest motion between a ray and one of these.
+    double most_moved(double moved) const { return std::max(moved - earliest, latest - moved); }
 };
 
 std::vector<FrameRays> rays_by_frame(const Rays& rays, size_t n_frames) {
@@ -25,6 +29,9 @@ std::vector<FrameRays> rays_by_frame(const Rays& rays, size_t n_frames) {
     for (size_t k = 0; k < rays.n; ++k) {
         FrameRays& of_frame = by_frame[rays.frame[k]];
         const Vector& d = rays.direction[k];
+        const bool is_first = of_frame.ray.empty();
+        of_frame.earliest = is_first ? rays.moved[k] : std::min(of_frame.earliest, rays.moved[k]);
+        of_frame.latest = is_first ? rays.moved[k] : std::max(of_frame.latest, rays.moved[k]);
         of_frame.ray.push_back(k);
         of_frame.x.push_back(d.x), of_frame.y.push_back(d.y), of_frame.z.push_back(d.z);
         of_frame.reach = std::max(of_frame.reach, rays.reach[k] * rays.max_range(k));
@@ -56,11 +63,7 @@ template <class To>
 class FramePair {
   public:
     FramePair(const Rays& rays, const Viewpoint& a, const Viewpoint& b, double most, To& to)
-        : rays_(rays),
-          baseline_(a.centre - b.centre),
-          moved_(std::abs(a.moved - b.moved)),
-          most_(most),
-          to_(to) {}
+        : rays_(rays), baseline_(a.centre - b.centre), most_(most), to_(to) {}
 
     /// All rays of `of_a` with all of `of_b`. Most pairs pass each other too far away at any range.
     void intersect(const FrameRays& of_a, const FrameRays& of_b) {
@@ -68,7 +71,8 @@ class FramePair {
         std::vector<double> misses(n);
         std::vector<size_t> near(n + 1);
         for (const size_t i : of_a.ray) {
-            const double reach = most_ * (rays_.reach[i] * rays_.max_range(i) + of_b.reach + moved_);
+            const double moved = of_b.most_moved(rays_.moved[i]);
+            const double reach = most_ * (rays_.reach[i] * rays_.max_range(i) + of_b.reach + moved);
             const Vector& d = rays_.direction[i];
             measure_misses(of_b, (1 / reach) * cross(baseline_, d), d, misses.data());
             size_t found = 0;
@@ -85,14 +89,15 @@ class FramePair {
         const double s = (c * we - wd) / parallax, t = (we - c * wd) / parallax;
         if (!(parallax > kMinParallax && s > 0 && t > 0 && rays_.allows(i, s) && rays_.allows(j, t))) return;
         const Vector between = w + s * d - t * e;
-        const double reach = std::hypot(rays_.reach[i] * s, rays_.reach[j] * t) + moved_;
+        const double moved = std::abs(rays_.moved[i] - rays_.moved[j]);
+        const double reach = std::hypot(rays_.reach[i] * s, rays_.reach[j] * t) + moved;
         const double distance = std::sqrt(dot(between, between));
         if (distance < most_ * reach) to_({i, j, s, t, distance, reach, parallax});
     }
 
     const Rays& rays_;
     const Vector baseline_;
-    const double moved_, most_;
+    const double most_;
     To& to_;
 };
 

@@ -10,20 +10,20 @@ namespace roundel::fusion {
 /// Squared sine of 3 degrees: rays closer to parallel do not determine a range.
 constexpr double kMinParallax = 0.00273905;
 
-/// The camera of a frame, its centre of projection, and how far the fastest marker moves between the time of
-/// the frame set and that of the frame (signed as the time).
+/// The camera of a frame, and its centre of projection.
 struct Viewpoint {
     int64_t camera;
     Vector centre;
-    double moved;
 };
 
-/// N viewing rays: frame, unit direction, tolerance (metres per metre of range), and the smallest and largest
-/// possible range for each of K marker sizes.
+/// N viewing rays: frame, unit direction, tolerance (metres per metre of range), how far the fastest marker
+/// moves between the time of the frame set and that of the ray (signed as the time), and the smallest and
+/// largest possible range for each of K marker sizes.
 struct Rays {
     const int64_t* frame;
     const Vector* direction;
     const double* reach;
+    const double* moved;
     const double* ranges;  // N x K x 2
     size_t n, n_sizes;
 

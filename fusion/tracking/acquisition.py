@@ -37,7 +37,7 @@ from fusion.tracking.track_table import TrackTable
 
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
-MAX_PAIRS = 200_000
+MAX_PAIRS = 80_000
 # The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
 # defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
 MAX_OTHER_PAIRS = 20_000

@@ -36,7 +36,7 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
         sys.exit(f"this machine can't run the benchmark: {reason}")
     with tempfile.TemporaryDirectory(prefix="roundel-first-arena-") as temporary:
         folder = Path(temporary)
-        recording = recording or folder / "recording"
+        recording = (recording or folder / "recording").resolve()  # its programs run in another folder
         if not recording.exists():
             render(recording)
         start = time.monotonic()

@@ -2,6 +2,7 @@
 """The status line names the worst fault and what to do; the next step follows the order of the work."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -50,6 +51,15 @@ def test_a_silent_camera_is_red_and_comes_first(healthy: ArenaState):
     condition = assess(with_silent(healthy, "north", 4.2), ENDPOINT)
     assert condition.level == "bad"
     assert condition.text == "camera north silent for 4 s: check its cable and its program (and 1 more)"
+
+
+def test_a_calibration_that_runs_comes_before_its_absence(healthy: ArenaState):
+    """The line says what to do in it; a silent camera is worse."""
+    uncalibrated = replace(healthy, rig=None)
+    assert assess(uncalibrated, ENDPOINT).text.startswith("the cameras are not calibrated")
+    for state in (uncalibrated, healthy):
+        assert assess(state, ENDPOINT, "wave the wand") == Condition("warn", "wave the wand")
+    assert assess(with_silent(healthy, "north", 4.2), ENDPOINT, "wave the wand").level == "bad"
 
 
 def test_a_robot_that_is_not_found_is_amber_with_its_reason(healthy: ArenaState):

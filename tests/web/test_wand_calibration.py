@@ -72,7 +72,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
     arena: LiveArena, shown: tuple[View, WandSessionPanel], files: CalibrationFiles
 ):
     """The rig and the recording are written; the page shows the grade, and that no server has the rig in force."""
-    (view, _), sent = shown, record(ARENA, 8.0)  # no noise
+    (view, panel), sent = shown, record(ARENA, 8.0)  # no noise
     with browsing(view) as page, open_client([arena.endpoint]) as session:
         with cameras_present(arena):  # without cameras the button is disabled
             page.get_by_role("button", name="Start wand session").click(timeout=30_000)
@@ -83,13 +83,16 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
         for name in ARENA.truth.cameras:
             page.get_by_text(name).first.wait_for(timeout=20_000)
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
+        assert "wave where" in panel.next_action()
         page.get_by_role("button", name="End wand session").click()
         page.get_by_text("accept or discard").wait_for(timeout=CALIBRATION_MS)
         assert not load_rig(files.rig).placed(), "nothing changes before the user accepts"
+        wait_for(lambda: "decide" in panel.next_action())
         page.get_by_role("button", name="Accept the calibration").click()
         page.get_by_text("but not in force: no server answers").wait_for(timeout=CALIBRATION_MS)
         page.get_by_text("grade").first.wait_for(timeout=20_000)
         page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
+        assert panel.next_action() == ""
     saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
     assert saved <= {(m.camera, m.t_ns) for m in sent}
     assert len(saved) > len(sent) / 2

@@ -43,7 +43,7 @@ def describe_rig(rig: Rig | None) -> str:
     """
     assessed = assess_calibration(rig, datetime.now(UTC))
     if rig is None or not assessed.placed:
-        return "not calibrated: start a wand session"
+        return "not calibrated yet"
     parts = [describe_calibration(assessed), f"{assessed.placed} of {len(rig.cameras)} cameras placed"]
     expected = rig.calibration.get("expected_mm")
     figures = [expected.get(key) for key in ("median", "worst")] if isinstance(expected, dict) else []

@@ -21,6 +21,7 @@ class Header:
     Attributes:
         tabs: by the names in `TABS`; controls that are added in a `with` block of one are in that tab.
         recording: the name of the recording that is shown in the place of the arena; empty for none.
+        calibrating: returns what to do next in a calibration that began on this page; empty for none.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class Header:
         gui = server.gui
         self._endpoint = endpoint
         self.recording = ""
+        self.calibrating: Callable[[], str] = str
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
         gui.set_panel_label(f"Roundel: {arena} at {endpoint}")
@@ -50,7 +52,7 @@ class Header:
 
     def update(self, state: ArenaState) -> None:
         """Show the condition of the arena, and the progress of the demo if it is recent."""
-        condition = assess(state, self._endpoint)
+        condition = assess(state, self._endpoint, self.calibrating())
         recorded = f"recording {self.recording}: " if self.recording else ""
         set_content(self._status, status_line(condition.level, recorded + condition.text))
         recent = state.progress and state.age_s(state.progress) < PROGRESS_S

@@ -14,8 +14,10 @@ import viser
 
 from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
 from calib.live.camera_sizes import running_camera_sizes
+from calib.live.session_progress import SessionProgress
+from calib.live.trials import WandSession
 from calib.live.wand_position import locate_wand
-from calib.live.wand_session import SessionProgress, WandSession, run_wand_session
+from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
@@ -66,6 +68,12 @@ class WandSessionPanel:
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
         self._wand = WandDrawing(server.scene)
         self._trial: Rig | None = None
+
+    def next_action(self) -> str:
+        """What the operator should do in the session, or with its result; empty if there is none."""
+        if self._session.is_running:
+            return "a wand session runs: wave where the table in Calibrate says"
+        return "a new calibration is ready: decide in Calibrate whether to use it" if self._candidate else ""
 
     def update(self, state: ArenaState) -> None:
         """Enable the button while cameras send, and colour it while it is the next step."""

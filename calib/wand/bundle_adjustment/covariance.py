@@ -101,6 +101,8 @@ def inflation_factor(adjusted: Adjusted) -> float:
     first = _first_intervals(adjusted.problem)
     if len(first) < MIN_BLOCKS:
         return 1.0
+    # Each background point is a block of its own.
+    first = np.append(first, np.arange(len(adjusted.problem.knot_s) - 1, len(adjusted.scores)))
     # At the optimum the scores sum to minus the priors' gradient: one degree of freedom of the blocks.
     scores = np.add.reduceat(adjusted.scores, first)
     scores = scores - scores.mean(axis=0)

@@ -2,6 +2,7 @@
 """Solves for a Levenberg-Marquardt step with GTSAM, which eliminates the knots first, then the cameras."""
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, cast
 
 import numpy as np
@@ -79,6 +80,7 @@ def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
     _add_views(graph, problem, groups)
     _add_motion(graph, groups)
     _add_priors(graph, system, count)
+    _add_background(graph, system, count)
     for camera in problem.estimated_cameras():
         added = damping * of_cameras[camera]
         graph.push_back(gtsam.HessianFactor(count + camera, np.diag(added), 0 * added, 0.0))
@@ -131,6 +133,24 @@ def _add_priors(graph: Any, system: LinearSystem, count: int) -> None:
             blocks = [part for camera, block in pairs for part in (count + camera, block)]
             unit = gtsam.noiseModel.Unit.Create(len(prior.error))
             graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, prior.error, unit))
+
+
+def _add_background(graph: Any, system: LinearSystem, count: int) -> None:
+    """Add what the background points say about the estimated cameras, whose keys begin at `count`: one factor for each
+    camera, and one for each pair; only their sum is positive definite."""
+    import gtsam
+
+    if not len(system.problem.background):
+        return
+    H, g = system.background.information, system.background.scores.sum(axis=0)
+    zero, none = np.zeros_like(H[0, :, 0]), np.zeros_like(g[0])
+    cameras = system.problem.estimated_cameras()
+    for camera in cameras:
+        graph.push_back(gtsam.HessianFactor(count + camera, H[camera, :, camera], g[camera], 0.0))
+    for a, b in combinations(cameras, 2):
+        both = H[a, :, b]
+        if both.any():
+            graph.push_back(gtsam.HessianFactor(count + a, count + b, zero, both, none, zero, none, 0.0))
 
 
 def _ordering(problem: Problem, count: int) -> Any:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from calib.rig.camera import LENS, Camera, with_distortion
+from calib.rig.camera import LENS, Camera, stated_sigma, with_distortion
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import inverse_information
 from calib.wand.bundle_adjustment.optimizer import Adjusted
@@ -28,8 +28,6 @@ from camera_node.geometry.lens import Lens
 FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005, 0.1)
 # Factors of these for a lens that the recording shows to be farther off: a file of another lens, or none.
 WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
-# Least standard deviations: focus, temperature or remounting change a lens by more than its calibration accounts for.
-MIN_SIGMA = np.array([5e-4, 0.3, 0.3, 5e-4, 2e-5, 2e-4, 2e-5, 2e-5, 2e-4])
 CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
 UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
 # Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
@@ -52,7 +50,8 @@ def calibrated_sigma(lens: Lens) -> Array | None:
     """(9,) standard deviations of the parameters (`LENS`) from the lens's file; None where it has none.
 
     The file does not state how fx and fy are correlated. They are nearly equal in relative terms, so the part of their
-    errors that is not common, and changes fx / fy, counts as a tenth.
+    errors that is not common, and changes fx / fy, counts as a tenth. Deviations of 0 declare a lens exact, and
+    coefficients after k1 without one count as exact.
     """
     if not isinstance(lens, Camera) or lens.lens_sigma is None:
         return None
@@ -60,7 +59,7 @@ def calibrated_sigma(lens: Lens) -> Array | None:
     focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
     k1, *higher = distortion or [K1]
     higher = [*higher, 0.0, 0.0, 0.0, 0.0][:4]
-    return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SIGMA)
+    return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SHARE * usual_sigma(lens))
 
 
 def coarse_sigma(lens: Lens) -> Array:
@@ -94,7 +93,7 @@ def parameter_sigma(lens: Lens, before: tuple[float, ...] | None, sigma: Array) 
     focal = float(np.hypot(focal, ratio / 2))
     count = len(lens.parameters)
     rest = (*(before or ()), *[0.0] * count)[9:count]
-    return (focal * lens.fx, focal * lens.fy, cx, cy, k1, *higher, *rest)[:count]
+    return stated_sigma(lens, (focal * lens.fx, focal * lens.fy, cx, cy, k1, *higher, *rest)[:count])
 
 
 def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:

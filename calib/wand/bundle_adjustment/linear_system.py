@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig.camera import LENS, PER_CAMERA, pixel_jacobians
+from calib.wand.bundle_adjustment.eliminated_points import PointInformation, eliminate_points
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import (
     LENGTH_SIGMA_M,
@@ -39,6 +40,7 @@ class LinearSystem:
         chain: (L, 12 B + 1, 12 B + 1) augmented Hessians of the motion terms, by interval: knot k's own terms are in
             interval k, the last knot's in the last interval.
         priors: of the cameras.
+        background: information of the background points on the cameras.
     """
 
     problem: Problem
@@ -47,6 +49,7 @@ class LinearSystem:
     bounds: Index
     chain: Array
     priors: list[CameraPrior]
+    background: PointInformation
 
     def diagonal(self) -> tuple[Array, Array]:
         """The Hessian's diagonal: (K, 6 B) of the knots and (C, d) of the cameras, without priors of the cameras."""
@@ -85,6 +88,7 @@ def linearize(
         bounds=2 * np.append(first, len(view)),
         chain=_linearize_motion(problem, state, weights),
         priors=camera_priors(problem, state),
+        background=eliminate_points(problem, state, weights.background),
     )
 
 

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.wand.bundle_adjustment.eliminated_points import accept, locate, locate_robustly, point_error_norms
 from calib.wand.bundle_adjustment.gtsam_step import solve_step
 from calib.wand.bundle_adjustment.linear_system import LinearSystem, linearize
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import (
+    Choice,
     ErrorNorms,
     Weights,
     error_norms,
@@ -43,8 +45,9 @@ class Adjusted:
         scale: ratio of the residuals to their assumed standard deviations, the square root of the variance factor.
         information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
             space is the gauge: the choice of the world, and of the time that clocks are relative to.
-        scores: (L, S d) gradients by interval between knots, without priors.
+        scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
         iterations: of all rounds.
+        background_used: images of background points that were not rejected.
         inflation: factor of the covariance for residuals that are correlated in time.
     """
 
@@ -56,6 +59,7 @@ class Adjusted:
     information: Array
     scores: Array
     iterations: int
+    background_used: Mask
     inflation: float = 1.0
 
 
@@ -85,6 +89,7 @@ def adjust(
         information=cameras.information,
         scores=cameras.scores,
         iterations=optimum.iterations,
+        background_used=optimum.weights.background,
     )
 
 
@@ -94,7 +99,8 @@ def with_information(adjusted: Adjusted, problem: Problem, observations: WandObs
     weights = find_weights(problem, observations, state)
     interrupted = error_norms(problem, observations, state, weights).interval > INTERRUPTED
     inliers = observations.select(used)
-    cameras = eliminate_motion(linearize(problem, inliers, state, weights.select(used, interrupted)))
+    chosen = weights.select(Choice(used, interrupted, adjusted.background_used))
+    cameras = eliminate_motion(linearize(problem, inliers, state, chosen))
     return replace(adjusted, problem=problem, information=cameras.information, scores=cameras.scores)
 
 
@@ -116,22 +122,37 @@ class _Optimum:
 def _optimize_exactly(
     problem: Problem, observations: WandObservations, state: State, rounds: int
 ) -> _Optimum:
-    iterations = 0
-    used, interrupted = np.zeros(len(observations), bool), np.zeros(len(problem.knot_s) - 1, bool)
+    iterations, none = 0, np.zeros(len(observations), bool)
+    choice = Choice(none, np.zeros(len(problem.knot_s) - 1, bool), np.zeros(len(problem.background.uv), bool))
     for _ in range(rounds):
         weights = find_weights(problem, observations, state)
-        norms = error_norms(problem, observations, state, weights)
-        spread = _spread(norms.observation[used] if used.any() else norms.observation)
-        accepted, broken = norms.observation < REJECTED * max(spread, 1.0), norms.interval > INTERRUPTED
-        if (accepted == used).all() and (broken == interrupted).all():
+        better = _choose(problem, observations, state, weights, choice)
+        if better.equals(choice):
             break
-        used, interrupted = accepted, broken
-        inliers, their_weights = observations.select(used), weights.select(used, interrupted)
+        choice = better
+        inliers, their_weights = observations.select(choice.observations), weights.select(choice)
+        state = locate(problem, state, choice.background)
         state, more = _levenberg_marquardt(problem, inliers, their_weights, state, robust=False)
         iterations += more
     else:
         weights = find_weights(problem, observations, state)
-    return _Optimum(state, used, weights.select(used, interrupted), iterations)
+    return _Optimum(state, choice.observations, weights.select(choice), iterations)
+
+
+def _choose(
+    problem: Problem, observations: WandObservations, state: State, weights: Weights, before: Choice
+) -> Choice:
+    """Reject observations and images of background points, and interrupt the motion prior, by the statistics of the
+    residuals; those that were used `before` give the spread of the observations."""
+    norms = error_norms(problem, observations, state, weights)
+    known = norms.observation[before.observations] if before.observations.any() else norms.observation
+    beside = point_error_norms(problem, locate_robustly(problem, state))
+    most = REJECTED * max(_spread(beside), 1.0) if len(beside) else REJECTED
+    return Choice(
+        observations=norms.observation < REJECTED * max(_spread(known), 1.0),
+        interrupted=norms.interval > INTERRUPTED,
+        background=accept(problem, beside, most),
+    )
 
 
 def _spread(norms: Array) -> float:
@@ -145,9 +166,11 @@ def _noise_scale(problem: Problem, observations: WandObservations, state: State,
     B, knots = len(problem.wand.basis), len(problem.knot_s)
     connected = weights.motion.any(axis=(1, 2))
     equations = 2 * len(observations) + 6 * B * int(connected.sum()) + len(problem.wand.lengths) * knots
+    equations += 2 * int(weights.background.sum())
     moving = np.append(connected, False) | np.append(False, connected)
     with_prior = np.isfinite(problem.prior_sigma()).sum()
     parameters = 3 * B * (knots + int(moving.sum()))
+    parameters += 3 * len(np.unique(problem.background.point[weights.background]))
     parameters += len(problem.free) * len(problem.lenses) - 6 - with_prior
     chi2 = 2 * error_norms(problem, observations, state, weights).cost()
     return float(np.sqrt(chi2 / max(equations - parameters, equations / 10)))
@@ -211,6 +234,7 @@ def _descend(objective: _Objective, before: _Step) -> _Step | None:
     while damping <= MAX_DAMPING:
         try:
             state = objective.problem.retract(before.state, *solve_step(system, damping))
+            state = locate(objective.problem, state, objective.weights.background)
             norms = objective.norms(state)
             if (cost := objective.cost(norms)) <= before.cost:
                 return _Step(state, norms, cost, damping)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The data of the wand's bundle adjustment: observations, unknowns (`State`) and constants (`Problem`)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
+from calib.wand.background import BackgroundPoints
 from calib.wand.trajectory import AffineWand
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
@@ -77,12 +78,14 @@ class State:
         clocks: (C, 3) time offset, s, drift, s/s, and readout time beside the given one, s (`true_times`).
         lenses: (C, 9) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
         motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
+        points: (J, 3) positions of the background points, world.
     """
 
     cameras: Array
     clocks: Array
     lenses: Array
     motion: Array
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
@@ -91,13 +94,15 @@ class State:
         return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion)
 
     def retract(self, camera_step: Array, motion_step: Array) -> "State":
-        """Add a step: (C, 18) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion."""
+        """Add a step: (C, 18) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion.
+        Points follow from the cameras (`eliminated_points`)."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
         clocks, lenses = self.clocks + camera_step[:, 6:9], self.lenses + camera_step[:, 9:]
-        return State(cameras, clocks, lenses, self.motion + motion_step.reshape(self.motion.shape))
+        motion = self.motion + motion_step.reshape(self.motion.shape)
+        return State(cameras, clocks, lenses, motion, self.points)
 
     def true_times(self, observations: "TimedRows", middle_s: float) -> Array:
         """(n,) true capture times: stamp + offset + drift (stamp - `middle_s`) + readout time x height in the image."""
@@ -137,6 +142,7 @@ class Problem:
         estimated: cameras that are estimated, the others are fixed; None for all.
         covariance_lens_sigma: (C, 9) prior standard deviations for the covariance; `lens_sigma` if None.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
+        background: images of the background points.
     """
 
     lenses: list[Lens]
@@ -152,6 +158,7 @@ class Problem:
     estimated: tuple[int, ...] | None = None
     covariance_lens_sigma: Array | None = None
     drift_sigma: float = SLEWED_DRIFT
+    background: BackgroundPoints = field(default_factory=BackgroundPoints.none)
 
     def prior_sigma(self) -> Array:
         """(C, d) prior standard deviations of the free parameters in the estimate; infinite for poses."""
@@ -209,7 +216,7 @@ class Problem:
         factor = distance / float(np.linalg.norm(state.cameras[a, :3, 3] - state.cameras[b, :3, 3]))
         cameras = state.cameras.copy()
         cameras[:, :3, 3] *= factor
-        return replace(state, cameras=cameras, motion=factor * state.motion)
+        return replace(state, cameras=cameras, motion=factor * state.motion, points=factor * state.points)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.wand.background import match_points
+from calib.wand.bundle_adjustment.eliminated_points import start_points
 from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_frames
 from calib.wand.bundle_adjustment.initial_motion import initial_positions
 from calib.wand.bundle_adjustment.lens_prior import coarse_sigma
 from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
 from calib.wand.detections import WandDetections, normalise
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling import WandRecording
+from calib.wand.labeling.labels import WandRecording
 from calib.wand.timing import Timing
 from calib.wand.tracks import MarkerTrack, build_tracks
 from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
@@ -36,6 +38,7 @@ class LabeledRecording:
         timing: how their frames are related in time.
         middle_s: stamp in the middle of the recording, at which time offsets are defined.
         readout_s: (C,) given readout times, which the times of detections contain.
+        background: images of background points in these cameras, if there are any.
     """
 
     detections: WandDetections
@@ -46,6 +49,7 @@ class LabeledRecording:
     timing: Timing
     middle_s: float
     readout_s: Array
+    background: WandDetections | None = None
 
     @classmethod
     def of(
@@ -54,11 +58,11 @@ class LabeledRecording:
         """The cameras `placed` of a recording, renumbered in this order."""
         number = np.full(len(recording.names), -1)
         number[placed] = np.arange(len(placed))
-        detections = recording.detections.select(number[recording.detections.camera] >= 0)
+        detections = _renumber(recording.detections, number)
         t_s, given_s = recording.frames.t_s, recording.frames.readout_s
         last = np.searchsorted(recording.frames.camera, placed, side="right") - 1
         return cls(
-            replace(detections, camera=number[detections.camera]),
+            detections,
             [recording.names[k] for k in placed],
             [recording.lenses[k] for k in placed],
             [pairs.tracks[k] for k in placed],
@@ -66,6 +70,7 @@ class LabeledRecording:
             recording.timing,
             float(t_s.min() + t_s.max()) / 2,
             given_s[last],
+            None if recording.background is None else _renumber(recording.background, number),
         )
 
     def with_centres(self, rows: Index, uv: Array) -> "LabeledRecording":
@@ -101,6 +106,12 @@ class LabeledRecording:
             for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
         ]
         return replace(self, tracks=tracks)
+
+
+def _renumber(detections: WandDetections, number: Index) -> WandDetections:
+    """The detections of the cameras whose `number` (C,) is not negative, under these."""
+    camera = number[detections.camera]
+    return replace(detections, camera=camera).select(camera >= 0)
 
 
 def build_problem(
@@ -140,6 +151,16 @@ def build_problem(
     )
     motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
     return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
+
+
+def add_background(recording: LabeledRecording, estimate: Estimate) -> Estimate:
+    """The estimate with the recording's background points, matched and located by its cameras and clocks."""
+    if (images := recording.background) is None:
+        return estimate
+    problem, state = estimate.problem, estimate.state
+    points = match_points(images, state.true_times(images, problem.middle_s), problem.gap_s)
+    problem, state = start_points(problem, state, points)
+    return replace(estimate, problem=problem, state=state)
 
 
 def _choose_detections(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig.camera import POSE
+from calib.wand.bundle_adjustment.eliminated_points import BEHIND, point_error_norms
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.trajectory import (
     SplineLocation,
@@ -25,7 +26,6 @@ from camera_node.geometry.lens import Lens
 LENGTH_SIGMA_M = 2e-4  # by which a wand bends while it moves
 SPEED_SIGMA = 3.0  # metres per second of a hand
 SCALE_SIGMA = 1e-6  # relative, of a distance that fixes the scale
-BEHIND = 1e4  # sigmas: the residual of a point behind its camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +37,35 @@ class Weights:
         motion: (L, 2, 4) whitened deviations from constant velocity, as factors of p0, v0, p1, v1, of each interval
             between knots; zero across gaps.
         observation, interval: (n,) and (L,) robust weights of either.
+        background: which images of background points are used.
     """
 
     pixel: Array
     motion: Array
     observation: Array
     interval: Array
+    background: Mask
 
-    def select(self, rows: Mask, interrupted: Mask) -> "Weights":
-        """The weights of some observations, without the motion prior in `interrupted` intervals (L,)."""
+    def select(self, choice: "Choice") -> "Weights":
+        """The weights of what was chosen."""
         motion = self.motion.copy()
-        motion[interrupted] = 0.0
-        return Weights(self.pixel[rows], motion, self.observation[rows], self.interval)
+        motion[choice.interrupted] = 0.0
+        rows = choice.observations
+        return Weights(self.pixel[rows], motion, self.observation[rows], self.interval, choice.background)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which of the n `observations` and of the images of `background` points are used, and in which of the L intervals
+    between knots the motion prior is `interrupted`."""
+
+    observations: Mask
+    interrupted: Mask
+    background: Mask
+
+    def equals(self, other: "Choice") -> bool:
+        """Whether both choices are the same."""
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in self.__slots__)
 
 
 def find_weights(problem: Problem, observations: WandObservations, state: State) -> Weights:
@@ -69,7 +86,8 @@ def find_weights(problem: Problem, observations: WandObservations, state: State)
     dt = np.diff(problem.knot_s)
     smooth, near = np.zeros((len(dt), 2, 4)), (dt <= problem.gap_s) & (dt > 0)
     smooth[near] = whitened_constant_velocity(dt[near], problem.density)
-    return Weights(pixel, smooth, np.ones(len(observations)), np.ones(len(dt)))
+    every = np.ones(len(problem.background.uv), bool)
+    return Weights(pixel, smooth, np.ones(len(observations)), np.ones(len(dt)), every)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +241,8 @@ def error_norms(
     size = 6 * len(problem.wand.basis)
     interval = np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / size)
     priors = (prior.error for prior in camera_priors(problem, state))
-    rest = sum((term**2).sum() for term in (lengths, speed, *priors))
+    beside = point_error_norms(problem, state)[weights.background]
+    rest = sum((term**2).sum() for term in (lengths, speed, beside, *priors))
     pixel = whitened_errors(problem, observations, state, weights)
     return ErrorNorms(np.linalg.norm(pixel, axis=1), interval, size, float(rest))
 

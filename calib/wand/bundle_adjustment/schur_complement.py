@@ -19,7 +19,7 @@ class CameraInformation:
 
     Attributes:
         information: (S d, S d), with the cameras' priors.
-        scores: (L, S d) gradients by interval between knots, without the cameras' priors.
+        scores: (L + J, S d) gradients by interval between knots, then by background point, without the cameras' priors.
     """
 
     information: Array
@@ -37,6 +37,7 @@ def eliminate_motion(system: LinearSystem) -> CameraInformation:
     crossed = np.zeros((intervals, local, len(estimated), d))
     scores = np.zeros((intervals, len(estimated), d))
     own = prior_information(system)
+    own += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
     for interval, camera, N in _normal_equations(system):
         first = np.flatnonzero(np.diff(interval, prepend=-1))
         hessian[interval[first]] += np.add.reduceat(N[:, :local, :local], first)
@@ -52,7 +53,9 @@ def eliminate_motion(system: LinearSystem) -> CameraInformation:
     information = own.reshape(len(estimated) * d, -1) - joined.T @ G
     by_knot = G.reshape(intervals + 1, local // 2, -1)
     eliminated = gradient.reshape(intervals, 2, 1, -1) @ np.stack([by_knot[:-1], by_knot[1:]], axis=1)
-    return CameraInformation(information, scores.reshape(intervals, -1) - eliminated.sum(axis=1)[:, 0])
+    of_motion = scores.reshape(intervals, -1) - eliminated.sum(axis=1)[:, 0]
+    of_points = system.background.scores[:, estimated].reshape(-1, of_motion.shape[1])
+    return CameraInformation(information, np.concatenate([of_motion, of_points]))
 
 
 def prior_information(system: LinearSystem) -> Array:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE
+from calib.wand.background import BackgroundPoints
 from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
 from calib.wand.bundle_adjustment.problem import (
@@ -120,6 +121,7 @@ def _confirm(
         covariance_lens_sigma=None,
         estimated=problem.estimated and (*problem.estimated, after),
         drift_sigma=SLEWED_DRIFT,
+        background=BackgroundPoints.none(),
     )
     start = State(state.cameras[split], clocks, state.lenses[split], state.motion)
     start = optimize_robustly(two, _split(observations, camera, change.t_s, after), start)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """GenICam cameras (GigE Vision and USB3 Vision) as a source of frames."""
 
+import contextlib
 import queue
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +21,9 @@ from camera_node.sources.genicam.stream import GenicamStream, StampedImage
 from camera_node.sources.live import Capture, LiveSource
 
 POP_S = 0.1  # longest wait for one buffer, between looks at other requests
-SILENCE_S = 2.0  # without a frame, after which a camera that runs freely counts as lost
+START_S = 2.0  # longest wait for the first frame of a camera that runs freely
+SILENCE_S = 1.0  # without a further frame, after which it counts as lost
+REOPEN_S = 0.2  # between attempts, each of which waits for the camera's answer
 REQUEST_S = 10.0  # longest wait of another thread for the one that reads
 
 
@@ -51,7 +54,7 @@ class GenicamCapture(Capture):
             if controls:
                 check_controls(controls, self._camera.controls(), self.name)
             self._camera.configure(settings, controls)
-            self._silence_s = max(SILENCE_S, 3 / settings.fps if settings.fps else 0.0)
+            self._period_s = 1 / settings.fps if settings.fps else 0.0
             self._begin()
         except BaseException:
             self._camera.close()
@@ -76,12 +79,13 @@ class GenicamCapture(Capture):
             raise
 
     def _next(self) -> Frame | None:
-        end_s = time.monotonic() + self._silence_s
+        silence_s = max(SILENCE_S if self._has_delivered else START_S, 3 * self._period_s)
+        end_s = time.monotonic() + silence_s
         while time.monotonic() < end_s:
             self._serve()
-            self._clock.refresh()
             if (stamped := self._stream.pop(POP_S)) is not None:
-                self._known_lost = self._stream.lost_packets()
+                self._known_lost, self._has_delivered = self._stream.lost_packets(), True
+                self._clock.refresh()  # not of a silent camera: a request without an answer takes three seconds
                 return self._frame(stamped)
             if not self._camera.is_controlled():
                 raise CameraError("the camera does not answer any more, or another program took it over")
@@ -89,7 +93,7 @@ class GenicamCapture(Capture):
         if self._is_triggered:
             return None
         raise CameraError(
-            f"no complete frame within {self._silence_s:g} s, {self.incomplete} incomplete ones so far; "
+            f"no complete frame within {silence_s:g} s, {self.incomplete} incomplete ones so far; "
             "check the firewall (UDP) and the packet size"
         )
 
@@ -115,7 +119,7 @@ class GenicamCapture(Capture):
         self._clock = DeviceClock(self._camera.clock())
         self._clock.refresh()
         self._stream = GenicamStream(self._camera, self._camera.pixel_format())
-        self._known_lost = 0
+        self._known_lost, self._has_delivered = 0, False
 
     def _frame(self, stamped: StampedImage) -> Frame:
         t_ns, error_us = self._clock.to_unix(stamped.device_ns)
@@ -170,8 +174,20 @@ class GenicamCapture(Capture):
 
 
 def open_genicam(text: str, settings: SourceSettings) -> LiveSource:
-    """A source of frames of a camera by serial number, id or address; raises as `GenicamCapture`."""
-    return LiveSource(lambda now, controls: GenicamCapture(find_camera(text), now, controls), settings)
+    """A source of frames of a camera by serial number, id or address; raises as `GenicamCapture`.
+
+    A lost camera is tried at its last address, where it answers as soon as it returns, and then searched for.
+    """
+    last: list[FoundCamera] = []
+
+    def open_camera(now: SourceSettings, controls: Mapping[str, ControlValue]) -> GenicamCapture:
+        with contextlib.suppress(CameraError):
+            if last:
+                return GenicamCapture(last[0], now, controls)
+        last[:] = [find_camera(text)]
+        return GenicamCapture(last[0], now, controls)
+
+    return LiveSource(open_camera, settings, REOPEN_S)
 
 
 def genicam_key(text: str) -> tuple[str, str]:

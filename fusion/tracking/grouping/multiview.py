@@ -29,7 +29,6 @@ from camera_node.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import DetectionTable
-from fusion.tracking.gating import MAX_SPEED_M_S
 from fusion.tracking.grouping.rays import Rays, misses, rays_of, triangulate
 from fusion.tracking.grouping.two_views import misfit_of, pair_rays
 
@@ -68,14 +67,17 @@ def find_markers(
     """
     rows = rows[np.isfinite(detections.xy[0, rows])]
     rays = rays_of(cameras, detections, rows, diameters)
-    group, centres = _seen_by_three(rays, float(np.min(diameters)) / 2)
+    radius = float(np.min(diameters)) / 2
+    group, centres = _seen_by_three(rays.at_rest(), radius)
+    if rays.tau.any():
+        group, centres = _with_moving(rays, *_without_parts(rays, group, centres), radius)
     group, centres = _with_pairs(rays, group, centres)
     return _markers(rays, group, centres, rows)
 
 
 def _seen_by_three(rays: Rays, radius: float) -> tuple[Index, Array]:
     """Groups (N,) of three or more cameras, -1 for the other rays, and their centres (K, 3)."""
-    range_m = _core.densest_ranges(rays.viewpoints, rays.frame, rays.d, rays.reach, rays.ranges)
+    range_m = _core.densest_ranges(rays.viewpoints, rays.frame, rays.d, rays.reach, rays.moved, rays.ranges)
     rows = np.flatnonzero(np.isfinite(range_m))
     if not len(rows):
         return np.full(len(rays), -1), np.empty((0, 3))
@@ -87,6 +89,29 @@ def _seen_by_three(rays: Rays, radius: float) -> tuple[Index, Array]:
     group = _join_unassigned(rays, group, centres)
     number = _renumber_groups(rays, group, len(centres), 3)
     return np.append(number, -1)[group], centres[number >= 0]
+
+
+def _without_parts(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
+    """Without the groups that may be a part of a moving marker's rays: motion explains another ray or group, too."""
+    if not len(centres):
+        return group, centres
+    free, has_ray = np.flatnonzero(group < 0), _frames_of(rays, group, len(centres))
+    explained = (_misses_of_all(rays, free, centres) < 1) & ~has_ray[:, rays.frame[free]].T
+    whole: Mask = np.logical_not(np.any(explained, axis=0))
+    pairs = KDTree(centres).query_pairs(2 * float(np.abs(rays.moved).max()), output_type="ndarray")
+    apart = ~(has_ray[pairs[:, 0]] & has_ray[pairs[:, 1]]).any(1)
+    whole[pairs[apart]] = False
+    number = np.where(whole, np.cumsum(whole) - 1, -1)
+    return np.append(number, -1)[group], centres[whole]
+
+
+def _with_moving(rays: Rays, group: Index, centres: Array, radius: float) -> tuple[Index, Array]:
+    """With the markers among the remaining rays that moved between frames: groups (N,) and centres (K, 3)."""
+    left = np.flatnonzero(group < 0)
+    of_moving, more = _seen_by_three(rays.select(left), radius)
+    group = group.copy()
+    group[left] = np.where(of_moving < 0, -1, len(centres) + of_moving)
+    return group, np.concatenate([centres, more])
 
 
 def _with_pairs(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
@@ -146,16 +171,21 @@ def _ambiguous(rays: Rays) -> Mask:
     return ambiguous
 
 
-def _two_closest(rays: Rays, rows: Index, points: Array) -> tuple[Index, Array, Array]:
-    """The closest point of each ray, and the distances (see `misses`) to it and to the second closest one."""
+def _misses_of_all(rays: Rays, rows: Index, points: Array) -> Array:
+    """(N, K) `misses` of N rays and K points."""
     o, d = rays.o[rows], rays.d[rows]
     along = d @ points.T - np.einsum("ni,ni->n", o, d)[:, None]
     squared = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ points.T + np.einsum("ki,ki->k", points, points)
     distance = np.sqrt(np.maximum(squared - along**2, 0))
-    reach = (rays.reach[rows])[:, None] * along + (MAX_SPEED_M_S * np.abs(rays.tau[rows]))[:, None]
-    miss = np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
-    two = np.partition(np.column_stack([miss, np.full(len(rows), np.inf)]), 1, axis=1)
-    return np.argmin(miss, 1), two[:, 0], two[:, 1]
+    reach = rays.reach[rows][:, None] * along + np.abs(rays.moved[rows])[:, None]
+    return np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
+
+
+def _frames_of(rays: Rays, group: Index, n: int) -> Mask:
+    """(n, F) whether a group has a ray in a frame."""
+    has_ray = np.zeros((n, int(rays.frame.max()) + 1), bool)
+    has_ray[group[group >= 0], rays.frame[group >= 0]] = True
+    return has_ray
 
 
 def _join_unassigned(rays: Rays, group: Index, centres: Array) -> Index:
@@ -163,15 +193,16 @@ def _join_unassigned(rays: Rays, group: Index, centres: Array) -> Index:
     free = np.flatnonzero(group < 0)
     if not len(free) or not len(centres):
         return group
-    taken = np.zeros((len(centres), int(rays.frame.max()) + 1), bool)
-    taken[group[group >= 0], rays.frame[group >= 0]] = True
-    blocks = np.array_split(free, -(-len(free) // BLOCK))
-    closest = [_two_closest(rays, block, centres) for block in blocks]
-    best, first, second = (np.concatenate(column) for column in zip(*closest, strict=True))
-    clear = (first < 1) & (first < CLEARLY * second) & ~taken[best, rays.frame[free]]
-    group = group.copy()
-    group[free[clear]] = best[clear]
-    return group
+    joined, has_ray = group.copy(), _frames_of(rays, group, len(centres))
+    for block in np.array_split(free, -(-len(free) // BLOCK)):
+        miss = _misses_of_all(rays, block, centres)
+        best, of_block = np.argmin(miss, 1), np.arange(len(block))
+        first = miss[of_block, best]
+        second = np.partition(np.column_stack([miss, np.full(len(block), np.inf)]), 1, axis=1)[:, 1]
+        clear = (first < 1) & (first < CLEARLY * second)
+        clear &= ~has_ray[best, rays.frame[block]]
+        joined[block[clear]] = best[clear]
+    return joined
 
 
 def _markers(rays: Rays, group: Index, centres: Array, rows: Index) -> list[Marker]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Viewing rays of detections, and the points at which several of them meet."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -53,8 +53,16 @@ class Rays:
     @property
     def viewpoints(self) -> _core.Viewpoints:
         """The frames for the native core."""
-        exposures = self.exposures
-        return _core.Viewpoints(exposures.camera, self.centres, MAX_SPEED_M_S * exposures.tau)
+        return _core.Viewpoints(self.exposures.camera, self.centres)
+
+    def at_rest(self) -> "Rays":
+        """The same rays for markers that do not move: as if all were of the time of the frame set."""
+        return replace(self, tau=np.zeros(len(self)))
+
+    @property
+    def moved(self) -> Array:
+        """(N,) how far the fastest marker moves between the time of the frame set and that of the ray, metres."""
+        return MAX_SPEED_M_S * self.tau
 
     @property
     def reach(self) -> Array:
@@ -86,23 +94,31 @@ def _possible_ranges(size: Array, diameters: Array) -> Array:
 
 
 def triangulate(rays: Rays, group: Index, near: Array) -> tuple[Array, Array]:
-    """(K, 3) least-squares intersections of the rays of each group, and covariances (K, 3, 3).
+    """(K, 3) positions of the markers of K groups at the time of the frame set, and covariances (K, 3, 3).
 
-    The weights follow from the noise at the range of `near` (K, 3), and from the motion between frames.
+    The ray of time tau passes p + tau v. Least squares give p and the velocity v of each group, whose prior has the
+    standard deviation `MAX_SPEED_M_S` / `SIGMAS` in each direction. The weights follow from the noise at the range of
+    `near` (K, 3).
     """
     rows = np.flatnonzero(group >= 0)
-    k, n, o, d = group[rows], len(near), rays.o[rows], rays.d[rows]
-    range_m = np.einsum("ni,ni->n", near[k] - o, d)
-    moved = MAX_SPEED_M_S / SIGMAS * np.abs(rays.tau[rows])
-    weight = 1 / ((rays.sigma[rows] * range_m) ** 2 + moved**2)
+    k, o, d = group[rows], rays.o[rows], rays.d[rows]
+    range_m, tau = np.einsum("ni,ni->n", near[k] - o, d), rays.tau[rows]
+    weight = 1 / (rays.sigma[rows] * range_m) ** 2
     across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
-    sums = np.zeros((n, 3, 4))
-    for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        sums[:, row, column] = sums[:, column, row] = np.bincount(k, across[row, column], n)
-    for row, side in enumerate(np.einsum("ijn,nj->in", across, o)):
-        sums[:, row, 3] = np.bincount(k, side, n)
-    covariance = np.asarray(np.linalg.inv(sums[:, :, :3] + 1e-9 * np.eye(3)), float)
-    return np.einsum("nij,nj->ni", covariance, sums[:, :, 3]), covariance
+    side = np.einsum("ijn,nj->in", across, o)
+    of_p, of_pv, of_v = (_sums(across * tau**power, k, len(near)) for power in range(3))
+    gain = of_pv @ np.linalg.inv(of_v + (SIGMAS / MAX_SPEED_M_S) ** 2 * np.eye(3))
+    right = _sums(side, k, len(near)) - (gain @ _sums(side * tau, k, len(near))[:, :, None])[:, :, 0]
+    covariance = np.asarray(np.linalg.inv(of_p - gain @ of_pv + 1e-9 * np.eye(3)), float)
+    return np.einsum("nij,nj->ni", covariance, right), covariance
+
+
+def _sums(values: Array, group: Index, n: int) -> Array:
+    """(n, ...) sums over the last axis of `values` in each of n groups."""
+    sums = np.zeros((n, *values.shape[:-1]))
+    for entry in np.ndindex(values.shape[:-1]):
+        sums[:, *entry] = np.bincount(group, values[entry], n)
+    return sums
 
 
 def misses(rays: Rays, rows: Index, points: Array) -> Array:

@@ -78,7 +78,7 @@ def pair_rays(rays: Rays, sigma: float) -> tuple[Index, Array]:
         rays: of no point that more cameras see.
         sigma: see `misfit_of`.
     """
-    given = rays.viewpoints, rays.frame, rays.d, rays.reach, rays.ranges
+    given = rays.viewpoints, rays.frame, rays.d, rays.reach, rays.moved, rays.ranges
     rows, (miss, range_m) = _core.ray_pairs(*given, FAR)
     if not (miss < 1).any():
         return np.empty((2, 0), np.intp), np.empty((0, 3))

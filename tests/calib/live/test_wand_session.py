@@ -18,18 +18,16 @@ from calib.commands.connection import Connection
 from calib.commands.wand import Wand
 from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames
-from calib.live.wand_session import (
+from calib.live.session_progress import (
     GONE_S,
     IDLE_S,
     SessionProgress,
     StoppingRule,
-    Trial,
-    WandSession,
     is_wand_gone,
-    run_wand_session,
-    select_blocks,
     summarize,
 )
+from calib.live.trials import Trial, WandSession, select_blocks
+from calib.live.wand_session import run_wand_session
 from calib.rig.recording import read_detections
 from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode

@@ -12,7 +12,7 @@ from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate, explain_disagreement
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling import label_recording
+from calib.wand.labeling.labels import label_recording
 from calib.wand.result import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

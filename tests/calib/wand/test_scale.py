@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.__main__ import execute
 from calib.commands.check import split_halves
 from calib.errors import CalibrationError
-from calib.live.wand_session import WandSession, compute_trial
+from calib.live.trials import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations

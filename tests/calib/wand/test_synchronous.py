@@ -138,3 +138,14 @@ def test_ends_without_numbers_are_distinguished_by_simultaneous_frames_alone():
     )
     assert len(result.rig.placed()) == 4
     assert camera_errors(result.rig, arena.truth)[0].max() < 0.02
+
+
+def test_frames_whose_ends_cannot_be_distinguished_are_counted():
+    """Ten instants have one camera alone, and the wand is elsewhere before and after: no other view names its ends."""
+    arena = ring(4, wand=STICK)
+    messages = random_rows(arena, 1_000_000_000, numbered=False)
+    alone = [m for m in messages if m.camera == "cam0" and m.seq % 6 == 0 and len(m) == 2]
+    recorded = [m for m in messages if m.seq % 6] + alone
+    report = calibrate(arena.intrinsics, STICK, recorded, synchronous=True).report
+    assert len(alone) > 5
+    assert report.cameras[0].left_out["the ends of the wand cannot be distinguished"] == len(alone)

@@ -49,6 +49,13 @@ def test_deep_grey_is_scaled_and_rounded(bits: int):
     assert narrow(np.empty((0, 5), np.uint16)).shape == (0, 5)
 
 
+@pytest.mark.parametrize(("fourcc", "bits"), [("Y10 ", 10), ("Y12 ", 12)])
+def test_a_dark_image_stays_dark_where_the_format_states_its_depth(fourcc: str, bits: int):
+    """A quarter of full scale, which could be full scale of two bits fewer."""
+    dark = np.full((4, 6), 2 ** (bits - 2) - 1, np.uint16)
+    assert np.abs(to_grey(dark, fourcc) - 255 / 4).max() < 1
+
+
 @pytest.mark.parametrize("fourcc", BAYER)
 def test_each_bayer_pattern_has_its_red_pixels_in_place(fourcc: str):
     """One pixel in four of a mosaic of pure red has the level 200; the luma is 0.299 times that (ITU-R BT.601)."""

@@ -25,7 +25,8 @@ from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, 
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.messages import RobotPose
-from tests.fusion.bridges.pose_server import publish_poses
+from tests.conftest import free_port
+from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
 
 DEADLINE_S = 60.0
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -209,6 +210,28 @@ def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, ow
     assert {p[5] for p in parts[1:]} == names
     assert {p[1] for p in parts[1:]} == {"MP"}
     assert {p[8] for p in parts[1:]} == {"::,10:,:,:,,"}
+
+
+def test_topics_continue_after_a_restart_of_the_server():
+    """The server's router is that of ROS, too, so that publishers and tokens are declared in it again."""
+    received, tokens, endpoint = queue.Queue(), queue.Queue(), f"tcp/127.0.0.1:{free_port()}"
+
+    def seconds(sample: zenoh.Sample) -> float:
+        stamp = read(sample.payload.to_bytes(), "nav_msgs/msg/Odometry").header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+
+    with PoseServer(endpoint) as server, ros_peer(endpoint) as ros, bridging(endpoint):
+        topics = ros.declare_subscriber("0/rover/odometry/**", received.put)
+        received.get(timeout=DEADLINE_S)
+        since_s = restart(server) * 1e-9
+        while seconds(received.get(timeout=DEADLINE_S)) <= since_s:
+            pass
+        graph = ros.liveliness().declare_subscriber(
+            "@ros2_lv/0/**/%rover%odometry/**", tokens.put, history=True
+        )
+        assert "/MP/" in str(tokens.get(timeout=DEADLINE_S).key_expr)
+        graph.undeclare()
+        topics.undeclare()
 
 
 def test_robots_with_equal_ros_names_are_counted():

@@ -31,7 +31,7 @@ ALONG_Z = np.tile([[0.0], [0.0], [1.0]], N)
 DISC_ARRAYS = FRAME, BODY, np.zeros((3, N)), ALONG_Z, np.full(N, 0.0625), np.full(N, 0.0625)
 SCALES, FOCAL, FALSE = np.tile(np.eye(2)[..., None], N), np.full(F, 800.0), np.zeros(B, bool)
 DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), np.ones(N)
-VIEWPOINT_ARRAYS = np.arange(F), np.zeros((F, 3)), np.zeros(F)
+VIEWPOINT_ARRAYS = np.arange(F), np.zeros((F, 3))
 EQUATIONS, STEPS = np.zeros((N, 2, 13)), np.zeros((B, 12))
 VIEWPOINTS = _core.Viewpoints(*VIEWPOINT_ARRAYS)
 POSES = _core.FramePoses(_core.BodyStates(*BODY_ARRAYS), _core.CameraExposures(*EXPOSURE_ARRAYS))
@@ -75,17 +75,19 @@ CALLS = {
     "Viewpoints": (_core.Viewpoints, VIEWPOINT_ARRAYS),
     "densest_ranges": (
         _core.densest_ranges,
-        (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.ones((N, 1, 2))),
+        (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
     "ray_pairs": (
-        lambda frames, frame, d, reach, ranges: _core.ray_pairs(frames, frame, d, reach, ranges, 2.0),
-        (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.ones((N, 1, 2))),
+        lambda frames, frame, d, reach, moved, ranges: _core.ray_pairs(
+            frames, frame, d, reach, moved, ranges, 2.0
+        ),
+        (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
     "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)))),
 }
 # Constructors check the indices only where they know what the indices refer to.
 UNCHECKED = {"DiscColumns", "DetectionColumns"}
-ANY_LENGTH = {"inverses", "look_up"}  # functions of one array
+ANY_LENGTH = {"inverses", "look_up", "Viewpoints"}  # functions of arrays whose lengths are independent
 
 
 def alike(array: np.ndarray):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from calib.rig.camera import stated_sigma
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma, usual_sigma, widen_lenses
 from calib.wand.calibrate import calibrate
@@ -107,12 +108,23 @@ def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_ri
 
 def test_standard_deviations_of_a_lens_are_read_and_checked():
     camera = roughly(recorded(1).intrinsics, CAREFUL, with_sigma=True).cameras["cam00"]
-    assert calibrated_sigma(camera) == pytest.approx(
-        [6e-4, 0.5, 0.5, 5e-4, 6e-5, 2e-4, 2e-5, 2e-5, 2e-4], rel=0.01
-    )
+    sigma = calibrated_sigma(camera)
+    assert sigma is not None
+    assert sigma[:5] == pytest.approx([6e-4, 0.5, 0.5, 5e-4, 6e-5], rel=0.01)
+    assert (sigma[5:] < 1e-5).all()  # those that the file does not state
     assert calibrated_sigma(msgspec.structs.replace(camera, lens_sigma=None)) is None
     with pytest.raises(ValueError, match="lens_sigma"):
         type(camera)(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, lens_sigma=(0.1,))
+
+
+def test_a_lens_is_declared_exact_but_own_calibrations_state_at_least_its_stability():
+    """`stated_sigma` writes files, which are taken literally: a focal length is stable to 5e-4, a centre to 0.3 px."""
+    camera = roughly(recorded(1).intrinsics, EXACT, with_sigma=True).cameras["cam00"]
+    sigma = calibrated_sigma(camera)
+    assert sigma is not None
+    assert (sigma < 1e-4 * usual_sigma(camera)).all()
+    stated = stated_sigma(camera, [1e-3, 2.0, 1e-3, 1.0, *[0.0] * 5])
+    assert stated == pytest.approx((5e-4 * camera.fx, 2.0, 0.3, 1.0, 5e-4, 2e-4, 2e-5, 2e-5, 2e-4))
 
 
 def test_widened_priors_make_the_covariance_of_changed_lenses_right():

@@ -19,7 +19,7 @@ from calib.wand.bundle_adjustment.residuals import predict_markers, reprojection
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling import label
+from calib.wand.labeling.labels import label
 from calib.wand.timing import Timing
 from calib.wand.trajectory import locate, position_weights, velocity_weights
 from camera_node.geometry.body import Body

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from calib.rig.rig import Rig
 from calib.wand.detections import FrameTable, WandDetections, gather
-from calib.wand.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
+from calib.wand.labeling.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
+from calib.wand.labeling.two_markers import label_ends
 from calib.wand.timing import Timing
-from calib.wand.two_markers import label_ends
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -38,6 +38,7 @@ class WandRecording:
         timing: how the cameras' frames are related in time.
         detections: the markers of the wand, at most one row per frame and marker.
         left_out: by camera, the number of frames without a marker by reason.
+        background: images of background points, if there are any.
     """
 
     names: list[str]
@@ -46,6 +47,7 @@ class WandRecording:
     timing: Timing
     detections: WandDetections
     left_out: list[Counter[str]]
+    background: WandDetections | None = None
 
 
 def label_recording(
