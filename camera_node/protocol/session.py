@@ -33,6 +33,7 @@ ALWAYS = {
     "transport/shared_memory/enabled": False,
 }
 SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
+LOOPBACK = re.compile(r"\w+/(localhost|127\.[\d.]+|\[::1\]):.*")  # never slow, and with segments of 64 kB
 BURST_BUFFER = 1 << 18  # for bursts of messages: a full buffer waits for an acknowledgement, 40 ms
 
 
@@ -116,15 +117,16 @@ def open_endless(
     Args:
         connect: endpoints of the server.
         zenoh_config: a file.
-        send_buffer: of the kernel, bytes.
+        send_buffer: of the kernel, bytes, if it is more than this function would choose.
 
     Raises:
         NetworkError: an endpoint is invalid, or a certificate is missing.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
     limits = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+    buffers = _send_buffers(send_buffer) if send_buffer > SEND_BUFFER else {}
     try:
-        return _open_client(connect, zenoh_config, {**limits, **_send_buffers(send_buffer)})
+        return _open_client(connect, zenoh_config, {**limits, **buffers})
     except zenoh.ZError as error:
         raise NetworkError(f"can't connect to {' '.join(connect)}: {_brief(error)}") from None
 
@@ -140,10 +142,19 @@ def _open_client(
         "connect/endpoints": list(connect),
         "connect/retry": RETRY,
         "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
-        **_send_buffers(SEND_BUFFER),
+        **_send_buffers(send_buffer_of(connect)),
         "transport/link/tx/queue/size/real_time": 1,  # batches
     }
     return zenoh.open(_config(zenoh_config, {**options, **limits}))
+
+
+def send_buffer_of(connect: Sequence[str]) -> int:
+    """The bytes of the kernel's send buffer: as few as a slow link needs, and enough for large messages on loopback.
+
+    On loopback a segment has 64 kB. A smaller buffer is never full of segments, so the receiver delays its
+    acknowledgement by 25 to 40 ms, in which a message of more than 16 kB waits and the next one is dropped.
+    """
+    return BURST_BUFFER if all(map(LOOPBACK.fullmatch, connect)) else SEND_BUFFER
 
 
 def _send_buffers(size: int) -> dict[str, int]:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Capacity of one core: the server's path from the bytes of messages to the bytes of poses, without the network.
+"""Capacity of one core: `python -m tests.benchmarks.fusion_capacity [--robots 60 100 150]`, 15 s a load.
+
+The server's path from the bytes of messages to the bytes of poses, without the network.
 
 Simulates a queue with one server by measured processor times: a message arrives `DELAY_NS` after its exposure and waits
 until the earlier ones are done. The latency of a frame set counts from the arrival of the message that completes it.
@@ -15,6 +17,7 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
+import tyro
 
 from camera_node.arrays import Array
 from camera_node.protocol.messages import Detections, decode, encode
@@ -28,6 +31,7 @@ from tests.benchmarks.fusion_load import Load
 
 T = TypeVar("T")
 DELAY_NS = 5_000_000
+P50_MS = 5.0  # goal of issue 16
 LATENCY = Latency(camera_ms=1.0, network_ms=1.0, wait_ms=1.0, fuse_ms=1.0, total_ms=4.0)
 START_S = 0.5  # for the acquisition of robots
 TURN_S = 0.25  # of a load before the next load's turn
@@ -188,3 +192,26 @@ class Queue:
         self.free_ns += cost
         self.busy_ns += cost
         return done
+
+
+def main(robots: tuple[int, ...] = (60, 100, 150), seconds: float = 4.0) -> int:
+    """Print the capacity of one core; exit code 1 if one of the loads is too much for it.
+
+    Args:
+        robots: of 4 markers each, before 8 cameras at 60 Hz; one load for each number.
+        seconds: of each load.
+    """
+    is_enough = True
+    for n in robots:
+        got = capacity(Load(n, 4, 8, 60.0), seconds)
+        is_enough &= got.cpu < 1 and got.p50_ms < P50_MS and got.tracked > 0.99
+        print(
+            f"{n} robots: {got.cpu:.0%} of a core ({got.quiet_ms * 60 / 1e3:.0%} undisturbed), "
+            f"p50 {got.p50_ms:.1f} ms, p99 {got.p99_ms:.1f} ms, {got.tracked:.1%} tracked",
+            flush=True,
+        )
+    return int(not is_enough)
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(main))

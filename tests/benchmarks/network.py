@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Interrupted and slow links, and a killed server: `python -m tests.benchmarks.network` (as root, for namespaces).
 
-The server and each of eight cameras run in a network namespace of their own, with real addresses.
+The server, each of eight cameras, and page, viewer, client, recorder and ROS 2 bridge run in network namespaces of
+their own, with real addresses.
 """
 
+import math
 import socket
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +23,8 @@ from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.network import Namespaces, why_not
 from tests.benchmarks.faults.world import CameraFault
 
+CLIENTS = ("viewer", "page", "recorder", "listener", "bridge")
+ODOMETRY = "0/*/odometry/**"  # of all robots in ROS 2's domain 0
 DEADLINE_S = 30.0
 FRESH_NS = 150_000_000  # age of a frame, up to which the server uses it
 FALSE = 160  # roundels that make the frames of a camera too large for its link
@@ -32,6 +37,22 @@ class Outage:
     away_s: float
     back_s: float
     gap_s: float
+
+
+@dataclass(frozen=True)
+class Blackout:
+    """What an interruption of all links cost: the seconds from their return to the poses of all robots at the server,
+    at a client, at the ROS 2 bridge and in the recording."""
+
+    away_s: float
+    server_s: float
+    client_s: float
+    bridge_s: float
+    recorder_s: float
+
+    @property
+    def worst_s(self) -> float:
+        return max(self.server_s, self.client_s, self.bridge_s, self.recorder_s)
 
 
 @dataclass(frozen=True)
@@ -78,6 +99,63 @@ def interrupt(arena: LiveArena, network: Namespaces, camera: str, seconds: float
         wait_until(arena, lambda: frames.fresh_since(up_s), f"fresh frame of {camera}")
         back_s = time.monotonic() - up_s
     return Outage(seconds, back_s, max((gap.seconds for gap in arena.judge.gaps), default=0.0))
+
+
+class Bridged:
+    """When the first odometry arrived that the ROS 2 bridge published after a moment, by the monotonic clock."""
+
+    def __init__(self, arena: LiveArena) -> None:
+        self.last_s = 0.0
+        self._subscriber = arena.session.declare_subscriber(ODOMETRY, self._take)
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self.last_s = time.monotonic()
+
+
+def interrupt_all(arena: LiveArena, network: Namespaces, names: Sequence[str], seconds: float) -> Blackout:
+    """Take the links of these programs down at once for a time.
+
+    A program that does not come back within `DEADLINE_S` has infinite seconds.
+    """
+    with closing(Bridged(arena)) as bridged:
+        for name in names:
+            network.set_link(name, False)
+        arena.wait(seconds)
+        recorded = recording_bytes(arena)
+        arena.judge.forget()
+        for name in names:
+            network.set_link(name, True)
+        up_s = time.monotonic()
+        back: dict[str, float] = {}
+        signs = {
+            "server": lambda: arena.judge.tracked(1.0) == len(arena.world.names),
+            "client": lambda: client_is_back(arena, up_s),
+            "bridge": lambda: bridged.last_s > up_s,
+            "recorder": lambda: recording_bytes(arena) > recorded,
+        }
+
+        def all_back() -> bool:
+            for name in [name for name, sign in signs.items() if name not in back and sign()]:
+                back[name] = time.monotonic() - up_s
+            return len(back) == len(signs)
+
+        with suppress(TimeoutError):
+            wait_until(arena, all_back, "return of all programs")
+    return Blackout(seconds, *(back.get(name, math.inf) for name in signs))
+
+
+def client_is_back(arena: LiveArena, since_s: float) -> bool:
+    """Whether the client has had poses again after a moment."""
+    text = (arena.folder / "listener.out").read_text()
+    complete = text[: text.rfind("\n") + 1].split()
+    return bool(complete) and float(complete[-1]) > since_s
+
+
+def recording_bytes(arena: LiveArena) -> int:
+    return sum(path.stat().st_size for path in arena.folder.glob("recording-*.mcap"))
 
 
 def squeeze(
@@ -134,7 +212,7 @@ def wait_until(arena: LiveArena, condition, content: str) -> None:
 
 
 def main(cameras: int = 8, away_s: tuple[float, ...] = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)) -> int:
-    """Print what each fault costs.
+    """Print what each fault costs; exit code 1 if poses take more than 2 s after a link, or 1 s after the server.
 
     Args:
         cameras: each in a network namespace of its own.
@@ -146,21 +224,30 @@ def main(cameras: int = 8, away_s: tuple[float, ...] = (0.5, 1.0, 2.0, 3.0, 4.0,
     load = small_load(cameras=cameras)
     with (
         tempfile.TemporaryDirectory(prefix="roundel-network-") as folder,
-        Namespaces(tuple(load.rig)) as network,
-        LiveArena(Path(folder), load, (), network) as arena,
+        Namespaces((*load.rig, *CLIENTS)) as network,
+        LiveArena(Path(folder), load, CLIENTS, network) as arena,
     ):
         arena.wait_until_tracked()
-        arena.wait(2.0)
+        arena.wait(5.0)  # until the programs have started
+        all_cameras = tuple(load.rig)
         worst_s = max(report(interrupt(arena, network, "cam1", seconds)) for seconds in away_s)
+        for names in (all_cameras, (*all_cameras, *CLIENTS)):
+            say(f"links of {', '.join(names)}:")
+            worst_s = max(worst_s, *(report(interrupt_all(arena, network, names, s)) for s in away_s))
         ready_s = max(report(restart_server(arena, seconds)) for seconds in (0.0, *away_s))
+        arena.programs.check()
+        for crash in arena.programs.crashes:
+            say(f"FAILED {crash}")
         ages = sorted(squeeze(arena, network, "cam2", 1_000_000, 10.0))
     say(f"1 Mbit/s: {len(ages) / 9:.1f} frames/s, age {ages[len(ages) // 2]:.2f} s, at most {ages[-1]:.2f} s")
     return int(worst_s > 2.0 or ready_s > 1.0 or ages[-1] > 1.0)
 
 
-def report(result: Outage | Restart) -> float:
+def report(result: Outage | Blackout | Restart) -> float:
     """Print a result; return the seconds until all was well."""
     say(str(result))
+    if isinstance(result, Blackout):
+        return result.worst_s
     return result.back_s if isinstance(result, Outage) else result.all_s
 
 

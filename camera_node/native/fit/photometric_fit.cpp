@@ -9,6 +9,7 @@
 #include "fit/fit_covariance.hpp"
 #include "fit/gauss_newton.hpp"
 #include "fit/normal_equations.hpp"
+#include "fit/plateaus.hpp"
 #include "fit/roundel_limits.hpp"
 
 namespace roundel {
@@ -18,7 +19,7 @@ namespace {
 // Half widths of the bands of pixels around an edge: at least so many pixels, and so many blurs.
 constexpr double kNarrow = 1.25, kNarrowBlurs = 1.5;
 constexpr double kWide = 2.5, kWideBlurs = 2.5;
-constexpr double kSeparateBlurs = 4;  // of wide bands that contain a single edge
+constexpr double kSeparateBlurs = 4;  // of wide bands that contain a single edge, and of plateaus
 constexpr double kMinCardStep = 0.2;  // of the contrast: a smaller step from card to ground is not fitted
 
 constexpr int kCoarsePixels = 200;
@@ -38,6 +39,9 @@ constexpr double kSlack = 1.3;     // upper bound: tolerance of a median of few 
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kMaxPrintError = 3;                 // standard deviations
+constexpr int kMinPlateau = 16;                      // pixels
+constexpr double kPlateauVariance = 2;               // factor from that of the residuals at the edges
+constexpr double kMaxPlateauError = 3;               // standard deviations
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
 constexpr float kPlateau = 235;        // level that compression leaves of clipped paper
 constexpr SanityLimits kLimits{
@@ -89,11 +93,13 @@ class PhotometricFitter : GaussNewton<kCount> {
     }
 
     double ratio() const { return p_[kRatio]; }
+    void use_plateaus();
     void use_print(const Print& print);
     void allow_shading();
     RoundelFit fit() const;
 
   private:
+    bool condition_on_plateau(Parameter level, const Plateau& plateau, Parameters& g);
     bool condition_on_print(const Print& print);
     Parameters covariance_with_ratio() const;
     Parameters effect_of_curvature() const;
@@ -209,6 +215,37 @@ class PhotometricFitter : GaussNewton<kCount> {
     Shading shading_;
 };
 
+/// Adds the level of a plateau to the system, and its residual to `g`; false if that level is not the one at
+/// the edges: where cameras sharpen, in uneven light, or for writing on the paper. Its noise must be that of
+/// the edges, too, which a tone curve and compression change.
+bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& plateau, Parameters& g) {
+    if (plateau.count < kMinPlateau || plateau.variance > kPlateauVariance * square(noise_) ||
+        plateau.variance < square(noise_) / kPlateauVariance)
+        return false;
+    if (plateau.mean < 2 * noise_ || plateau.mean > kPlateau) return false;  // the scale's ends
+    Parameters unit{};
+    unit[level] = 1;
+    double variance = 1.0 / plateau.count;  // in units of the noise: of the plateau, and of the fit's level
+    for (const double x : factor_->halfway(unit)) variance += square(x);
+    const double off = plateau.mean - p_[level], n = plateau.count;
+    if (square(off) > square(kMaxPlateauError * noise_) * variance) return false;
+    system_.H[level][level] += n, g[level] = n * off;
+    return true;
+}
+
+/// Conditions the estimate on the levels far from the edges. They are most of the pixels of a large roundel,
+/// and its size depends on the level half way between them.
+void PhotometricFitter::use_plateaus() {
+    if (occlusion_.any() || clipped_) return;
+    const Plateaus plateaus =
+        read_plateaus(image_, p_, pixels_.origin_x, pixels_.origin_y, kSeparateBlurs * p_[kBlur]);
+    Parameters g{};
+    const bool ring = condition_on_plateau(kDark, plateaus.ring, g);
+    if (!condition_on_plateau(kBright, plateaus.hole, g) && !ring) return;
+    factor_.emplace(system_.H);
+    apply(factor_->solve(g));
+}
+
 Parameters PhotometricFitter::covariance_with_ratio() const {
     Parameters unit{};
     unit[kRatio] = square(noise_);
@@ -311,6 +348,7 @@ RoundelFit PhotometricFitter::fit() const {
 std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess) {
     PhotometricFitter fitter(image, guess);
     if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
+    fitter.use_plateaus();
     if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
     if (guess.shading_sigma > 0) fitter.allow_shading();
     return fitter.fit();

@@ -43,7 +43,7 @@ class LiveArena:
     Args:
         folder: for the arena's files and logs.
         load: robots and cameras.
-        extra: programs besides server and cameras: viewer, page, recorder, listener, rendered.
+        extra: programs besides server and cameras: viewer, page, recorder, listener, bridge, rendered.
         network: where the programs run.
 
     Attributes:
@@ -190,6 +190,9 @@ class LiveArena:
 
     def _listener(self) -> list[str]:
         return python("tests.benchmarks.faults.listener", "--connect", self.endpoint, "--arena", ARENA)
+
+    def _bridge(self) -> list[str]:
+        return python("fusion", "ros2", "--connect", self.endpoint, "--arena", ARENA)
 
     def _rendered(self) -> list[str]:
         sim = ("--source", "sim", "--scene", self.folder / "demo" / "scene.yaml", "--name", RENDERED)

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from itertools import count
 
 COUNT = count()  # of networks: the names of one that was deleted are free a little later
-SUBNET = "10.213.77"  # private; the server has .1, this process .2, the cameras follow
+SUBNETS = 250  # private, 10.213.x: two processes rarely have the same
 
 
 class Loopback:
@@ -29,9 +29,9 @@ class Namespaces(Loopback):
         cameras: the names of the programs that have a namespace of their own; others run beside the server.
     """
 
-    host = f"{SUBNET}.1"
-
     def __init__(self, cameras: Sequence[str]) -> None:
+        self._subnet = f"10.213.{os.getpid() % SUBNETS}"
+        self.host = f"{self._subnet}.1"  # this process has .2, and the programs follow
         self._number = f"{os.getpid() % 10**6}{next(COUNT) % 10}"
         self._prefix = f"rdl{self._number}"
         self._server = f"{self._prefix}-server"
@@ -81,7 +81,7 @@ class Namespaces(Loopback):
         run("ip", "-n", self._server, "link", "add", link, "type", "veth", "peer", "name", inside, *place)
         if not namespace:
             run("ip", "-n", self._server, "link", "set", inside, "netns", "1")
-        run(*within, "address", "add", f"{SUBNET}.{number}/24", "dev", inside)
+        run(*within, "address", "add", f"{self._subnet}.{number}/24", "dev", inside)
         run(*within, "link", "set", inside, "up")
         run("ip", "-n", self._server, "link", "set", link, "master", "br0", "up")
 
