@@ -198,14 +198,17 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
     }
 }
 
+/// Whether the camera's response is all that shapes the levels of a roundel.
+static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.fields.has_light(); }
+
 /// Learns which prints are in use; once some are known, other rings no longer count as roundels.
 void Detector::learn_prints(const FrameState& frame) {
     if (!print_ratios_) return;
     std::vector<PrintSample> samples;
     for (const TrackedFit& roundel : frame.found)
-        if (roundel.fit.unoccluded) samples.push_back({&roundel.fit, roundel.track});
+        if (shows_camera(roundel.fit)) samples.push_back({&roundel.fit, roundel.track});
     for (const RoundelFit& fit : frame.unknown)
-        if (fit.unoccluded) samples.push_back({&fit, -1});
+        if (shows_camera(fit)) samples.push_back({&fit, -1});
     if (print_ratios_->learn(samples)) use_prints();
 }
 
@@ -219,7 +222,7 @@ void Detector::use_prints() {
 void Detector::learn_response(const FrameState& frame) {
     std::vector<const RoundelFit*> fits;
     for (const TrackedFit& roundel : frame.found)
-        if (roundel.fit.unoccluded) fits.push_back(&roundel.fit);
+        if (shows_camera(roundel.fit)) fits.push_back(&roundel.fit);
     if (!response_.learn(fits, limits_)) return;
     change_mask_.invalidate(), tracks_.forget_models();
     if (print_ratios_) print_ratios_->forget_measurements();
@@ -269,8 +272,9 @@ std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    return explain_refusals(linear, {limits_, noise_level(linear), response_.edge_noise(),
-                                     response_.shading_sigma(), response_.curvature_sigma()});
+    return explain_refusals(linear,
+                            {limits_, noise_level(linear), response_.edge_noise(), response_.shading_sigma(),
+                             response_.curvature_sigma(), response_.correlation()});
 }
 
 std::optional<double> Detector::theta() const {

@@ -84,8 +84,12 @@ class Detector {
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const {
-        return {frame.limits, frame.noise, response_.edge_noise(), response_.shading_sigma(),
-                response_.curvature_sigma()};
+        return {frame.limits,
+                frame.noise,
+                response_.edge_noise(),
+                response_.shading_sigma(),
+                response_.curvature_sigma(),
+                response_.correlation()};
     }
 
     RoundelLimits limits_, any_limits_;

@@ -27,8 +27,12 @@ ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the ope
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 OPEN_TIMEOUT_MS = 2000  # of one attempt; `close` waits this long for a listener that is not Zenoh
 LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
+MAX_MESSAGE = (
+    1 << 24
+)  # bytes; the largest are snapshots. Zenoh's own limit is 1 GB, which each receiver assembles
 ALWAYS = {
     "transport/link/tx/lease": LEASE_MS,
+    "transport/link/rx/max_message_size": MAX_MESSAGE,
     # It maps 16 MB for each program that sends, bypasses access rights of the network, and a killed program leaves it.
     "transport/shared_memory/enabled": False,
 }

@@ -6,11 +6,11 @@ from camera_node.arrays import Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
-from fusion.monitoring.camera_clocks import CameraClocks
+from fusion.monitoring.clocks.camera_clocks import CameraClocks
+from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
 from fusion.monitoring.frame_consistency import FrameConsistency
 from fusion.monitoring.frozen_images import FrozenImages
-from fusion.monitoring.time_search import Snapshot
 
 
 class CameraMonitors:

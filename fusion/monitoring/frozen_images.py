@@ -17,8 +17,8 @@ from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable
+from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.expected_views import ExpectedViews
-from fusion.monitoring.time_search import Snapshot
 
 log = logging.getLogger("fusion")
 SEEN_PX = 2.0  # between an expected and a detected roundel

@@ -10,9 +10,11 @@ position and velocity of a robot adapt to them.
 import numpy as np
 
 from camera_node.arrays import Array
+from fusion._core import SLACK_PX
 
 MIN_RESIDUALS = 12  # in a frame set
 MIN_PX, MIN_RATIO = 0.2, 2.0  # of an unusual median residual: absolute, and relative to the usual one
+SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
 LEARNED = 15  # frame sets that define the usual residual
 CAUCHY, REJECTED = (
     4.0,
@@ -25,6 +27,11 @@ class ResidualMonitor:
 
     def __init__(self) -> None:
         self._usual_px, self._learned = 0.0, 0
+
+    @property
+    def slack_px(self) -> float:
+        """Standard deviation that covers calibration errors: as the residuals show, `SLACK_PX` until they are known."""
+        return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self._learned >= LEARNED else SLACK_PX
 
     def is_unusual(self, squared_px: Array) -> bool:
         """Whether the squared residuals (N,) of a frame set, px^2, are far above the usual ones; learns others."""

@@ -14,7 +14,7 @@ from fusion.errors import FusionError
 from fusion.model.corrections import corrected_camera
 from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot, changed, load_robots, load_saved_robots, save_robots
-from fusion.monitoring.camera_clocks import ClockHealth
+from fusion.monitoring.clocks.camera_clocks import ClockHealth
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard

@@ -14,7 +14,7 @@ import numpy as np
 
 from camera_node.logs import about
 from fusion.model.limits import Limits
-from fusion.monitoring.camera_clocks import ClockHealth
+from fusion.monitoring.clocks.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 

@@ -123,9 +123,7 @@ class Estimator:
         bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
         if not len(bodies):
             return states, np.empty((2, 0))
-        observations = self._straighten(states, observations)
-        observations = self._inflate_late(states, observations)
-        observations = self._inflate_by_clock(states, observations)
+        observations = self.with_time_errors(states, self._straighten(states, observations))
         problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
         solution = self._solve(problem, states, np.zeros((n, 12)))
         for _ in range(MAX_ITERATIONS - 1):
@@ -139,12 +137,20 @@ class Estimator:
             P[self.single] = reset_unobservable(P[self.single])
         return replace(states.retract(solution.delta), P=P), _in_pixels(observations, solution.residuals)
 
+    def with_time_errors(self, states: States, observations: MatchedObservations) -> MatchedObservations:
+        """With the noise of late frames and of the clocks of the cameras."""
+        return self._inflate_by_clock(states, self._inflate_late(states, observations))
+
     def innovations(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
         """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
         seen, discs = observations.detections, observations.discs
         poses = self.cameras.frame_poses(states, seen.exposures)
         equations = poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
         return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
+
+    def residuals_px(self, states: States, observations: MatchedObservations) -> Array:
+        """(2, N) measured minus expected centres, NaN where the disc is not visible."""
+        return _in_pixels(observations, self.innovations(states, observations)[1].reshape(-1, 2).T)
 
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the bodies."""

@@ -14,10 +14,10 @@ from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.robots import Robot
 from fusion.monitoring.camera_monitors import CameraMonitors
+from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, TrackedScene
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
-from fusion.monitoring.time_search import Snapshot
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition

@@ -2,7 +2,6 @@
 #include "fit/normal_equations.hpp"
 
 #include <algorithm>
-#include <type_traits>
 
 #include "numeric/gram.hpp"
 #include "numeric/simd.hpp"
@@ -13,42 +12,6 @@ namespace {
 
 constexpr int kSample = 24;    // approximate number of lanes of a sample
 constexpr int kHalvings = 10;  // of the interval of 256 grey levels
-constexpr int kLevels = 3;     // columns of a single edge before those of its ellipse
-
-/// The parameters of a part's gradient: all, or those of a single edge, with its ellipse last.
-template <Edge edge>
-constexpr auto kBy = [] {
-    if constexpr (edge == kAnyEdge)
-        return std::array{kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy};
-    else
-        return std::array{kSidesOf[edge].inside, kSidesOf[edge].outside, kBlur, kX, kY, kAxx, kAxy, kAyy};
-}();
-template <Edge edge>
-constexpr int kUnknowns = int(kBy<edge>.size());
-template <Edge edge>
-using GramOf = Gram<kUnknowns<edge> + 1>;  // and the residual
-
-/// Calls `work` with a part's edge as a compile-time constant. All calls within must be inlined, as in every
-/// function that is compiled for several targets (see simd.hpp).
-template <typename Work>
-ROUNDEL_INLINE void with_edge(Edge edge, const Work& work) {
-    switch (edge) {
-        case kOuterEdge:
-            return work(std::integral_constant<Edge, kOuterEdge>());
-        case kInnerEdge:
-            return work(std::integral_constant<Edge, kInnerEdge>());
-        case kCardEdge:
-            return work(std::integral_constant<Edge, kCardEdge>());
-        case kAnyEdge:
-            return work(std::integral_constant<Edge, kAnyEdge>());
-    }
-}
-
-/// The square root of Tukey's weight for residuals of `t` cutoffs.
-ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
-    const Lanes left = 1.0f - t * t;
-    return left > 0.0f ? left : all(0);
-}
 
 template <Edge edge>
 ROUNDEL_INLINE void evaluate_part(const EdgePixels& pixels, const EdgePixels::EdgePart& part,
@@ -137,52 +100,6 @@ ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const
     });
 }
 
-/// Sums of the products with one column of shading.
-struct ShadingSums {
-    Lanes by[kCount], residual;
-};
-
-/// Adds the products of `pixels` (the part's first one) with level x and level y, and of these two.
-ROUNDEL_CLONES void add_shading(const Gradient* chunks, int lanes, Edge edge, const float* x, const float* y,
-                                const float* level, float per_cut, ShadingSums (&sums)[2], Lanes (&own)[3]) {
-    with_edge(edge, [&](auto e) __attribute__((always_inline)) {
-        Lanes wx[kChunk], wy[kChunk];
-        for (; lanes > 0; lanes -= kChunk, ++chunks) {
-            const int count = std::min(kChunk, lanes);
-            for (int k = 0; k < count; ++k, x += kLanes, y += kLanes, level += kLanes) {
-                const Lanes residual = chunks->residual[k], root = root_weight(residual * per_cut);
-                const Lanes model = load(level) - residual, w = root * root * model;
-                const Lanes by_x = load(x), by_y = load(y);
-                wx[k] = w * by_x, wy[k] = w * by_y;
-                own[0] += wx[k] * model * by_x, own[1] += wx[k] * model * by_y;
-                own[2] += wy[k] * model * by_y;
-            }
-            const auto multiply = [&](const Lanes* column, Lanes& sum_x, Lanes& sum_y)
-                                      __attribute__((always_inline)) {
-                                          for (int k = 0; k < count; ++k)
-                                              sum_x += wx[k] * column[k], sum_y += wy[k] * column[k];
-                                      };
-            for (const int i : kBy<e>) multiply(chunks->by[i], sums[0].by[i], sums[1].by[i]);
-            multiply(chunks->residual, sums[0].residual, sums[1].residual);
-        }
-    });
-}
-
-/// Transforms products with the columns of a part's gradient to those of all parameters.
-Parameters to_parameters(const ShadingSums& sums, Edge edge, const EdgeEllipse::Jacobian& J) {
-    Parameters to{};
-    for (size_t i = 0; i < kCount; ++i) to[i] = double(sum(sums.by[i]));
-    if (edge == kAnyEdge) return to;
-    const Parameters of_ellipse = to;
-    for (int m = 0; m < kPoseCount; ++m) to[kX + m] = 0;
-    for (int j = 0; j < EdgeEllipse::kShape; ++j) {
-        for (int m = 0; m < kPoseCount; ++m) to[kX + m] += J[j][m] * of_ellipse[kX + j];
-        if (edge != kOuterEdge)
-            to[edge == kInnerEdge ? kRatio : kCard] += J[j][kPoseCount] * of_ellipse[kX + j];
-    }
-    return to;
-}
-
 struct LaneResidualSums {
     Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
 };
@@ -255,19 +172,6 @@ ROUNDEL_CLONES float median_of(Sample& sample) {
     return high;
 }
 
-/// Transforms a step of all parameters to one of the parameters of a part's gradient.
-std::array<float, kCount> step_of(const Parameters& delta, Edge edge, const EdgeEllipse::Jacobian& J) {
-    std::array<float, kCount> step{};
-    for (size_t i = 0; i < kCount; ++i) step[i] = float(delta[i]);
-    if (edge == kAnyEdge) return step;
-    for (int i = 0; i < EdgeEllipse::kShape; ++i) {
-        double shape = J[i][kPoseCount] * delta[edge == kInnerEdge ? kRatio : kCard];  // or 0
-        for (int m = 0; m < kPoseCount; ++m) shape += J[i][m] * delta[kX + m];
-        step[size_t(kX + i)] = float(shape);
-    }
-    return step;
-}
-
 }  // namespace
 
 void NormalEquations::linearize(const EdgePixels& pixels, const Parameters& p) {
@@ -318,24 +222,6 @@ ResidualSums NormalEquations::residuals_after(const Parameters& delta, double sc
             .mrr = double(sum(s.mrr)),
             .mwrr = double(sum(s.mwrr)),
             .mpsi = double(sum(s.mpsi))};
-}
-
-ShadingProducts NormalEquations::shading(const EdgePixels& pixels, double scale) const {
-    ShadingProducts products;
-    for (const LinearPart& part : parts()) {
-        ShadingSums sums[2]{};
-        Lanes own[3]{};
-        add_shading(part.chunks, part.lanes, part.edge, pixels.x + part.begin, pixels.y + part.begin,
-                    pixels.level + part.begin, float(1 / (kTukey * scale)), sums, own);
-        for (size_t a = 0; a < 2; ++a) {
-            const Parameters of_part = to_parameters(sums[a], part.edge, part.jacobian);
-            for (size_t i = 0; i < kCount; ++i) products.parameters[a][i] += of_part[i];
-            products.residuals[a] += double(sum(sums[a].residual));
-        }
-        products.own.xx += double(sum(own[0])), products.own.xy += double(sum(own[1]));
-        products.own.yy += double(sum(own[2]));
-    }
-    return products;
 }
 
 }  // namespace roundel

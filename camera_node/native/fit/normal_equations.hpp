@@ -6,6 +6,7 @@
 #include "fit/edge_ellipse.hpp"
 #include "fit/edge_pixels.hpp"
 #include "fit/gauss_newton.hpp"
+#include "fit/linear_parts.hpp"
 #include "fit/roundel_model.hpp"
 
 namespace roundel {
@@ -17,17 +18,6 @@ struct ResidualSums {
     /// Sums of w m, w m^2, w m r^2, w^2 m r^2 and m psi'. m is the squared slope of the level (a pixel's
     /// information on the edges), w Tukey's weight, psi = w r.
     double m, mm, mrr, mwrr, mpsi;
-};
-
-/// Tukey's biweight is (1 - (r / c)^2)^2 for |r| < c = 6 scales and 0 beyond.
-constexpr float kTukey = 6;
-
-/// Products of the two columns of linear shading, level x and level y, with those of the parameters, with
-/// each other and with the residuals; x and y in the pixels' frame.
-struct ShadingProducts {
-    std::array<Parameters, 2> parameters{};
-    Symmetric own{};
-    std::array<double, 2> residuals{};
 };
 
 /// The normal equations of weighted least squares: the model's levels at all pixels, linearized at one point
@@ -42,20 +32,9 @@ class NormalEquations {
     /// J^T W J and J^T W r with Tukey's weights W for residuals of a standard deviation `scale`.
     GaussNewtonSystem<kCount> accumulate(double scale) const;
     ResidualSums residuals_after(const Parameters& delta, double scale) const;
-    /// The products that a fit with shading needs in addition. `pixels` are those of `linearize`.
-    ShadingProducts shading(const EdgePixels& pixels, double scale) const;
-
-  private:
-    /// Chunks of the pixels of one edge, or of all edges.
-    struct LinearPart {
-        Edge edge;
-        int lanes;
-        int begin;  // in the pixels
-        const Gradient* chunks;
-        EdgeEllipse::Jacobian jacobian;  // of a single edge's ellipse
-    };
     std::span<const LinearPart> parts() const { return {parts_.data(), size_t(part_count_)}; }
 
+  private:
     static constexpr int kChunks = EdgePixels::kMax / (kChunk * kLanes) + kEdges;
     std::array<LinearPart, kEdges> parts_;
     int part_count_ = 0;

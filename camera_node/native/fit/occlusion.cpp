@@ -13,11 +13,13 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2;       // half width of the band around an edge, pixels
-constexpr int kPixels = 1500;     // approximate number of pixels used
-constexpr double kChance = 4;     // standard deviations
-constexpr double kReach = 2;      // blur of an occluding object's edge, pixels
-constexpr int kAround = 2;        // sectors on either side that a mean includes
+constexpr double kBand = 2;    // half width of the band around an edge, pixels
+constexpr int kPixels = 1500;  // approximate number of pixels used
+constexpr double kChance = 4;  // standard deviations
+constexpr double kReach = 2;   // blur of an occluding object's edge, pixels
+constexpr int kAround = 2;     // sectors on either side that a mean includes
+constexpr double kAbsorbed =
+    2;  // twelve means over a sixth of the turn have about six degrees of freedom left
 constexpr double kMinSeen = 0.2;  // of the information in a mean if the whole edge is visible
 
 /// The direction of (x, y) in radians from -pi to pi, within 4e-4: a polynomial in the tangent or its
@@ -150,13 +152,26 @@ Displacement SectorSums::displacement(double noise) const {
     return {std::sqrt(sum / n), std::sqrt(chance / n)};
 }
 
-EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p)
+void SectorSums::add_scatter(Sectors masked, double& sum, int& count) const {
+    for (int s = 0; s < kSectors; ++s) {
+        double across = 0, along = 0;
+        Sectors used = 0;
+        for (int k = s - kAround; k <= s + kAround; ++k) {
+            const auto at = size_t(k + kSectors) % kSectors;
+            across += regression_[at], along += squared_[at], used |= Sectors(1) << at;
+        }
+        if (along > 0 && !(used & masked)) sum += across * across / along, ++count;
+    }
+}
+
+EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields)
     : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
     EdgePixels pixels;
     pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
     local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
+    if (fields.any()) fields.remove_from(pixels);
     add_misfit(pixels, Model(local), SectorIndex(local), edges_);
 }
 
@@ -172,6 +187,13 @@ double EdgeMisfit::median() const {
 OcclusionMask EdgeMisfit::occlusion(double noise, double slack) const {
     return {dilate(edges_[0].exceeding(noise, slack), circles_[0]),
             dilate(edges_[1].exceeding(noise, slack), circles_[1])};
+}
+
+double EdgeMisfit::correlation(double noise, const OcclusionMask& mask) const {
+    double sum = 0;
+    int count = 0;
+    edges_[0].add_scatter(mask.outer, sum, count), edges_[1].add_scatter(mask.inner, sum, count);
+    return count ? std::max(1.0, kAbsorbed * sum / (count * noise * noise)) : 1;
 }
 
 std::array<Displacement, 2> EdgeMisfit::displacements(double noise) const {

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "fit/edge_pixels.hpp"
+#include "fit/fields.hpp"
 #include "numeric/image.hpp"
 
 namespace roundel {
@@ -50,6 +51,9 @@ class SectorSums {
     /// deviations.
     Sectors exceeding(double noise, double slack) const;
     Displacement displacement(double noise) const;
+    /// Adds the squared scores of means over a sixth of the turn, in variances of independent residuals of
+    /// variance 1, and their number. Means that contain `masked` sectors do not count.
+    void add_scatter(Sectors masked, double& sum, int& count) const;
     /// Appends the weighted mean square of each sector that has pixels.
     void append_mean_squares(std::vector<double>& to) const;
 
@@ -57,10 +61,10 @@ class SectorSums {
     std::array<double, kSectors> rr_{}, weight_{}, squared_{}, regression_{};
 };
 
-/// The residuals of the model `p` (in the image's frame) on both edges of the ring.
+/// The residuals of the model `p` and its fields (both in the image's frame) on both edges of the ring.
 class EdgeMisfit {
   public:
-    EdgeMisfit(const ImageView& image, const Parameters& p);
+    EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields);
     /// The sectors in which the residuals of an edge exceed `noise` and `slack`, both in grey levels RMS, and
     /// adjacent ones that the blurred edge of the occluding object can reach.
     OcclusionMask occlusion(double noise, double slack) const;
@@ -70,6 +74,10 @@ class EdgeMisfit {
     /// Displacements of the outer and of the inner edge. Ragged edges (drawn, printed, sharpened) scatter
     /// about the right position, so their means hardly differ from it.
     std::array<Displacement, 2> displacements(double noise) const;
+    /// The factor by which residuals that are correlated along the edges enlarge the covariance of a fit
+    /// (a cluster-robust covariance has such factors for all directions): 1 if they are independent with the
+    /// standard deviation `noise`, grey levels. Sectors in the mask do not count.
+    double correlation(double noise, const OcclusionMask& mask) const;
 
   private:
     CircleImage circles_[2];

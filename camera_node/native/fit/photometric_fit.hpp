@@ -5,6 +5,7 @@
 #include <optional>
 #include <span>
 
+#include "fit/fields.hpp"
 #include "fit/occlusion.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/ellipse.hpp"
@@ -18,6 +19,9 @@ namespace roundel {
 /// of phi(x)^2 dx, 1 / (2 sqrt(pi)).
 constexpr double kEdgeShift = 0.5908179503;
 
+/// The fields that a fit may contain if the residuals show them.
+enum class AllowedFields { kNone, kBend, kAll };
+
 /// The initial guess of a fit: an ellipse within a pixel, the ratio of the diameters, and the grey levels.
 struct InitialGuess {
     Ellipse outer;
@@ -28,6 +32,7 @@ struct InitialGuess {
     double noise = 0;                   // noise that the fit of `model` estimated
     double shading_sigma = 0;           // of the relative change of the light, per pixel; 0 for none
     double curvature_sigma = 0;         // of the curvature that is left in the tone curve; 0 for none
+    AllowedFields fields = AllowedFields::kNone;
 };
 
 /// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is
@@ -62,7 +67,10 @@ struct RoundelFit {
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
     Shading shading{};
-    bool clipped = false;  // the paper is brighter than the camera can show
+    bool clipped = false;    // the paper is brighter than the camera can show
+    bool uneven = false;     // the residuals show light that changes by more than the fit contains
+    double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
+    Fields fields{};         // that the fit contains, in the image's frame
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {

@@ -92,13 +92,20 @@ class EllipseLevels {
     /// Grey levels at kRays points on the ellipse scaled by `scale`; negative outside of the image.
     std::array<float, kRays> at(const ImageView& image, double scale) const {
         std::array<float, kRays> levels;
-        const double a = scale * e_.major / 2, b = scale * e_.minor / 2;
         for (size_t k = 0; k < kRays; ++k) {
-            const double along = a * double(kDirections[k].x), across = b * double(kDirections[k].y);
-            levels[k] = sample(image, float(e_.x + cos_ * along - sin_ * across),
-                               float(e_.y + sin_ * along + cos_ * across));
+            const Point p = point(k, scale);
+            levels[k] = sample(image, p.x, p.y);
         }
         return levels;
+    }
+    struct Point {
+        float x, y;
+    };
+    /// The k-th of these points.
+    Point point(size_t k, double scale) const {
+        const double along = scale * e_.major / 2 * double(kDirections[k].x),
+                     across = scale * e_.minor / 2 * double(kDirections[k].y);
+        return {float(e_.x + cos_ * along - sin_ * across), float(e_.y + sin_ * along + cos_ * across)};
     }
 
   private:

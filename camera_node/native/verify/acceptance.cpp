@@ -34,7 +34,8 @@ constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped
 // Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
-constexpr double kMaxWrong = 0.2;  // share of samples of ring and hole with a wrong level
+constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
+constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
 struct Tolerance {
@@ -125,6 +126,40 @@ void claim_misfit(RoundelFit& fit, double noise) {
         for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
 }
 
+/// A fit with its tests. `misfit` is empty if noise explains the residuals.
+struct TestedFit {
+    RoundelFit fit;
+    std::optional<EdgeMisfit> misfit;
+    bool elliptic, accepted;
+};
+
+/// Applies the tests of a fit to the unmodified image, all around.
+TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceContext& context) {
+    TestedFit tested{fit, std::nullopt, true, false};
+    if (!is_explained_by_noise(fit, context.noise)) tested.misfit.emplace(image, fit.p, fit.fields);
+    const auto& misfit = tested.misfit;
+    if (misfit) tested.fit.correlation = misfit->correlation(fit.noise, {});
+    tested.elliptic = !misfit || has_elliptic_edges(*misfit, fit, context.noise);
+    tested.accepted = tested.elliptic && passes(image, fit, context, {kMisfit, kMaxGrowth});
+    tested.fit.unoccluded =
+        tested.accepted &&
+        !(misfit && shows_occlusion(*misfit, fit, likely_edge_noise(context, *misfit, fit)));
+    return tested;
+}
+
+/// The fit with all fields, if it shows the whole roundel: highlights and shadows change the residuals as an
+/// occlusion does, but smoothly.
+std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, const RoundelFit& fit,
+                                    const AcceptanceContext& context) {
+    guess.outer = fit.outer, guess.model = fit.p, guess.noise = fit.noise, guess.fields = AllowedFields::kAll;
+    const auto even = fit_photometric(image, guess);
+    if (!even) return std::nullopt;
+    // Residuals that processing leaves around all of the ring remain.
+    if (!fit.uneven && even->edge_residual > kEvenResidual * fit.edge_residual) return std::nullopt;
+    const TestedFit tested = test(image, *even, context);
+    return tested.fit.unoccluded ? std::optional(tested) : std::nullopt;
+}
+
 }  // namespace
 
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
@@ -149,7 +184,7 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
 
 std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fit,
                                     const AcceptanceContext& context) {
-    const EdgeMisfit misfit(image, fit.p);
+    const EdgeMisfit misfit(image, fit.p, fit.fields);
     const OcclusionMask hidden = misfit.occlusion(context.noise, kHidden * fit.contrast());
     const bool covered = count_sectors(hidden.outer | hidden.inner) >= kMinHidden;
     const auto failure = first_failure(image, fit, context, {kMisfit, kMaxGrowth});
@@ -162,22 +197,27 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
     guess.prints = context.limits.prints, guess.shading_sigma = context.shading_sigma;
-    guess.curvature_sigma = context.curvature_sigma;
-    auto fit = fit_photometric(image, guess);
-    if (!fit) return std::nullopt;
-    std::optional<EdgeMisfit> misfit;
-    if (!is_explained_by_noise(*fit, context.noise)) misfit.emplace(image, fit->p);
+    guess.curvature_sigma = context.curvature_sigma, guess.fields = AllowedFields::kBend;
+    const auto first = fit_photometric(image, guess);
+    if (!first) return std::nullopt;
+    TestedFit tested = test(image, *first, context);
+    // Before the camera is known, its tone curve and its processing look like uneven light.
+    if (context.edge_noise > 0 && (first->uneven || !tested.fit.unoccluded) &&
+        is_within_limits(*first, context.limits))
+        if (const auto even = fit_uneven(image, guess, *first, context);
+            even && (known || tested.accepted || is_certain_roundel(image, even->fit, guess, context.noise)))
+            tested = *even;
+    auto& [fit, misfit, elliptic, accepted] = tested;
+    if (fit.fields.has_light())
+        fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));
+    claim_misfit(fit, context.noise);
+    if (fit.unoccluded || guess.model) return fit.unoccluded ? std::optional(fit) : std::nullopt;
     const double at_edges = std::max(context.noise, context.edge_noise);
-    const bool elliptic = !misfit || has_elliptic_edges(*misfit, *fit, context.noise);
-    const bool accepted = elliptic && passes(image, *fit, context, {kMisfit, kMaxGrowth});
-    fit->unoccluded =
-        accepted && !(misfit && shows_occlusion(*misfit, *fit, likely_edge_noise(context, *misfit, *fit)));
-    claim_misfit(*fit, context.noise);
-    if (fit->unoccluded || guess.model) return fit->unoccluded ? fit : std::nullopt;
-    const auto rest = fit_occluded(image, {guess, *fit, misfit, at_edges, known || accepted});
+    const auto rest =
+        fit_occluded(image, {guess, fit, misfit, at_edges, context.correlation, known || accepted});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
-    return elliptic && may_be_ragged(*fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
+    return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
 }
 
 }  // namespace roundel

@@ -40,6 +40,7 @@ struct AcceptanceContext {
     double edge_noise = 0;       // residual at the edges of this camera's roundels, grey levels; 0 if unknown
     double shading_sigma = 0;    // of this camera's light, relative, per pixel
     double curvature_sigma = 0;  // of what is left of this camera's tone curve
+    double correlation = 1;      // of residuals that its processing makes (`EdgeMisfit::correlation`)
 };
 
 /// Fits a roundel and applies the acceptance tests that reject false positives. If the fit to the unmodified

@@ -98,10 +98,15 @@ std::optional<CameraResponse::ToneEstimate> CameraResponse::measure(const Rounde
 
 void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     if (fits.empty()) return;
-    std::vector<double> residuals;
-    for (const RoundelFit* fit : fits) residuals.push_back(fit->edge_residual);
-    const double median = median_by(residuals, [](double residual) { return residual; });
-    edge_noise_ = edge_noise_ > 0 ? edge_noise_ + kMemory * (median - edge_noise_) : median;
+    const auto median_of = [&](double RoundelFit::* of) {
+        std::vector<double> values;
+        for (const RoundelFit* fit : fits) values.push_back(fit->*of);
+        return median_by(values, [](double value) { return value; });
+    };
+    const double residual = median_of(&RoundelFit::edge_residual);
+    const double gain = edge_noise_ > 0 ? kMemory : 1;
+    edge_noise_ += gain * (residual - edge_noise_);
+    correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
 }
 
 /// The measured gradients contain the noise of their measurement. The squared length of a gradient with

@@ -28,6 +28,8 @@ class CameraResponse {
     std::optional<double> exponent() const;
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
     double edge_noise() const { return edge_noise_; }
+    /// Correlation of these residuals along the edges, as `EdgeMisfit::correlation`; 1 if unknown.
+    double correlation() const { return correlation_; }
     /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
     double shading_sigma() const { return std::sqrt(shading_); }
     /// Standard deviation of the curvature, between ink and paper, that linearization leaves: no power law
@@ -49,7 +51,7 @@ class CameraResponse {
     double log_exponent_ = 0;  // in use
     double mean_ = 0;          // of the measured ones
     double sigma_ = 0;         // of the mean; 0 before the first measurement
-    double edge_noise_ = 0;
+    double edge_noise_ = 0, correlation_ = 1;
     double shading_;        // variance
     double curvature_ = 0;  // variance
     bool knows_shading_ = false, knows_tone_ = false, knows_curvature_ = false;

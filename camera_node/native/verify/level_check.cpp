@@ -15,9 +15,12 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const EllipseLevels on(e);
     LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
-        for (const float value : on.at(image, scale)) {
-            if (value < 0) continue;
-            const double share = (double(value) - fit.dark) / contrast;  // 0 is ink, 1 is paper
+        const auto levels = on.at(image, scale);
+        for (size_t k = 0; k < kRays; ++k) {
+            if (levels[k] < 0) continue;
+            const auto [x, y] = on.point(k, scale);
+            const double level = fit.fields.even_level(double(x), double(y), double(levels[k]));
+            const double share = (level - fit.dark) / contrast;  // 0 is ink, 1 is paper
             ++samples.total, samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
         }
     };

@@ -48,9 +48,9 @@ class SectorView {
         Sectors found = 0;
         for (int s = 0; s < kSectors; ++s) {
             const auto [x, y] = point_in_sector(fit_.p, s, radius);
-            const float level = sample(image_, x, y);
-            found |= Sectors(level >= 0 && test((double(level) - fit_.dark) / (fit_.bright - fit_.dark)))
-                     << s;
+            const float seen = sample(image_, x, y);
+            const double level = fit_.fields.even_level(double(x), double(y), double(seen));
+            found |= Sectors(seen >= 0 && test((level - fit_.dark) / (fit_.bright - fit_.dark))) << s;
         }
         return found;
     }
@@ -132,13 +132,20 @@ bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noi
     return misfit.occlusion(noise, kOcclusion * fit.contrast()).any();
 }
 
+bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
+                        double noise) {
+    if (!has_print_ratio(fit, guess.prints)) return false;
+    const SectorView view(image, fit);
+    return has_round_card(view) || !is_letter(view, fit, guess.occlusion, noise);
+}
+
 std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGuess& input) {
     if (input.full_fit.outer.major < (input.known ? kMinKnown : kMinNew)) return std::nullopt;
     InitialGuess guess = input.guess;
     RoundelFit fit = input.full_fit;
     std::optional<EdgeMisfit> misfit = input.misfit;
     for (const double slack : kSlacks) {
-        if (!misfit) misfit.emplace(image, fit.p);
+        if (!misfit) misfit.emplace(image, fit.p, fit.fields);
         const OcclusionMask mask = misfit->occlusion(input.noise, slack * fit.contrast());
         if (masks_too_much(mask)) return std::nullopt;
         if (mask == guess.occlusion) continue;
@@ -155,11 +162,10 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
         fit = *rest, misfit.reset();
     }
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
-    if (input.known) return fit;
-    const SectorView view(image, fit);
-    if (!has_print_ratio(fit, guess.prints)) return std::nullopt;
-    const bool accepted = has_round_card(view) || !is_letter(view, fit, guess.occlusion, input.noise);
-    return accepted ? std::optional(fit) : std::nullopt;
+    fit.correlation = EdgeMisfit(image, fit.p, fit.fields).correlation(fit.noise, guess.occlusion);
+    fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / input.correlation));
+    return input.known || is_certain_roundel(image, fit, guess, input.noise) ? std::optional(fit)
+                                                                             : std::nullopt;
 }
 
 }  // namespace roundel

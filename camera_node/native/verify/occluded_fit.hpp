@@ -15,12 +15,19 @@ bool is_explained_by_noise(const RoundelFit& fit, double noise);
 /// and lens are spread around the ring.
 bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noise);
 
+/// Whether a fit that does not show all of a roundel, or shows it in uneven light, is no letter: its ratio is
+/// that of a print within 0.01, and either it has a round card, or the levels of the parts that the guess
+/// leaves out are not those of ink and paper.
+bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
+                        double noise);
+
 /// The input of a fit to the visible part of a roundel.
 struct OccludedGuess {
     const InitialGuess& guess;
     const RoundelFit& full_fit;        // to all sectors
     std::optional<EdgeMisfit> misfit;  // of `full_fit`, if it was computed
     double noise;                      // of the image, grey levels
+    double correlation;                // of the camera's residuals
     bool known;                        // from the last frame
 };
 

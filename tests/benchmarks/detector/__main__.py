@@ -16,6 +16,7 @@ from tests.benchmarks.detector import (
     bent,
     cameras,
     known_lens,
+    lighting,
     motion,
     negatives,
     pose,
@@ -33,6 +34,7 @@ PARTS = {
     "false_positives": negatives.measure,
     "pose": pose.measure,
     "cameras": cameras.measure,
+    "lighting": lighting.measure,
     "bent": bent.measure,
 }
 
@@ -52,6 +54,7 @@ class Benchmark:
                 "false_positives",
                 "pose",
                 "cameras",
+                "lighting",
                 "bent",
                 "all",
             ],

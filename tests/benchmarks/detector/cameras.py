@@ -29,6 +29,7 @@ PRINTS = (0.3, 0.5, 0.7)  # inner ratios that no detector is given
 PRINT_FOUND = 0.97
 SIZES = ((14, 20), (20, 32), (32, 60))  # pixels
 Light = Callable[[np.random.Generator], tuple[Array, list[Card]]]
+Disturb = Callable[[Array, list[Card], np.random.Generator], Array]
 
 
 def acquainted(run: Run, sensor: Sensor) -> Detector:
@@ -145,8 +146,10 @@ class Errors:
     bias_sigma: float
 
 
-def errors(known: Detector, sensor: Sensor, band: tuple[int, int], frames: int) -> Errors:
-    """Measure cards of random sizes in a band, tilted by up to 60 degrees, on grey."""
+def errors(
+    known: Detector, sensor: Sensor, band: tuple[int, int], frames: int, disturb: Disturb | None = None
+) -> Errors:
+    """Measure cards of random sizes in a band, tilted by up to 60 degrees, on grey, in disturbed light."""
     rng = np.random.default_rng(band)
     rows, there = [], 0
     for _ in range(frames):
@@ -159,7 +162,8 @@ def errors(known: Detector, sensor: Sensor, band: tuple[int, int], frames: int) 
             )
             for uv in grid(20, SIZE, rng)
         ]
-        found = known.adjusted().detect(sensor.expose(paste(flat(SIZE, 90.0), shown), rng))
+        light = paste(flat(SIZE, 90.0), shown)
+        found = known.adjusted().detect(sensor.expose(disturb(light, shown, rng) if disturb else light, rng))
         there += len(shown)
         for card in shown:
             off = np.linalg.norm(found.uv - card.uv, axis=1)

@@ -12,6 +12,7 @@ import zenoh
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.session import (
     BURST_BUFFER,
+    MAX_MESSAGE,
     SEND_BUFFER,
     ServerWatch,
     listening_endpoints,
@@ -168,3 +169,17 @@ def test_the_servers_absence_and_return_are_logged_once_each(network, eventually
 def test_only_links_that_may_be_slow_have_a_small_send_buffer(connect: tuple[str, ...], size: int):
     """Before: on loopback, frames of 300 roundels and more were 25 to 45 ms late, and of 1000 roundels some dropped."""
     assert send_buffer_of(connect) == size
+
+
+def test_a_giant_message_reaches_nobody_and_harms_no_other(network, inbox, eventually):
+    """Before: a message of 200 MB was assembled by the router and by each subscriber, which did not return the memory.
+    Zenoh closes its sender's connection, which opens again."""
+    router, got = network.router(), inbox()
+    router.declare_subscriber("a/**", lambda sample: got.put(len(sample.payload)))
+    sender, other = network.client(), network.client()
+    publisher = other.declare_publisher("a/other")
+    sender.put("a/giant", bytes(MAX_MESSAGE + 1), congestion_control=zenoh.CongestionControl.BLOCK)
+    assert eventually(lambda: publisher.put(b"tick") or len(got.items) > 20)
+    assert set(got.items) == {4}
+    assert eventually(lambda: sender.put("a/small", bytes(7)) or 7 in got.items)
+    assert set(got.items) == {4, 7}

@@ -82,7 +82,6 @@ def test_invalid_detections_are_counted_and_skipped(tmp_path):
         until(lambda: status.next().faults == expected)
 
 
-@pytest.mark.slow  # on a loaded machine, in one of five runs the lags of these stamps exclude the clocks of all cameras
 def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_path):
     with serving(config(tmp_path)) as (server, client):
         send(server, live(ARENA.messages(12)))

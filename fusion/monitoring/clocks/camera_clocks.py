@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
 
-    arrival of a frame   -> `StampCheck`: its stamp jumped?             -> excluded from this frame on
+    arrival of a frame   -> `ArrivalMonitor`: its stamp jumped?         -> excluded from this frame on
     every frame set      -> `ClockComparison.jump`: one camera off?     -> excluded
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
     slow information     -> `ClockComparison.drifts`                    -> corrected while in use
@@ -22,11 +22,11 @@ from camera_node.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
-from fusion.monitoring.clock_comparison import FAST_NS, ClockComparison
-from fusion.monitoring.clock_drift import Drift
-from fusion.monitoring.stamp_check import StampCheck
-from fusion.monitoring.time_offsets import Disagreement
-from fusion.monitoring.time_search import Snapshot, TimeShift, find_time_shift
+from fusion.monitoring.clocks.arrival_monitor import ArrivalMonitor
+from fusion.monitoring.clocks.clock_comparison import FAST_NS, ClockComparison
+from fusion.monitoring.clocks.clock_drift import Drift
+from fusion.monitoring.clocks.time_offsets import Disagreement
+from fusion.monitoring.clocks.time_search import Snapshot, TimeShift, find_time_shift
 
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
@@ -39,6 +39,9 @@ MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
 MIN_EXPECTED = 16  # moving markers, for a decision
 GIVE_UP_NS = 1_500_000_000  # without an explanation by time: above `RANGE_S`, so that the history covers it
+ALONE_NS = (
+    2_000_000_000  # after which the arrival decides if no camera is left to compare with: above `GIVE_UP_NS`
+)
 STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the arrival decides
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
@@ -66,7 +69,7 @@ class _Clock:
         departed_ns: when it was last found to depart slowly.
         frames: the last frames, with the present correction.
         since_ns: server time of the exclusion; 0 while the camera is in use.
-        has_jumped: whether the arrival of its frames shows a jump.
+        by_arrival: whether the arrival of its frames excluded it.
         searched_ns, trusted_ns: times of the last search, and until which no evidence of the same kind counts.
         reported_ns: the correction that was last reported.
     """
@@ -75,10 +78,9 @@ class _Clock:
     correction_ns: int = 0
     sigma_s: float = 0.0
     departed_ns: int = 0
-    check: StampCheck = field(default_factory=StampCheck)
     frames: deque[CalibratedFrame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     since_ns: int = 0
-    has_jumped: bool = False
+    by_arrival: bool = False
     searched_ns: int = 0
     trusted_ns: int = 0
     reported_ns: int = 0
@@ -98,6 +100,7 @@ class CameraClocks:
     def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask) -> None:
         self._cameras, self._markers = cameras, markers
         self._clocks = {name: _Clock() for name in cameras.names}
+        self._arrivals = ArrivalMonitor(cameras.names)
         self._comparison = ClockComparison(cameras, markers, single)
         self._now_ns = self._undecided_ns = self._reported_ns = 0
         self._undecided_s = 0.0
@@ -116,19 +119,22 @@ class CameraClocks:
 
     def inherit(self, old: "CameraClocks") -> None:
         """Continue with the clocks of the same cameras; the history of other robots is dropped."""
-        self._clocks = old._clocks
+        self._clocks, self._arrivals = old._clocks, old._arrivals
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """The frame in corrected time; None while its camera is excluded, or if that time is in the future."""
         clock = self._clocks[frame.camera]
-        has_jumped = clock.check.has_jumped(frame.t_ns, frame.received_ns)
+        self._arrivals.observe(frame.camera, frame.t_ns, frame.received_ns)
+        self._correct_all(self._arrivals.impossible_ns)
+        self._exclude_jumped(frame.received_ns)
         sigma_s = np.sqrt(frame.clock_sigma_s**2 + clock.sigma_s**2 + self._common_sigma_s() ** 2)
         frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=float(sigma_s))
-        if has_jumped and clock.state != "excluded" and frame.received_ns > clock.trusted_ns:
-            self._exclude(clock, frame.received_ns, 0)
-            clock.has_jumped = True
         clock.frames.append(frame)
-        if clock.state == "excluded" or frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
+        if clock.state == "excluded":
+            if frame.received_ns > clock.since_ns + ALONE_NS:
+                self._search(frame.camera, frame.received_ns)
+            return None
+        if frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
             return None
         while clock.frames[0].t_ns < frame.t_ns - KEPT_NS:
             clock.frames.popleft()
@@ -155,7 +161,7 @@ class CameraClocks:
         for drift in self._comparison.drifts(departing):
             self._correct_drift(drift)
         for name in self.excluded:
-            self._search(name)
+            self._search(name, self._now_ns)
 
     def suspects(self, name: str) -> bool:
         """Whether time explains the last detections of a camera, which is then excluded here, or may explain them."""
@@ -167,12 +173,13 @@ class CameraClocks:
             if shift is None or not shift.explains(MIN_EXPECTED) or shift.is_zero:
                 return False
             self._exclude(clock, self._now_ns, KEPT_NS)
-            self._search(name)
+            self._search(name, self._now_ns)
         return True
 
     def reset(self, name: str) -> None:
         """Forget the clock of a camera that has another calibration."""
         self._clocks[name] = _Clock()
+        self._arrivals.reset(name)
         self._comparison.forget()
 
     def _is_undecided(self) -> bool:
@@ -194,13 +201,26 @@ class CameraClocks:
                 self._exclude(clock, self._now_ns, FAST_NS)
         self._comparison.forget_jumps()
 
+    def _exclude_jumped(self, now_ns: int) -> None:
+        """Exclude the cameras whose stamps jumped relative to those of the others, and use those whose did not."""
+        jumped = self._arrivals.jumped
+        for name, clock in self._clocks.items():
+            if clock.state == "excluded":
+                if clock.by_arrival and name not in jumped:
+                    clock.state, clock.by_arrival = _state_in_use(clock), False
+            elif name in jumped and now_ns <= clock.trusted_ns:
+                self._arrivals.settle(name)
+            elif name in jumped:
+                self._exclude(clock, now_ns, 0)
+                clock.by_arrival = True
+
     def _departs(self, clock: _Clock) -> bool:
         """Whether a clock departed slowly from the others just now."""
         return bool(clock.departed_ns) and self._now_ns < clock.departed_ns + FOLLOWED_NS
 
     def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
         """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
-        clock.state, clock.since_ns, clock.has_jumped = "excluded", now_ns, False
+        clock.state, clock.since_ns, clock.by_arrival = "excluded", now_ns, False
         self._comparison.forget_since(now_ns - FAST_NS)
         while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
             clock.frames.popleft()
@@ -213,38 +233,49 @@ class CameraClocks:
             self._cameras, name, tuple(clock.frames), tuple(self._comparison.history), self._markers
         )
 
-    def _search(self, name: str) -> None:
+    def _search(self, name: str, now_ns: int) -> None:
         """Find the time of an excluded camera's frames, and use it again if this is known."""
         clock = self._clocks[name]
-        if self._now_ns < clock.searched_ns + SEARCH_NS:
+        if now_ns < clock.searched_ns + SEARCH_NS:
             return
-        clock.searched_ns = self._now_ns
-        shift, waited_ns = self._shift(name, clock), self._now_ns - clock.since_ns
-        jump_ns = clock.check.jump_ns() if clock.has_jumped else None
+        clock.searched_ns = now_ns
+        shift, waited_ns = self._shift(name, clock), now_ns - clock.since_ns
+        jump_ns = self._arrivals.jump_ns(name)
         if (
             shift is not None
             and shift.explains(MIN_EXPECTED)
             and (jump_ns is None or shift.resolves(jump_ns * 1e-9))
         ):
             if shift.is_zero:
-                self._readmit(clock)
+                self._readmit(name, now_ns)
             elif shift.is_told_apart:
                 self._correct_jump(name, shift.offset_s, shift.sigma_s)
         elif jump_ns is not None and waited_ns > STATIC_NS:
             self._correct_jump(name, -jump_ns * 1e-9, ARRIVAL_SIGMA_S)
         elif waited_ns > GIVE_UP_NS:
-            self._readmit(clock)
+            self._readmit(name, now_ns)
 
-    def _readmit(self, clock: _Clock) -> None:
+    def _readmit(self, name: str, now_ns: int) -> None:
         """Use a camera again whose clock is not at fault."""
-        clock.state = "corrected" if clock.correction_ns else "correct"
-        clock.trusted_ns = self._now_ns + PAUSE_NS
+        clock = self._clocks[name]
+        clock.state, clock.trusted_ns = _state_in_use(clock), now_ns + PAUSE_NS
+        self._arrivals.settle(name)
         self._comparison.forget_since(clock.since_ns)
+
+    def _correct_all(self, jump_ns: float) -> None:
+        """Correct a jump of all stamps, which changes no offset between cameras."""
+        if jump_ns:
+            for clock in self._clocks.values():
+                clock.correction_ns -= round(jump_ns)
+                clock.reported_ns -= round(jump_ns)
+                clock.state = "excluded" if clock.state == "excluded" else "corrected"
+                clock.frames.clear()
 
     def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
         clock = self._clocks[name]
         clock.correction_ns += round(offset_s * 1e9)
         clock.state, clock.sigma_s, clock.reported_ns = "corrected", sigma_s, clock.correction_ns
+        self._arrivals.settle(name)
         self._comparison.forget_since(clock.since_ns)
         clock.frames.clear()
         at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
@@ -283,3 +314,7 @@ class CameraClocks:
                 "check the clocks of %s",
                 ", ".join(self._cameras.names),
             )
+
+
+def _state_in_use(clock: _Clock) -> ClockState:
+    return "corrected" if clock.correction_ns else "correct"

@@ -13,9 +13,14 @@ import numpy as np
 from camera_node.arrays import Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
-from fusion.monitoring.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
-from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, disagreement, offset_information
-from fusion.monitoring.time_search import RANGE_S, Snapshot
+from fusion.monitoring.clocks.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
+from fusion.monitoring.clocks.time_offsets import (
+    Disagreement,
+    OffsetInformation,
+    disagreement,
+    offset_information,
+)
+from fusion.monitoring.clocks.time_search import RANGE_S, Snapshot
 
 COMPARED_NS, CHECKED_NS = 45_000_000, 400_000_000  # between comparisons, and between searches for a drift
 LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set

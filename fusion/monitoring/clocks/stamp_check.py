@@ -26,7 +26,9 @@ class StampCheck:
     """
 
     def __init__(self) -> None:
-        self._usual_ns: float | None = None  # lag before the last jump
+        self._usual_ns: float | None = None  # lag before the last jump; None without arrival times
+        self._stamps_jump_ns = 0.0  # of the last jump by the stamps alone: from the expected next one
+        self.tolerance_ns = 0.0  # of the size of the last jump
         self._lags: deque[int] = deque(maxlen=HISTORY)
         self._stamps: deque[int] = deque(maxlen=LEARNED)
         self._quantiles, self._slope, self._age = np.zeros(4), 0.0, RENEWED
@@ -42,6 +44,8 @@ class StampCheck:
             jumped = is_early or is_late or (not is_known and self._is_after_gap(t_ns))
             if jumped:
                 self._usual_ns = float(usual) if is_known else None
+                self._stamps_jump_ns = t_ns - self._stamps[-1] - self._interval_ns()
+                self.tolerance_ns = MIN_JUMP_NS + float(late - first) if is_known else self._interval_ns()
                 self._lags.clear()
                 self._stamps.clear()
                 self._age = RENEWED
@@ -49,9 +53,24 @@ class StampCheck:
         self._stamps.append(t_ns)
         return jumped
 
-    def jump_ns(self) -> float | None:
-        """By how much the stamps jumped, from the lags before and since; None if arrivals do not show it."""
-        return None if self._usual_ns is None else self._usual_ns - float(np.median(self._lags))
+    @property
+    def is_learned(self) -> bool:
+        """Whether enough frames arrived to say what is usual."""
+        return len(self._lags) >= LEARNED
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether arrivals show the size of the last jump."""
+        return self._usual_ns is not None
+
+    @property
+    def lag_ns(self) -> float:
+        """The usual lag since the last jump."""
+        return float(np.median(self._lags))
+
+    def change_ns(self) -> float:
+        """By how much the stamps jumped last: by the lags before and since; without arrival times, by the stamps."""
+        return self._stamps_jump_ns if self._usual_ns is None else self._usual_ns - self.lag_ns
 
     def _expected_lags(self) -> Array:
         """(4,) quantiles 0, 0.5, 0.95 and 1 of the lag of the next frame: the lags so far follow their trend, as those

@@ -17,8 +17,8 @@ import numpy as np
 
 from camera_node.arrays import Array, Mask
 from fusion.model.states import States
-from fusion.monitoring.time_offsets import Disagreement, OffsetInformation, contradiction
-from fusion.monitoring.time_search import Snapshot
+from fusion.monitoring.clocks.time_offsets import Disagreement, OffsetInformation, contradiction
+from fusion.monitoring.clocks.time_search import Snapshot
 
 WINDOW_NS, WINDOW_PX = 500_000_000, 100.0  # smallest duration of a window, and smallest image motion in it
 MAX_WINDOWS, MAX_AGE_NS = 60, 60_000_000_000

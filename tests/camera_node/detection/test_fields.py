@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bent paper and uneven light: found, and within the claims."""
+
+import pytest
+
+from camera_node.detection.detector import Detector
+from tests.benchmarks.detector.bent import measure_bend
+from tests.benchmarks.detector.cameras import acquainted, errors
+from tests.benchmarks.detector.lighting import BAND, KINDS
+from tests.benchmarks.detector.table import Run
+
+RUN = Run("chords", Detector, False)
+CLAIM = 3.0  # squared errors over claims, for each coordinate; without the fields 1000 to 2000, 6 and 3
+
+
+@pytest.mark.parametrize("diameter", [40, 80])
+def test_a_bend_is_removed_from_the_outline_and_its_unknown_part_is_claimed(diameter):
+    """A hundredth of the card's diameter; the mean curvature may have either sign and does not show."""
+    measured = measure_bend(RUN, 0.01, diameter, 8)
+    assert measured.found == 1
+    assert measured.centre < CLAIM
+    assert measured.size < CLAIM
+
+
+@pytest.mark.parametrize("diameter", [40, 80])
+def test_flat_paper_is_not_taken_for_bent(diameter):
+    """Mean squared errors of 16 coordinates have a standard deviation of 0.35; three of them below the mean."""
+    assert measure_bend(RUN, 0.0, diameter, 8).centre > 1 - 3 * 0.35
+
+
+@pytest.mark.parametrize("what", ["soft shadow", "gloss"])
+def test_uneven_light_is_within_the_claims(what):
+    sensor, disturb, _ = KINDS[what]
+    measured = errors(acquainted(RUN, sensor), sensor, BAND, 3, disturb)
+    assert measured.found > 0.7
+    assert measured.centre < CLAIM
