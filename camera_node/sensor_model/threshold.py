@@ -43,8 +43,8 @@ class SmallestSizes:
 HALF, NEARLY_ALL = 0.5, 0.99  # the measured shares
 SIZES: dict[Ground, dict[float, SmallestSizes]] = {
     "cluttered": {
-        HALF: SmallestSizes((7.29, 8.28, 11.0, 15.8, 21.3), (1.0, 1.084, 1.217, 1.376, 1.647, 1.929, 2.404)),
-        NEARLY_ALL: SmallestSizes((10.1, 11.1, 16.4, 24.3, 37.6), (1.0, 1.1, 1.22, 1.41, 1.63, 1.89, 3.92)),
+        HALF: SmallestSizes((7.29, 8.28, 11.0, 16.8, 22.5), (1.0, 1.084, 1.217, 1.376, 1.647, 1.929, 2.404)),
+        NEARLY_ALL: SmallestSizes((10.1, 11.1, 16.4, 26.8, 37.6), (1.0, 1.1, 1.22, 1.41, 1.63, 1.89, 3.92)),
     },
     "even": {
         HALF: SmallestSizes((7.09, 7.43, 9.77, 13.5, 17.3), (1.0, 1.089, 1.207, 1.329, 1.604, 1.954, 2.422)),

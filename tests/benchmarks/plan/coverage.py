@@ -21,7 +21,7 @@ from tests.benchmarks.plan.arena import DIAMETER_M, HALF_M, HEIGHTS_M, image_of,
 REACH_M = 0.15  # half length of paths through edges of the image
 FAR_M = 0.75  # half length of paths through limits of size and slant
 STEPS = 31  # of a path
-PERIOD_S = 1000.0  # of the motion along a path: the roundels of the prediction are at rest, so these must not blur
+PERIOD_S = 1000.0  # of the motion along a path: so slow that no roundel blurs, as in the prediction
 
 
 @dataclass(frozen=True)
