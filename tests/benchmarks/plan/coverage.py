@@ -169,9 +169,13 @@ def _line(path: EdgePath) -> dict[str, Any]:
 
 
 def _edge(steps: Array, found: np.ndarray) -> float:
-    """The step that separates found from missed with the fewest exceptions; infinite if all are of one kind."""
+    """Where found and missed are separated with the fewest exceptions; infinite if all are of one kind.
+
+    It is the middle of all such places: the first one is nearer to the camera than the transition.
+    """
     if found.all() or not found.any():
         return np.inf if found.all() else -np.inf
-    wrong = [np.sum(~found[:k]) + np.sum(found[k:]) for k in range(len(steps) + 1)]
-    k = int(np.argmin(wrong))
-    return float(steps[min(k, len(steps) - 1)] - (steps[1] - steps[0]) / 2)
+    wrong = np.array([np.sum(~found[:k]) + np.sum(found[k:]) for k in range(len(steps) + 1)])
+    half = (steps[1] - steps[0]) / 2
+    between = np.append(steps - half, steps[-1] + half)
+    return float(np.mean(between[wrong == wrong.min()]))
