@@ -35,14 +35,17 @@ class LogLimits:
         kind_lines: of one kind at once ...
         kind_s: ... then one in this time.
         lines: of all kinds at once; those of a traceback count ...
-        digest_s: ... then one in this time, a digest of all kinds that were held back.
+        line_s: ... then one in this time. A line that stands for others, as a digest of all kinds that were held back
+            does, costs as many lines as it stands for, ...
+        most_lines: ... but at most so many: events are written soon, and a flood is one line a minute.
     """
 
     spacing_s: float = 1.0
     kind_lines: int = 6
-    kind_s: float = 600.0
+    kind_s: float = 60.0
     lines: int = 32
-    digest_s: float = 120.0
+    line_s: float = 2.0
+    most_lines: int = 30
 
 
 def about(name: str) -> dict[str, str]:
@@ -126,7 +129,7 @@ class LimitedHandler(logging.StreamHandler):
     def __init__(self, stream: Any = None, limits: LogLimits | None = None) -> None:
         super().__init__(stream)
         self._limits = limits or LogLimits()
-        self._allowance = _Allowance(self._limits.lines, self._limits.digest_s)
+        self._allowance = _Allowance(self._limits.lines, self._limits.line_s)
         self._kinds: dict[object, _Kind] = {}
         self._timer: threading.Timer | None = None
         self._timer_s = 0.0
@@ -170,9 +173,12 @@ class LimitedHandler(logging.StreamHandler):
         """Write a line for each kind, or one for all if the process may not write as many."""
         as_digest = len(kinds) > max(1.0, self._allowance.left(now_s))
         released = [kind.release(now_s) for kind in kinds]
+        held = [sum(held for held, _ in released)] if as_digest else [held for held, _ in released]
+        records = [_digest(released)] if as_digest else [_counted(*pair) for pair in released]
         try:
-            for record in [_digest(released)] if as_digest else [_counted(*pair) for pair in released]:
-                self._allowance.take(now_s, 1 + self.format(record).count("\n"))
+            for number, record in zip(held, records, strict=True):
+                lines = 1 + self.format(record).count("\n")
+                self._allowance.take(now_s, max(lines, min(number, self._limits.most_lines)))
                 super().emit(record)
         except Exception:  # of a format string that does not fit its arguments
             self.handleError(released[0][1])

@@ -37,6 +37,9 @@ InitialGuess ExpectedRoundel::guess() const {
     InitialGuess guess{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise};
     guess.outer.x += vx, guess.outer.y += vy;
     (*guess.model)[kX] += vx, (*guess.model)[kY] += vy;
+    // The parameters beside fields are no solution without them: a single step from there leaves residuals
+    // that would show the fields again.
+    if (fit.fields.any()) guess.model.reset();
     return guess;
 }
 

@@ -111,10 +111,10 @@ def attacked(limits: LogLimits, kinds: int, seconds: float) -> tuple[str, int]:
 @pytest.mark.parametrize("kinds", [1, 5, 60])
 def test_lines_under_attack_are_bounded_and_none_is_uncounted(kinds: int):
     """However many kinds and messages: those at once, one each time of the refill, and one at the end."""
-    limits, seconds = LogLimits(0.001, kind_lines=4, kind_s=0.1, lines=12, digest_s=0.05), 0.5
+    limits, seconds = LogLimits(0.001, kind_lines=4, kind_s=0.1, lines=12, line_s=0.005, most_lines=10), 0.5
     text, sent = attacked(limits, kinds, seconds)
     of_kinds = kinds * (limits.kind_lines + seconds / limits.kind_s)
-    of_process = limits.lines + seconds / limits.digest_s
+    of_process = limits.lines + seconds / (limits.line_s * limits.most_lines)
     assert (
         len(text.splitlines()) <= min(of_kinds, of_process) * 1.3 + 1
     )  # a busy machine takes longer than `seconds`
@@ -123,13 +123,24 @@ def test_lines_under_attack_are_bounded_and_none_is_uncounted(kinds: int):
 
 def test_the_real_limits_leave_an_hour_of_attack_below_a_hundred_lines():
     limits = LogLimits()
-    assert limits.lines + 3600 / limits.digest_s < 100
+    assert limits.lines + 3600 / (limits.line_s * limits.most_lines) < 100
+
+
+def test_events_of_an_arena_are_written_within_a_second(stream: io.StringIO):
+    """Forty events one after the other, though four lines may be written at once: each is a line of its own."""
+    log.handlers[0].close()
+    handler = LimitedHandler(stream, LogLimits(0.0, lines=4, line_s=0.01))
+    handler.setFormatter(LineFormatter("%(message)s"))
+    log.handlers[:] = [handler]
+    for k in range(40):
+        log.warning("camera %s was moved", k, extra=about(str(k)))
+        wait_for(lambda k=k: f"camera {k} was moved" in stream.getvalue(), deadline_s=1.0)
 
 
 def test_a_rare_line_is_quoted_in_the_digest_of_a_flood(stream: io.StringIO):
     """A camera that fails during an attack is in the next line that may be written."""
     log.handlers[0].close()
-    handler = LimitedHandler(stream, LogLimits(0.0, kind_lines=1000, lines=3, digest_s=0.1))
+    handler = LimitedHandler(stream, LogLimits(0.0, kind_lines=1000, lines=3, line_s=0.01, most_lines=10))
     handler.setFormatter(LineFormatter("%(levelname)s %(message)s"))
     log.handlers[:] = [handler]
     for k in range(4000):

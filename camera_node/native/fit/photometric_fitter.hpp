@@ -21,8 +21,8 @@ constexpr double kStrictScale = 0.5, kSlackScale = 1.3;
 constexpr double kSeparateBlurs = 4;    // of wide bands that contain a single edge, and of plateaus
 constexpr float kClippedPlateau = 235;  // level that compression leaves of clipped paper
 
-/// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 1100.
-constexpr double kUnlikelyField = 14;
+/// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 22,000.
+constexpr double kUnlikelyField = 20;
 
 /// One photometric fit: the state that its stages share. `fit_photometric` calls the stages in order.
 class PhotometricFitter : GaussNewton<kCount> {

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace
 
 from camera_node.errors import RoundelError
+from fusion.protocol.messages import CameraHealth
 from tests.benchmarks.faults.arena import Fuzz, LiveArena
 from tests.benchmarks.faults.world import CameraFault, RobotEvent
 
@@ -330,14 +331,21 @@ def advised(camera: str, word: str) -> Callable[[Evidence], str]:
 
 
 def suspected(camera: str) -> Callable[[Evidence], str]:
-    """The server names the camera in its log, or excludes it."""
+    """The server names the camera in its log, or its status says what is wrong with it."""
 
     def report(seen: Evidence) -> str:
         health = seen.health(camera)
         line = seen.logged("server:", camera)
-        return line or ("status: excluded" if health and health.excluded else "")
+        return line or (_suspicion(health) if health else "")
 
     return report
+
+
+def _suspicion(health: CameraHealth) -> str:
+    """Why the server does not use a camera as it is; empty if it does."""
+    if health.excluded or health.frozen:
+        return "status: excluded" if health.excluded else "status: frozen"
+    return "" if health.clock == "correct" else f"status: clock {health.clock}"
 
 
 def camera_fault(
