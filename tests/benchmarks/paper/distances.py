@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tables III and IV: error and repeatability of the distance, with an imperfectly known lens."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,13 +61,13 @@ def known_lens(lens: Lens, rng: np.random.Generator) -> Lens:
 
 
 def measure_resolution(
-    resolution: tuple[int, int], frames: int
+    resolution: tuple[int, int], frames: int, distances: Sequence[float] = published.DISTANCES
 ) -> tuple[dict[str, Measured], dict[float, float]]:
     """Measure a pattern placed by hand at each distance; also the predicted L_delta in %, by distance."""
     lens, rng = published.paper_lens(resolution), np.random.default_rng(resolution)
     calibrated = known_lens(lens, rng)
     done, predicted = {name: Measured() for name in METHODS}, {}
-    for distance in published.DISTANCES:
+    for distance in distances:
         uv = tuple((np.array([lens.cx, lens.cy]) + rng.uniform(-0.06, 0.06, 2) * lens.width).tolist())
         view = View(lens, uv, distance, float(rng.uniform(0, 0.2)), float(rng.uniform(0, 6.28)))
         picture = trace_print(view, roundel(PATTERN), rng)

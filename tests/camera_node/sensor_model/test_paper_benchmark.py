@@ -70,6 +70,17 @@ def test_ours_is_more_precise_than_the_reference_and_the_distance_repeats_as_pre
     assert np.mean([ours[x][1] for x in near]) < np.mean([reference[x][1] for x in near])
 
 
+@pytest.mark.slow  # ten seconds
+def test_the_distance_of_a_tracked_pattern_repeats_in_a_hundred_images():
+    """A disturbance that a fit assumes by chance must not persist: here the size was 0.45 % off from image 40 on.
+
+    The standard deviation of 100 values has a relative error of 0.07; the prediction holds within 20 %.
+    """
+    done, predicted = distances.measure_resolution((480, 360), 100, published.DISTANCES[:4])
+    for distance, (_, repeats) in done["ours"].table(3.5).items():
+        assert repeats < 1.2 * (1 + 3 * 0.07) * predicted[distance]
+
+
 def test_v_max_of_the_model_is_within_a_pixel_of_the_measured_range():
     """Of the pattern's size in the image."""
     lens, pattern = published.paper_lens((752, 480)), published.PATTERN
