@@ -16,6 +16,7 @@ from tests.benchmarks.faults.world import CameraFault, RobotEvent
 SHORT_S = 0.1  # a longer gap needs an explanation
 LATE_S = 0.35  # a camera falls silent: one frame set waits 0.15 s for it, and association starts again
 LONGEST_S = 2.1  # any gap
+LATENESS_MS = 150.0  # the server's limit
 DISK_BYTES = 300_000
 
 Action = Callable[[], object]
@@ -139,8 +140,17 @@ def lost_frames(arena: LiveArena, rng: random.Random) -> Fault:
 
 def late_frames(arena: LiveArena, rng: random.Random) -> Fault:
     name = rng.choice(arena.cameras)
+
+    def report(seen: Evidence) -> str:
+        """Other faults make frames late, too, and the log has few lines of one kind: then the status shows it."""
+        health = seen.health(name)
+        lateness_ms = health.lateness_ms if health else 0.0
+        return seen.logged(name, "late") or (
+            f"lateness {lateness_ms:.0f} ms" if lateness_ms > LATENESS_MS else ""
+        )
+
     fault = CameraFault(delay_ms=rng.uniform(250, 800))
-    return camera_fault(arena, name, fault, lambda seen: seen.logged(name, "late"), 3.0, LATE_S)
+    return camera_fault(arena, name, fault, report, 3.0, LATE_S)
 
 
 def swapped_frames(arena: LiveArena, rng: random.Random) -> Fault:
