@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from camera_node.rate_limit import RateLimit
 from camera_node.text import MAX_LINE, printable
 
 MAX_KINDS = 256  # further ones are limited together
@@ -75,41 +76,24 @@ class LineFormatter(logging.Formatter):
         return "\n".join(f"| {printable(line)}" for line in super().formatException(ei).splitlines())
 
 
-class _Allowance:
-    """Lines that may be written: `lines` at once, then one in `refill_s`. More may be taken than there are."""
-
-    def __init__(self, lines: int, refill_s: float) -> None:
-        self._lines, self._refill_s = lines, refill_s
-        self._left, self._at_s = float(lines), time.monotonic()
-
-    def left(self, now_s: float) -> float:
-        return min(self._lines, self._left + (now_s - self._at_s) / self._refill_s)
-
-    def is_full(self, now_s: float) -> bool:
-        return self.left(now_s) >= self._lines
-
-    def take(self, now_s: float, lines: int = 1) -> None:
-        self._left, self._at_s = self.left(now_s) - lines, now_s
-
-    @property
-    def due_s(self) -> float:
-        """When the next line may be written, by the monotonic clock."""
-        return self._at_s + max(0.0, 1.0 - self._left) * self._refill_s
-
-
 class _Kind:
     """The lines of one kind: those that may be written, and those that are held back."""
 
     def __init__(self, limits: LogLimits) -> None:
         self._spacing_s = limits.spacing_s
         self._written_s = -limits.spacing_s
-        self.allowance = _Allowance(limits.kind_lines, limits.kind_s)
+        self.allowance = RateLimit(1 / limits.kind_s, limits.kind_lines)
         self.held = 0
         self.last: logging.LogRecord | None = None
 
     @property
     def due_s(self) -> float:
-        return max(self._written_s + self._spacing_s, self.allowance.due_s)
+        return max(self._written_s + self._spacing_s, self.allowance.due_s())
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is held back, and as many lines may be written as ever."""
+        return not self.held and self.allowance.left() >= self.allowance.burst
 
     def hold(self, record: logging.LogRecord) -> None:
         self.held, self.last = self.held + 1, record
@@ -119,7 +103,7 @@ class _Kind:
         assert self.last is not None
         held, record = self.held, self.last
         self.held, self.last, self._written_s = 0, None, now_s
-        self.allowance.take(now_s)
+        self.allowance.take()
         return held, record
 
 
@@ -129,7 +113,7 @@ class LimitedHandler(logging.StreamHandler):
     def __init__(self, stream: Any = None, limits: LogLimits | None = None) -> None:
         super().__init__(stream)
         self._limits = limits or LogLimits()
-        self._allowance = _Allowance(self._limits.lines, self._limits.line_s)
+        self._allowance = RateLimit(1 / self._limits.line_s, self._limits.lines)
         self._kinds: dict[object, _Kind] = {}
         self._timer: threading.Timer | None = None
         self._timer_s = 0.0
@@ -163,22 +147,22 @@ class LimitedHandler(logging.StreamHandler):
     def _write_due(self, now_s: float) -> None:
         """Write the kinds whose time has come, if the process may write; start a timer for the others."""
         waiting = self._waiting()
-        if now_s >= self._allowance.due_s:
+        if now_s >= self._allowance.due_s():
             self._write([kind for kind in waiting if kind.due_s <= now_s], now_s)
             waiting = self._waiting()
         if waiting:
-            self._start_timer(max(self._allowance.due_s, min(kind.due_s for kind in waiting)), now_s)
+            self._start_timer(max(self._allowance.due_s(), min(kind.due_s for kind in waiting)), now_s)
 
     def _write(self, kinds: list[_Kind], now_s: float) -> None:
         """Write a line for each kind, or one for all if the process may not write as many."""
-        as_digest = len(kinds) > max(1.0, self._allowance.left(now_s))
+        as_digest = len(kinds) > max(1.0, self._allowance.left())
         released = [kind.release(now_s) for kind in kinds]
         held = [sum(held for held, _ in released)] if as_digest else [held for held, _ in released]
         records = [_digest(released)] if as_digest else [_counted(*pair) for pair in released]
         try:
             for number, record in zip(held, records, strict=True):
                 lines = 1 + self.format(record).count("\n")
-                self._allowance.take(now_s, max(lines, min(number, self._limits.most_lines)))
+                self._allowance.take(max(lines, min(number, self._limits.most_lines)))
                 super().emit(record)
         except Exception:  # of a format string that does not fit its arguments
             self.handleError(released[0][1])
@@ -201,12 +185,8 @@ class LimitedHandler(logging.StreamHandler):
         """The kind of a record. Kinds without lines of late make room for others."""
         key = (record.name, record.levelno, record.msg, getattr(record, "subject", None))
         if key not in self._kinds and len(self._kinds) >= MAX_KINDS:
-            now_s = time.monotonic()
-            used = {
-                k: kind for k, kind in self._kinds.items() if kind.held or not kind.allowance.is_full(now_s)
-            }
-            self._kinds = used
-            key = key if len(used) < MAX_KINDS else None
+            self._kinds = {k: kind for k, kind in self._kinds.items() if not kind.is_idle}
+            key = key if len(self._kinds) < MAX_KINDS else None
         if key not in self._kinds:
             self._kinds[key] = _Kind(self._limits)
         return self._kinds[key]

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from camera_node.commands.camera import LocalCameras, given_options
 from camera_node.errors import NetworkError
+from camera_node.processes.supervisor import Supervisor
 from camera_node.sources.frame import SourceSettings
-from camera_node.supervisor import Supervisor
 from fusion.server.config import ArenaConfig
 from web.arena_folder import ArenaFolder
 from web.page_access import PageAccess, is_loopback

@@ -18,11 +18,11 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
 from camera_node.errors import NetworkError
+from camera_node.processes.supervisor import Supervisor, log_path
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import SourceSettings
-from camera_node.supervisor import Supervisor, log_path
 from fusion.protocol.messages import RobotPose
 from fusion.server.config import load_arena
 from web.arena_folder import ArenaFolder

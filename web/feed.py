@@ -54,9 +54,8 @@ class ArenaState:
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
     progress: TimedMessage | None = None  # of the demo
-    declared: dict[str, Robot] = field(
-        default_factory=dict
-    )  # the server's robots; another object if one changed
+    # The server's robots; another object if one changed.
+    declared: dict[str, Robot] = field(default_factory=dict)
     rig: Rig | None = None
     rig_t_ns: int | None = None  # since when it is in force, server's time
     history: RigHistory | None = None  # the versions of the server's rig

@@ -38,10 +38,8 @@ class RecordingPlayer:
         """
         self.path = path
         self.faults: Counter[str] = Counter()
-        self._held: dict[str, list[tuple[int, str, bytes]]] = {
-            "rig": [],
-            "robots": [],
-        }  # what holds until the next one
+        # Messages that are valid until the next one of their key.
+        self._held: dict[str, list[tuple[int, str, bytes]]] = {"rig": [], "robots": []}
         times: list[int] = []
         arenas: Counter[str] = Counter()
         for key, data, t_ns in read_messages(path, self.faults):

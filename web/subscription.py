@@ -16,8 +16,8 @@ from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
-from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import RequestSource
+from camera_node.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
@@ -27,9 +27,8 @@ from web.feed import Feed
 REQUEST_TIMEOUT_S = 2.0
 RIG_REQUESTS_HZ = 1.0  # however many status messages arrive
 RIG_TIMEOUT_S = 5.0
-ROBOTS_S = (
-    5.0  # from one request for the declared robots to the next; their markers may change without a message
-)
+# From one request for the declared robots to the next; their markers may change without a message.
+ROBOTS_S = 5.0
 
 
 class Subscription:

@@ -72,7 +72,7 @@ class Wand(WandOptions):
     """Calibrate the pose of this camera only, from a short recording; the other cameras keep theirs."""
     background: Path | None = None
     """Points beside the wand, at unknown places, that stand still or move: a CSV as for --observations, in which marker
-    is the number of the point, the same in all cameras. They make the cameras accurate where nobody waves the wand."""
+    is the number of the point, the same in all cameras. They make the cameras accurate where the wand is not waved."""
     widen_lenses: float = 1.0
     """Multiply the standard deviations of the lenses by this, 1 or more: for lenses that changed since they were
     calibrated, or that are farther off than usual."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Points beside the wand, at unknown positions, that several cameras see: matched in time.
 
-They may stand still or move, and constrain the cameras where nobody waves the wand ("unpaired" or background points of
+They may stand still or move, and constrain the cameras where the wand is not waved ("unpaired" or background points of
 easyWand and Argus).
 """
 
@@ -19,9 +19,8 @@ from camera_node.arrays import Array, Index
 from camera_node.protocol.messages import Detections
 
 STILL = 3.0  # standard deviations of one detection: the images of a point that stands still differ by less
-STILL_SIGMA_PX = (
-    0.05  # part of the error of a detection that is the same in all images of a point that stands still
-)
+# Part of the error of a detection that is the same in all images of a point that stands still.
+STILL_SIGMA_PX = 0.05
 MAX_POINTS = 2000  # positions of points that are used
 
 

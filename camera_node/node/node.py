@@ -25,7 +25,6 @@ from camera_node.node.settings import apply_settings, read_settings
 from camera_node.node.status import DetectedFrame, NodeStatistics
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, Settings, encode
-from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import (
     RequestError,
     encode_jpeg,
@@ -38,6 +37,7 @@ from camera_node.protocol.requests import (
     sender_of,
 )
 from camera_node.protocol.session import ServerWatch
+from camera_node.rate_limit import RateLimit
 from camera_node.service import ServiceManager
 from camera_node.sources.frame import Frame, Source
 

@@ -13,7 +13,7 @@ import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
 from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.session import NO_SERVER, PATIENCE_S, SEND_BUFFER, open_endless
+from camera_node.protocol.session import NO_SERVER, PATIENCE_S, open_endless
 
 log = logging.getLogger("camera_node.network")
 
@@ -30,7 +30,7 @@ class ServerConnection:
     Args:
         connect: endpoints of the server.
         zenoh_config: a file.
-        send_buffer: of the kernel, bytes; `BURST_BUFFER` for a program that sends many messages at once.
+        send_buffer: of the kernel, bytes; `BURST_BUFFER` for a program that sends many messages at once, else None.
 
     Raises:
         NetworkError: an endpoint is invalid.
@@ -38,7 +38,7 @@ class ServerConnection:
     """
 
     def __init__(
-        self, connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int = SEND_BUFFER
+        self, connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int | None = None
     ) -> None:
         self.endpoints = " ".join(connect)
         self._future: Future[zenoh.Session] = Future()
@@ -117,7 +117,7 @@ class ServerConnection:
         except FutureTimeout:
             return None
 
-    def _open(self, connect: Sequence[str], zenoh_config: Path | None, send_buffer: int) -> None:
+    def _open(self, connect: Sequence[str], zenoh_config: Path | None, send_buffer: int | None) -> None:
         try:
             session = open_endless(connect, zenoh_config, send_buffer)
         except (NetworkError, ConfigError) as error:

@@ -222,9 +222,8 @@ class CameraStatus(msgspec.Struct, frozen=True, kw_only=True):
         None  # standard deviation of the blur of the roundels' edges; None without roundels
     )
     advice: str = ""  # "saturated", "too dark" or "out of focus" with the change to make, or empty
-    refused: int = (
-        0  # refused requests for a snapshot or settings, and undecodable rigs, since the node started
-    )
+    # Refused requests for a snapshot or settings, and undecodable rigs, since the node started.
+    refused: int = 0
 
     def check(self) -> None:
         """Raise MessageError for a name that no camera can have, or impossible ratios."""

@@ -27,9 +27,8 @@ ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the ope
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 OPEN_TIMEOUT_MS = 2000  # of one attempt; `close` waits this long for a listener that is not Zenoh
 LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
-MAX_MESSAGE = (
-    1 << 24
-)  # bytes; the largest are snapshots. Zenoh's own limit is 1 GB, which each receiver assembles
+# Bytes; the largest are snapshots. Zenoh's own limit is 1 GB, which each receiver assembles.
+MAX_MESSAGE = 1 << 24
 ALWAYS = {
     "transport/link/tx/lease": LEASE_MS,
     "transport/link/rx/max_message_size": MAX_MESSAGE,
@@ -114,21 +113,21 @@ def open_client(
 
 
 def open_endless(
-    connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int = SEND_BUFFER
+    connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int | None = None
 ) -> zenoh.Session:
     """As `open_client`, but tries until a server answers: for threads that are daemons.
 
     Args:
         connect: endpoints of the server.
         zenoh_config: a file.
-        send_buffer: of the kernel, bytes, if it is more than this function would choose.
+        send_buffer: of the kernel, bytes; None for that of `send_buffer_of`.
 
     Raises:
         NetworkError: an endpoint is invalid, or a certificate is missing.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
     limits = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
-    buffers = _send_buffers(send_buffer) if send_buffer > SEND_BUFFER else {}
+    buffers = {} if send_buffer is None else _send_buffers(send_buffer)
     try:
         return _open_client(connect, zenoh_config, {**limits, **buffers})
     except zenoh.ZError as error:

@@ -99,9 +99,8 @@ class ImageModel:
         m = self._margin - 1  # one more pixel on each side for the gradient
         rays = self._rays[v0 + m : v1 + m + 2, u0 + m : u1 + m + 2]
         fine = cv2.resize(rays, None, fx=SUBSAMPLES, fy=SUBSAMPLES, interpolation=cv2.INTER_LINEAR)
-        rows = np.arange(v0 - 1, v1 + 1).repeat(
-            SUBSAMPLES
-        )  # all sub-samples of a pixel have the time of its row
+        # All sub-samples of a pixel have the time of its row.
+        rows = np.arange(v0 - 1, v1 + 1).repeat(SUBSAMPLES)
         heights = self.camera.image_row(np.column_stack([rows, rows]))
         radius = disc.intersect(np.asarray(fine, np.float32), heights)
         rim = SUBSAMPLES - 1

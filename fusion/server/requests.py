@@ -19,7 +19,6 @@ from calib.rig.messages import (
 )
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import Keys, encode
-from camera_node.protocol.rate_limit import RateLimit
 from camera_node.protocol.requests import (
     RequestError,
     RequestSource,
@@ -27,6 +26,7 @@ from camera_node.protocol.requests import (
     parse_request,
     payload_of,
 )
+from camera_node.rate_limit import RateLimit
 from fusion.model.undistortion import prepare_lenses
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.server.pipeline import TrackingPipeline

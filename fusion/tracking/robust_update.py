@@ -18,9 +18,8 @@ from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
 from fusion.tracking.joint_compatibility import jointly_compatible
 
-SUSPICIOUS = (
-    4.0  # squared residual over that of calibration errors, from which a robot's detections are compared
-)
+# Squared residual over that of calibration errors, from which a robot's detections are compared.
+SUSPICIOUS = 4.0
 # Correction of a position in standard deviations of its prediction: those of frames 33 ms apart have 11 mm. No false
 # roundel has displaced a robot by more than its correction and the error of its prediction.
 MIN_CORRECTION = 0.5

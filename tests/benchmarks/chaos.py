@@ -18,8 +18,9 @@ from rich.table import Table
 from camera_node.terminal import console, say, track
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.judge import Gap, WrongPose
-from tests.benchmarks.faults.kinds import KINDS, LONGEST_S, SHORT_S, VIRTUAL, Evidence, Fault
+from tests.benchmarks.faults.kinds import KINDS, LONGEST_S, SHORT_S, VIRTUAL, Fault
 from tests.benchmarks.faults.memory import Growth
+from tests.benchmarks.faults.reports import Evidence
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.fuzz import EXTRA
 

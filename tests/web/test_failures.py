@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from camera_node.supervisor import Supervisor, log_path
+from camera_node.processes.supervisor import Supervisor, log_path
 from tests.conftest import free_port
 from tests.waiting import wait_for
 from web.demo import Demo
@@ -45,7 +45,7 @@ def test_leaving_the_block_stops_all_programs(
     supervisor: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Both a program that ends at SIGTERM and one that ignores it; until then their use of resources is measured."""
-    monkeypatch.setattr("camera_node.supervisor.GRACE_S", 0.3)
+    monkeypatch.setattr("camera_node.processes.supervisor.GRACE_S", 0.3)
     with supervisor:
         for name in ("lasting", "stubborn"):
             supervisor.start(name, name, [])

@@ -16,10 +16,10 @@ import zenoh
 
 from camera_node.errors import NetworkError
 from camera_node.geometry.pose import Pose
+from camera_node.processes.supervisor import spawn, stop_all
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from camera_node.service import stopped_by_signals
-from camera_node.supervisor import spawn, stop_all
 from camera_node.terminal import say
 from fusion.client import Arena
 from web.errors import WebError

@@ -13,11 +13,8 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from fusion.model.likeness import sides
 
-UNKNOWN_RADIUS_M, PLATE_M, BORDER_M = (
-    0.13,
-    0.03,
-    0.03,
-)  # of a plate below prints; its height; beyond their cards
+# Of a plate below unknown prints; its height; how far it reaches beyond the cards.
+UNKNOWN_RADIUS_M, PLATE_M, BORDER_M = 0.13, 0.03, 0.03
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
 
 

@@ -21,9 +21,8 @@ BEHIND = 1e4  # sigmas: the residual of a point behind its camera
 STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step
 ROBUST_STEPS = 10
 CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
-REGULAR = (
-    1e-9  # relative information that is added to every coordinate: a point on parallel rays stays where it is
-)
+# Relative information that is added to every coordinate: a point on parallel rays stays where it is.
+REGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +137,8 @@ def _linearize(problem: Problem, state: State) -> tuple[Array, Array, Array]:
 def _step(problem: Problem, state: State, weight: Array) -> State:
     """One step of Gauss-Newton for all points, with weights (n,) of the images."""
     error, _, J = _linearize(problem, state)
-    H, g, point = (
-        np.zeros((len(state.points), 3, 3)),
-        np.zeros((len(state.points), 3)),
-        problem.background.point,
-    )
+    n, point = len(state.points), problem.background.point
+    H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
     np.add.at(H, point, weight[:, None, None] * np.swapaxes(J, 1, 2) @ J)
     np.add.at(g, point, weight[:, None] * (np.swapaxes(J, 1, 2) @ error[:, :, None])[:, :, 0])
     regular = REGULAR * np.einsum("jii->j", H)[:, None, None] + np.finfo(float).tiny

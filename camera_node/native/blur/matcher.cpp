@@ -101,11 +101,6 @@ constexpr TemplateGrid kTemplateGrid = [] {
     return grid;
 }();
 
-ROUNDEL_INLINE Lanes between(const Lanes& x, const Lanes& most) {
-    const Lanes positive = x > 0.0f ? x : all(0);
-    return positive < most ? positive : most;
-}
-
 }  // namespace
 
 void MotionBlurMatcher::use_prints(std::span<const Print> prints) {
@@ -151,8 +146,8 @@ ROUNDEL_CLONES void MotionBlurMatcher::sample(const ImageView& image, const Disc
     const Lanes right = all(float(image.width - 1)), bottom = all(float(image.height - 1));
     for (size_t k = 0; k < NewTemplate::kPadded; k += kLanes) {
         const Lanes a = along * load(&kTemplateGrid.along[k]), b = across * load(&kTemplateGrid.across[k]);
-        const Lanes x = between(float(p.x) + a * c - b * s + 0.5f, right);
-        const Lanes y = between(float(p.y) + a * s + b * c + 0.5f, bottom);
+        const Lanes x = clamped(float(p.x) + a * c - b * s + 0.5f, all(0), right);
+        const Lanes y = clamped(float(p.y) + a * s + b * c + 0.5f, all(0), bottom);
         const Bits column = __builtin_convertvector(x, Bits), row = __builtin_convertvector(y, Bits);
         for (int n = 0; n < kLanes; ++n) levels.at[k + size_t(n)] = float(image.row(row[n])[column[n]]);
     }

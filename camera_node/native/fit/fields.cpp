@@ -14,11 +14,6 @@ constexpr float kDarkest = 0.6f, kBrightest = 254;  // levels that are not clipp
 constexpr float kLeastLight = 0.2f;                 // of the mean
 constexpr double kEdgeBlurs = 1.5;                  // from the card's edge to where the ground hardly shows
 
-ROUNDEL_INLINE Lanes between(const Lanes& value, float low, float high) {
-    const Lanes least = value > low ? value : all(low);
-    return least < high ? least : all(high);
-}
-
 ROUNDEL_CLONES void remove(const FieldPlane& plane, const float* of, float along_x, float along_y,
                            EdgePixels& pixels) {
     for (int k = 0; k < pixels.count; k += kLanes) {
@@ -28,7 +23,7 @@ ROUNDEL_CLONES void remove(const FieldPlane& plane, const float* of, float along
         FieldPlane::functions_of_light(X, Y, f);
         for (int i = 0; i < kLightFields; ++i) light += of[kLight + i] * f[i], gloss += of[kGloss + i] * f[i];
         const Lanes least = light > kLeastLight ? light : all(kLeastLight);
-        const Lanes even = between((level - gloss) / least, kDarkest, kBrightest);
+        const Lanes even = clamped((level - gloss) / least, all(kDarkest), all(kBrightest));
         const Bits clipped = (level < 0.5f) | (level > kSaturated);
         const Lanes bend = 2.0f * (of[kBend] * f[2] + of[kBend + 1] * f[3]);
         store(pixels.level + k, clipped ? level : even);

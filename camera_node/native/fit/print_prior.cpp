@@ -43,7 +43,7 @@ bool PhotometricFitter::condition_on_print(const Print& print) {
     const double off = print.ratio - p_[kRatio], variance = with[kRatio] + square(print.sigma);
     if (square(off) > square(kMaxPrintError) * variance) return false;
     for (int i = 0; i < kCount; ++i)
-        if (i != kRatio) p_[i] += with[i] * off / variance;  // the measured ratio is kept for the tests
+        if (i != kRatio) p_[i] += with[i] * off / variance;  // the tests need the measured ratio
     for (int i = 0; i < kPoseCount; ++i) curvature_effect_[i] = bent[kX + i] / noise_;
     for (int i = 0; i < kPoseCount; ++i) print_effect_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
     posterior_ratio_ = p_[kRatio] + with[kRatio] * off / variance;

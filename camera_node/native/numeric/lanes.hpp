@@ -23,6 +23,10 @@ ROUNDEL_INLINE Lanes load(const float* from) {
     return v;
 }
 ROUNDEL_INLINE void store(float* to, const Lanes& v) { __builtin_memcpy(to, &v, sizeof v); }
+ROUNDEL_INLINE Lanes clamped(const Lanes& value, const Lanes& low, const Lanes& high) {
+    const Lanes above = value > low ? value : low;
+    return above < high ? above : high;
+}
 ROUNDEL_INLINE Lanes magnitude(const Lanes& x) { return Lanes(Bits(x) & 0x7fffffff); }
 
 /// 1 / sqrt(x) for x > 0 with a relative error of 5e-6: an initial guess by halving the exponent, and two
@@ -42,7 +46,7 @@ struct Normal {
 /// Approximating polynomials in t^2 on [-3.5, 3.5]. The error of the tail is 3e-5 there and 2e-4 beyond, that
 /// of the density 3e-3; the density is 0 beyond. Independent terms are faster than Horner's scheme.
 ROUNDEL_INLINE Normal normal_tail(const Lanes& t) {
-    const Lanes above = t > -3.5f ? t : all(-3.5f), z = above < 3.5f ? above : all(3.5f);
+    const Lanes z = clamped(t, all(-3.5f), all(3.5f));
     const Lanes u = z * z, uu = u * u;
     const Lanes odd = (0.398817865f - 0.0660721718f * u) + uu * (0.00956194028f - 0.00100343984f * u) +
                       uu * uu * ((7.07925185e-05f - 2.94779384e-06f * u) + uu * 5.38789068e-08f);

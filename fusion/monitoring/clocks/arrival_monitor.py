@@ -91,11 +91,8 @@ class ArrivalMonitor:
         self._shared -= {name}
 
     def _shared_ns(self) -> float:
-        return (
-            float(np.median([self._cameras[name].change_ns for name in self._shared]))
-            if self._shared
-            else 0.0
-        )
+        changes = [self._cameras[name].change_ns for name in self._shared]
+        return float(np.median(changes)) if changes else 0.0
 
     def _compare(self, now_ns: int) -> None:
         """Find the cameras that changed relative to the others."""

@@ -39,9 +39,8 @@ MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
 MIN_EXPECTED = 16  # moving markers, for a decision
 GIVE_UP_NS = 1_500_000_000  # without an explanation by time: above `RANGE_S`, so that the history covers it
-ALONE_NS = (
-    2_000_000_000  # after which the arrival decides if no camera is left to compare with: above `GIVE_UP_NS`
-)
+# After which the arrival decides if no camera is left to compare with: above `GIVE_UP_NS`.
+ALONE_NS = 2_000_000_000
 STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the arrival decides
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence

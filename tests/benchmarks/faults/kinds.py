@@ -4,56 +4,21 @@
 import contextlib
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from msgspec.structs import replace
 
 from camera_node.errors import RoundelError
-from fusion.protocol.messages import CameraHealth
 from tests.benchmarks.faults.arena import Fuzz, LiveArena
+from tests.benchmarks.faults.reports import Evidence, advised, gone, late, suspected
 from tests.benchmarks.faults.world import CameraFault, RobotEvent
 
 SHORT_S = 0.1  # a longer gap needs an explanation
 LATE_S = 0.35  # a camera falls silent: one frame set waits 0.15 s for it, and association starts again
 LONGEST_S = 2.1  # any gap
-LATENESS_MS = 150.0  # the server's limit
 DISK_BYTES = 300_000
 
 Action = Callable[[], object]
-
-
-@dataclass
-class Evidence:
-    """What the arena reported since a fault began: log lines as "program: line", and counters before it."""
-
-    arena: LiveArena
-    lines: list[str] = field(default_factory=list)
-    counted: dict[str, int] = field(default_factory=dict)
-    begun_ns: int = 0
-
-    def logged(self, *words: str) -> str:
-        """A line with all of these words; empty without one."""
-        return next((line for line in self.lines if all(word in line for word in words)), "")
-
-    def health(self, camera: str):
-        """The server's figures of a camera, if they are newer than the fault."""
-        status = self.arena.status
-        return status.cameras.get(camera) if status and status.t_ns > self.begun_ns else None
-
-    def node(self, camera: str):
-        """A camera's own status, if it is newer than the fault."""
-        status = self.arena.camera_status.get(camera)
-        return status if status and status.t_ns > self.begun_ns else None
-
-    def robot(self, name: str) -> str:
-        """The state of a robot in the server's status."""
-        status = self.arena.status
-        return status.robots.get(name, "") if status and status.t_ns > self.begun_ns else ""
-
-    def count(self, reason: str) -> int:
-        """How much a counter of the server's rose."""
-        faults = self.arena.status.faults if self.arena.status else {}
-        return faults.get(reason, 0) - self.counted.get(reason, 0)
 
 
 @dataclass
@@ -140,17 +105,7 @@ def lost_frames(arena: LiveArena, rng: random.Random) -> Fault:
 
 def late_frames(arena: LiveArena, rng: random.Random) -> Fault:
     name = rng.choice(arena.cameras)
-
-    def report(seen: Evidence) -> str:
-        """Other faults make frames late, too, and the log has few lines of one kind: then the status shows it."""
-        health = seen.health(name)
-        lateness_ms = health.lateness_ms if health else 0.0
-        return seen.logged(name, "late") or (
-            f"lateness {lateness_ms:.0f} ms" if lateness_ms > LATENESS_MS else ""
-        )
-
-    fault = CameraFault(delay_ms=rng.uniform(250, 800))
-    return camera_fault(arena, name, fault, report, 3.0, LATE_S)
+    return camera_fault(arena, name, CameraFault(delay_ms=rng.uniform(250, 800)), late(name), 3.0, LATE_S)
 
 
 def swapped_frames(arena: LiveArena, rng: random.Random) -> Fault:
@@ -314,48 +269,6 @@ def fuzz_burst(arena: LiveArena, rng: random.Random) -> Fault:
             arena.programs.crashes.append(f"fuzzer: exit code {code}")
 
     return Fault("fuzzer", lambda: arena.start("fuzzer"), end, report, 6.0, LATE_S)
-
-
-# Reports.
-
-
-def gone(camera: str) -> Callable[[Evidence], str]:
-    """The server's log says that a camera is gone, or its status that no frames arrive."""
-
-    def report(seen: Evidence) -> str:
-        health = seen.health(camera)
-        silent = "status: 0 frames/s" if health and health.fps == 0 else ""
-        return seen.logged("server:", camera, "gone") or silent
-
-    return report
-
-
-def advised(camera: str, word: str) -> Callable[[Evidence], str]:
-    """The camera's status advises on its exposure."""
-
-    def report(seen: Evidence) -> str:
-        status = seen.node(camera)
-        return status.advice if status and word in status.advice else ""
-
-    return report
-
-
-def suspected(camera: str) -> Callable[[Evidence], str]:
-    """The server names the camera in its log, or its status says what is wrong with it."""
-
-    def report(seen: Evidence) -> str:
-        health = seen.health(camera)
-        line = seen.logged("server:", camera)
-        return line or (_suspicion(health) if health else "")
-
-    return report
-
-
-def _suspicion(health: CameraHealth) -> str:
-    """Why the server does not use a camera as it is; empty if it does."""
-    if health.excluded or health.frozen:
-        return "status: excluded" if health.excluded else "status: frozen"
-    return "" if health.clock == "correct" else f"status: clock {health.clock}"
 
 
 def camera_fault(

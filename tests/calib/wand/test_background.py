@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Points beside the wand, at unknown positions, make the cameras accurate where nobody waves the wand."""
+"""Points beside the wand, at unknown positions, make the cameras accurate where the wand is not waved."""
 
 from functools import cache
 
