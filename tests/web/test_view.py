@@ -6,6 +6,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import isclose
 
 import cv2
 import numpy as np
@@ -59,6 +60,7 @@ def require_one_column(view: View, page: Page) -> None:
     page.set_viewport_size({"width": 420, "height": 850})
     page.get_by_role("tab", name="Cameras").wait_for()
     (client,) = view.server.get_clients().values()
+    shape = "(c => c.clientWidth / c.clientHeight)([...document.querySelectorAll('canvas')].at(0))"
     for least_height in (0.44 * 850, 0.9 * 850):
         page.wait_for_function(
             f"Math.max(...[...document.querySelectorAll('canvas')].map(c => c.clientHeight)) >= {least_height}"
@@ -68,6 +70,8 @@ def require_one_column(view: View, page: Page) -> None:
         )
         title = "[...document.querySelectorAll('div')].filter(d => d.innerText?.startsWith('Roundel: test')).at(-1)"
         page.wait_for_function(f"{scene} <= {title}.getBoundingClientRect().top")
+        # The client reports the new shape of its scene some time after the browser has laid it out.
+        wait_for(lambda: isclose(client.camera.aspect, page.evaluate(shape), rel_tol=0.02))
         wait_for(
             lambda: np.allclose(
                 client.camera.position, default_viewpoint(four_cameras(), client.camera.aspect)[0], atol=0.05
