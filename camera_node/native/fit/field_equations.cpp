@@ -50,13 +50,14 @@ struct PartPixels {
 
 template <Edge edge, typename Basis>
 ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels at, const Basis& basis,
-                                 float per_cut, FurtherSums<Basis::kSize>& sums) {
+                                 const Weighting& weighting, FurtherSums<Basis::kSize>& sums) {
     constexpr int N = Basis::kSize;
     Lanes weighted[N][kChunk], columns[N];
     for (; lanes > 0; lanes -= kChunk, ++chunks) {
         const int count = std::min(kChunk, lanes);
         for (int k = 0; k < count; ++k, at.x += kLanes, at.y += kLanes, at.level += kLanes) {
-            const Lanes residual = chunks->residual[k], root = root_weight(residual * per_cut);
+            const Lanes residual = chunks->residual[k];
+            const Lanes root = root_weight<edge>(*chunks, k, residual, weighting);
             basis.columns(load(at.x), load(at.y), load(at.level) - residual, chunks->ring[k], columns);
             for (int a = 0; a < N; ++a) {
                 weighted[a][k] = root * root * columns[a];
@@ -75,16 +76,17 @@ ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels a
     }
 }
 
-ROUNDEL_CLONES void add_shading(const LinearPart& part, PartPixels at, float per_cut, FurtherSums<2>& sums) {
+ROUNDEL_CLONES void add_shading(const LinearPart& part, PartPixels at, const Weighting& weighting,
+                                FurtherSums<2>& sums) {
     with_edge(part.edge, [&](auto e) __attribute__((always_inline)) {
-        add_products<e>(part.chunks, part.lanes, at, ShadingBasis(), per_cut, sums);
+        add_products<e>(part.chunks, part.lanes, at, ShadingBasis(), weighting, sums);
     });
 }
 
-ROUNDEL_CLONES void add_fields(const LinearPart& part, PartPixels at, const FieldBasis& basis, float per_cut,
-                               FurtherSums<kFields>& sums) {
+ROUNDEL_CLONES void add_fields(const LinearPart& part, PartPixels at, const FieldBasis& basis,
+                               const Weighting& weighting, FurtherSums<kFields>& sums) {
     with_edge(part.edge, [&](auto e) __attribute__((always_inline)) {
-        add_products<e>(part.chunks, part.lanes, at, basis, per_cut, sums);
+        add_products<e>(part.chunks, part.lanes, at, basis, weighting, sums);
     });
 }
 
@@ -119,14 +121,14 @@ struct ScoreSums {
 
 /// `delta` is a step of the parameters of the part's gradient.
 ROUNDEL_CLONES void add_scores(const LinearPart& part, PartPixels at, const FieldPlane& plane,
-                               const float* delta, float per_cut, ScoreSums& sums) {
+                               const float* delta, const Weighting& weighting, ScoreSums& sums) {
     with_edge(part.edge, [&](auto e) __attribute__((always_inline)) {
         const Gradient* chunks = part.chunks;
         for (int lanes = part.lanes; lanes > 0; lanes -= kChunk, ++chunks, at.next_chunk())
             for (int k = 0; k < std::min(kChunk, lanes); k += kScoreStep) {
                 Lanes r = chunks->residual[k];
                 for (const int i : kBy<e>) r -= delta[i] * chunks->by[i][k];
-                const Lanes root = root_weight(r * per_cut), w = root * root, wr = w * r;
+                const Lanes root = root_weight(r * weighting.per_cut), w = root * root, wr = w * r;
                 Lanes X = load(at.x + k * kLanes), Y = load(at.y + k * kLanes);
                 plane.map(X, Y);
                 const Lanes xx = X * X, yy = Y * Y, xy = X * Y, rr = xx + yy;
@@ -149,34 +151,34 @@ double score(const Lanes& one, const Lanes& other, const Lanes& squared) {
 }  // namespace
 
 FurtherProducts<2> shading_products(const NormalEquations& equations, const EdgePixels& pixels,
-                                    double scale) {
+                                    const Weighting& weighting) {
     FurtherProducts<2> products;
     for (const LinearPart& part : equations.parts()) {
         FurtherSums<2> sums{};
-        add_shading(part, {pixels, part}, float(1 / (kTukey * scale)), sums);
+        add_shading(part, {pixels, part}, weighting, sums);
         add_sums(sums, part, products);
     }
     return products;
 }
 
 FurtherProducts<kFields> field_products(const NormalEquations& equations, const EdgePixels& pixels,
-                                        const FieldFrame& frame, double scale) {
+                                        const FieldFrame& frame, const Weighting& weighting) {
     FurtherProducts<kFields> products;
     for (const LinearPart& part : equations.parts()) {
         FurtherSums<kFields> sums{};
-        add_fields(part, {pixels, part}, {FieldPlane(frame)}, float(1 / (kTukey * scale)), sums);
+        add_fields(part, {pixels, part}, {FieldPlane(frame)}, weighting, sums);
         add_sums(sums, part, products);
     }
     return products;
 }
 
 FieldScores score_fields(const NormalEquations& equations, const EdgePixels& pixels, const FieldFrame& frame,
-                         const Parameters& step, double scale) {
+                         const Parameters& step, const Weighting& weighting) {
     ScoreSums sums{};
     const FieldPlane plane(frame);
     for (const LinearPart& part : equations.parts())
-        add_scores(part, {pixels, part}, plane, step_of(step, part.edge, part.jacobian).data(),
-                   float(1 / (kTukey * scale)), sums);
+        add_scores(part, {pixels, part}, plane, step_of(step, part.edge, part.jacobian).data(), weighting,
+                   sums);
     return {score(sums.cos3, sums.sin3, sums.bend), score(sums.cos2, 2 * sums.sin2, sums.light)};
 }
 

@@ -17,12 +17,13 @@ struct FurtherProducts {
 };
 
 /// Those of linear shading: level x and level y, with x and y in the pixels' frame. `pixels` are those that
-/// the equations were linearized at, `scale` is that of Tukey's weights; so in all functions here.
-FurtherProducts<2> shading_products(const NormalEquations& equations, const EdgePixels& pixels, double scale);
+/// the equations were linearized at, `weighting` is that of their solution; so in all functions here.
+FurtherProducts<2> shading_products(const NormalEquations& equations, const EdgePixels& pixels,
+                                    const Weighting& weighting);
 
 /// Those of all fields; `frame` is in the pixels' frame.
 FurtherProducts<kFields> field_products(const NormalEquations& equations, const EdgePixels& pixels,
-                                        const FieldFrame& frame, double scale);
+                                        const FieldFrame& frame, const Weighting& weighting);
 
 /// Score tests of fields that a fit did not contain: squared sums of products of residuals and columns over
 /// their variance, for residuals of variance 1. Each is chi-square with two degrees of freedom.
@@ -35,6 +36,6 @@ struct FieldScores {
 
 /// The scores of the residuals after a further `step` of the parameters.
 FieldScores score_fields(const NormalEquations& equations, const EdgePixels& pixels, const FieldFrame& frame,
-                         const Parameters& step, double scale);
+                         const Parameters& step, const Weighting& weighting);
 
 }  // namespace roundel

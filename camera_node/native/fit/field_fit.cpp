@@ -23,7 +23,7 @@ bool PhotometricFitter::shows_bend() {
     if (occlusion_.any()) return false;
     Parameters step = p_;
     for (int i = 0; i < kCount; ++i) step[i] -= linearized_at_[i];
-    scores_ = score_fields(equations_, pixels_, FieldFrame(p_), step, scale_);
+    scores_ = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
     scores_.bend /= square(noise_), scores_.light /= square(noise_);
     return allowed_ == AllowedFields::kBend && scores_.bend > kUnlikelyField;
 }
@@ -71,7 +71,7 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
     Parameters step = factor_->solve(system_.g);
     FieldFrame frame = fields_.frame;
     frame.x -= pixels_.origin_x, frame.y -= pixels_.origin_y;
-    const auto products = field_products(equations_, pixels_, frame, scale_);
+    const auto products = field_products(equations_, pixels_, frame, {scale_, spread_});
     std::array<Vector<kFields>, kFields> S = products.own;
     std::array<Parameters, kFields> half;
     Vector<kFields> right = products.residuals;
@@ -93,7 +93,7 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
         for (size_t i = 0; i < kCount; ++i) step[i] -= by_field_[a][i] * change[a];
     }
     field_cov_ = factor.inverse_tail<kFields>();
-    sums_ = equations_.residuals_after(step, scale_);
+    sums_ = equations_.residuals_after(step, {scale_, spread_});
     update_noise();
     for (size_t a = 0; a < kFields; ++a) fields_.of[a] += change[a];
     apply(step);
@@ -127,7 +127,7 @@ void PhotometricFitter::add_fields(PoseCovariance& inverse) const {
 ///   S = D + prior - C^T H^-1 C,  shading = S^-1 (e - C^T step),  pose <- pose - (H^-1 C shading)_pose.
 /// The covariance grows by H^-1 C S^-1 C^T H^-1. The shading is relative to the level at the pixels' origin.
 void PhotometricFitter::allow_shading() {
-    const auto products = shading_products(equations_, pixels_, scale_);
+    const auto products = shading_products(equations_, pixels_, {scale_, spread_});
     const auto& [Cx, Cy] = products.parameters;
     const Parameters yx = factor_->halfway(Cx), yy = factor_->halfway(Cy);
     Symmetric S{products.own[0][0], products.own[1][0], products.own[1][1]};

@@ -48,6 +48,30 @@ ROUNDEL_INLINE Lanes root_weight(const Lanes& t) {
     return left > 0.0f ? left : all(0);
 }
 
+/// The weights of residuals: Tukey's, and less for pixels that see the ground, of which little is known.
+struct Weighting {
+    float per_cut;  // 1 / Tukey's cutoff
+    float spread;   // variance of the ground's levels over that of the noise, times the pixels of a patch
+    Weighting(double scale, double ground) : per_cut(float(1 / (kTukey * scale))), spread(float(ground)) {}
+};
+
+/// The weight of a pixel by what it sees of the ground.
+template <Edge edge>
+ROUNDEL_INLINE Lanes ground_weight(const Gradient& at, int k, float spread) {
+    if constexpr (edge == kOuterEdge || edge == kInnerEdge) return all(1);
+    if (spread == 0) return all(1);
+    return 1.0f / (1.0f + spread * at.by[kGround][k] * at.by[kGround][k]);
+}
+
+/// The square root of the weight of a residual: Tukey's, and less for pixels that see the ground.
+template <Edge edge>
+ROUNDEL_INLINE Lanes root_weight(const Gradient& at, int k, const Lanes& residual, const Weighting& by) {
+    const Lanes tukey = root_weight(residual * by.per_cut);
+    if constexpr (edge == kOuterEdge || edge == kInnerEdge) return tukey;
+    if (by.spread == 0) return tukey;
+    return tukey * inverse_sqrt(1.0f + by.spread * at.by[kGround][k] * at.by[kGround][k]);
+}
+
 /// The linearized model at the pixels of one edge, or of all edges.
 struct LinearPart {
     Edge edge;

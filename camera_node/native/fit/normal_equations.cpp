@@ -31,13 +31,13 @@ ROUNDEL_CLONES void evaluate(const EdgePixels& pixels, const EdgePixels::EdgePar
 }
 
 template <Edge edge>
-ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, float per_cut, GramOf<edge>& gram) {
+ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, const Weighting& by, GramOf<edge>& gram) {
     constexpr int n = kUnknowns<edge>;
     Columns<n + 1> columns;
     for (; lanes > 0; lanes -= kChunk, ++chunks) {
         const int count = std::min(kChunk, lanes);
         for (int k = 0; k < count; ++k) {
-            const Lanes root = root_weight(chunks->residual[k] * per_cut);
+            const Lanes root = root_weight<edge>(*chunks, k, chunks->residual[k], by);
             for (int i = 0; i < n; ++i) columns[i][k] = root * chunks->by[kBy<edge>[size_t(i)]][k];
             columns[n][k] = root * chunks->residual[k];
         }
@@ -89,10 +89,10 @@ ROUNDEL_INLINE void add_transformed(const GramOf<edge>& gram, const EdgeEllipse:
 }
 
 ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const EdgeEllipse::Jacobian& J,
-                             float per_cut, GaussNewtonSystem<kCount>& to) {
+                             const Weighting& by, GaussNewtonSystem<kCount>& to) {
     with_edge(edge, [&](auto e) __attribute__((always_inline)) {
         GramOf<e> gram{};
-        add_products<e>(chunks, lanes, per_cut, gram);
+        add_products<e>(chunks, lanes, by, gram);
         if constexpr (e == kAnyEdge)
             add_sums(gram, to);
         else
@@ -101,13 +101,15 @@ ROUNDEL_CLONES void add_part(const Gradient* chunks, int lanes, Edge edge, const
 }
 
 struct LaneResidualSums {
-    Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi;
+    Lanes ring, agreeing, ring_rr, m, mm, mrr, mwrr, mpsi, ground, ground_rr, ground_ground;
 };
 
-ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, float per_cut,
+template <Edge edge>
+ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, const Weighting& by,
                                   LaneResidualSums& sums) {
-    const Lanes t = r * per_cut, root = root_weight(t), w = root * root, rr = r * r;
-    const Lanes squared = at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k];
+    const Lanes t = r * by.per_cut, root = root_weight(t), w = root * root, rr = r * r;
+    const Lanes squared =
+        (at.by[kX][k] * at.by[kX][k] + at.by[kY][k] * at.by[kY][k]) * ground_weight<edge>(at, k, by.spread);
     const Lanes ring = at.residual[k] < kAbsent ? at.ring[k] * at.ring[k] : all(0), m = w * squared;
     sums.ring += ring;
     sums.agreeing += w * ring;
@@ -117,17 +119,20 @@ ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, flo
     sums.mrr += m * rr;
     sums.mwrr += m * w * rr;
     sums.mpsi += squared * root * (1.0f - 5.0f * t * t);
+    if constexpr (edge == kOuterEdge || edge == kInnerEdge) return;
+    const Lanes share = at.residual[k] < kAbsent ? at.by[kGround][k] : all(0), gg = share * share;
+    sums.ground += gg, sums.ground_rr += gg * rr, sums.ground_ground += gg * gg;
 }
 
 /// `delta` is a step of the parameters of the part's gradient.
 ROUNDEL_CLONES void add_residual_sums(const Gradient* chunks, int lanes, Edge edge, const float* delta,
-                                      float per_cut, LaneResidualSums& sums) {
+                                      const Weighting& by, LaneResidualSums& sums) {
     with_edge(edge, [&](auto e) __attribute__((always_inline)) {
         for (; lanes > 0; lanes -= kChunk, ++chunks)
             for (int k = 0; k < std::min(kChunk, lanes); ++k) {
                 Lanes r = chunks->residual[k];
                 for (const int i : kBy<e>) r -= delta[i] * chunks->by[i][k];
-                add_residuals(r, *chunks, k, per_cut, sums);
+                add_residuals<e>(r, *chunks, k, by, sums);
             }
     });
 }
@@ -202,18 +207,18 @@ double NormalEquations::median_residual() const {
     return double(median_of(sample));
 }
 
-GaussNewtonSystem<kCount> NormalEquations::accumulate(double scale) const {
+GaussNewtonSystem<kCount> NormalEquations::accumulate(const Weighting& by) const {
     GaussNewtonSystem<kCount> system{};
     for (const LinearPart& part : parts())
-        add_part(part.chunks, part.lanes, part.edge, part.jacobian, float(1 / (kTukey * scale)), system);
+        add_part(part.chunks, part.lanes, part.edge, part.jacobian, by, system);
     return system;
 }
 
-ResidualSums NormalEquations::residuals_after(const Parameters& delta, double scale) const {
+ResidualSums NormalEquations::residuals_after(const Parameters& delta, const Weighting& by) const {
     LaneResidualSums s{};
     for (const LinearPart& part : parts())
         add_residual_sums(part.chunks, part.lanes, part.edge, step_of(delta, part.edge, part.jacobian).data(),
-                          float(1 / (kTukey * scale)), s);
+                          by, s);
     return {.ring = double(sum(s.ring)),
             .agreeing = double(sum(s.agreeing)),
             .ring_rr = double(sum(s.ring_rr)),
@@ -221,7 +226,10 @@ ResidualSums NormalEquations::residuals_after(const Parameters& delta, double sc
             .mm = double(sum(s.mm)),
             .mrr = double(sum(s.mrr)),
             .mwrr = double(sum(s.mwrr)),
-            .mpsi = double(sum(s.mpsi))};
+            .mpsi = double(sum(s.mpsi)),
+            .ground = double(sum(s.ground)),
+            .ground_rr = double(sum(s.ground_rr)),
+            .ground_ground = double(sum(s.ground_ground))};
 }
 
 }  // namespace roundel

@@ -18,6 +18,8 @@ struct ResidualSums {
     /// Sums of w m, w m^2, w m r^2, w^2 m r^2 and m psi'. m is the squared slope of the level (a pixel's
     /// information on the edges), w Tukey's weight, psi = w r.
     double m, mm, mrr, mwrr, mpsi;
+    /// Sums of g^2, g^2 r^2 and g^4, unweighted. g is the share of the ground in a pixel.
+    double ground, ground_rr, ground_ground;
 };
 
 /// The normal equations of weighted least squares: the model's levels at all pixels, linearized at one point
@@ -29,9 +31,9 @@ class NormalEquations {
     /// The median absolute residual of a sample of the pixels on steep parts of the ring's edges; negative if
     /// there are fewer than eight.
     double median_residual() const;
-    /// J^T W J and J^T W r with Tukey's weights W for residuals of a standard deviation `scale`.
-    GaussNewtonSystem<kCount> accumulate(double scale) const;
-    ResidualSums residuals_after(const Parameters& delta, double scale) const;
+    /// J^T W J and J^T W r.
+    GaussNewtonSystem<kCount> accumulate(const Weighting& by) const;
+    ResidualSums residuals_after(const Parameters& delta, const Weighting& by) const;
     std::span<const LinearPart> parts() const { return {parts_.data(), size_t(part_count_)}; }
 
   private:

@@ -27,8 +27,11 @@ constexpr int kMaxResumedSteps = 3;         // from the last frame's model
 constexpr double kMaxResumedMisfit = 0.25;  // residuals over the contrast: edges are off by half a blur
 constexpr int kEdgeUnknowns = kCount - 3;   // all but the grey levels
 
-constexpr double kScale = 1.06;    // standard deviation of Gaussian noise over that of weighted residuals
-constexpr double kNoiseFloor = 1;  // grey levels
+constexpr double kScale = 1.06;      // standard deviation of Gaussian noise over that of weighted residuals
+constexpr double kNoiseFloor = 1;    // grey levels
+constexpr double kGroundChance = 4;  // standard deviations of the ground's residuals, by noise
+constexpr double kPatch = 64;        // pixels of the ground with correlated levels
+constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
@@ -57,7 +60,7 @@ PhotometricFitter::PhotometricFitter(const ImageView& image, const InitialGuess&
     p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
     prior_ = prior_information(guess.outer.major, kRatioPrior, kBlurPrior);
     if (!resumed_) return;
-    p_ = *guess.model, start_[kGround] = p_[kGround], scale_ = guess.noise;
+    p_ = *guess.model, start_[kGround] = p_[kGround], scale_ = guess.noise, spread_ = guess.ground;
     p_[kX] -= pixels_.origin_x, p_[kY] -= pixels_.origin_y;
 }
 
@@ -122,12 +125,23 @@ bool PhotometricFitter::iterate(const EdgePixels& pixels, int steps_to_go) {
 }
 
 bool PhotometricFitter::solve(double scale) {
-    system_ = equations_.accumulate(scale);
+    system_ = equations_.accumulate({scale, spread_});
     return factorize(system_, scale);
 }
 
 bool PhotometricFitter::is_converged(double left) const {
     return left < kConverged * noise_ / std::sqrt(edge_information());
+}
+
+bool PhotometricFitter::sees_clutter() const { return !has_fields_ && !spread_ && ground_ > kEvenGround; }
+
+bool PhotometricFitter::weigh_ground() {
+    spread_ = ground_, p_ = linearized_at_;
+    posterior_ratio_ = 0, print_effect_ = curvature_effect_ = {}, shading_effect_ = {};
+    const double scale = scale_;
+    if (!solve(scale)) return false;
+    const double left = square(advance(scale)) / p_[kBlur];
+    return is_sane(kFitLimits) && (is_converged(left) || iterate(pixels_, 1));
 }
 
 bool PhotometricFitter::is_near(double left) const {
@@ -145,7 +159,7 @@ double PhotometricFitter::edge_scale() const {
 /// Newton's step is therefore longer by w / psi'.
 double PhotometricFitter::advance(double scale) {
     Parameters delta = factor_->solve(system_.g);
-    sums_ = equations_.residuals_after(delta, scale);
+    sums_ = equations_.residuals_after(delta, {scale, spread_});
     update_noise();
     for (int i = 0; i < kCount; ++i) delta[i] /= slope_;
     apply(delta);
@@ -173,6 +187,9 @@ void PhotometricFitter::update_noise() {
     slope_ = std::clamp(sums_.mpsi / sums_.m, 0.5, 1.0);
     scale_ = std::max(kNoiseFloor, kScale * std::sqrt(sums_.mrr / (sums_.m * freedom)));
     noise_ = std::max(kNoiseFloor, std::sqrt(sums_.mwrr / (sums_.m * freedom)) / slope_);
+    const double chance = kGroundChance * std::sqrt(2 * sums_.ground_ground);
+    const double beyond = sums_.ground_rr / square(noise_) - sums_.ground - chance;
+    ground_ = kPatch * std::max(0.0, beyond) / std::max(sums_.ground_ground, 1e-9);
 }
 
 PoseCovariance PhotometricFitter::pose_covariance() const {
@@ -190,24 +207,39 @@ RoundelFit PhotometricFitter::fit() const {
     if (posterior_ratio_ > 0) fit.p[kRatio] = posterior_ratio_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
-    fit.noise = scale_, fit.shading = shading_, fit.clipped = clipped_;
+    fit.noise = scale_, fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;
+    fit.shading = shading_, fit.clipped = clipped_;
     fit.uneven = scores_.light > kUnlikelyField, fit.fields = fields_;
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;
 }
 
-std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess) {
-    PhotometricFitter fitter(image, guess);
-    if (guess.fields == AllowedFields::kAll) {
-        if (!fitter.fit_fields()) return std::nullopt;
-    } else {
-        if (!(guess.model || fitter.approach()) || !fitter.finish()) return std::nullopt;
-        if (fitter.shows_bend() && !fitter.fit_fields()) return std::nullopt;
-    }
+/// The iterations; false if they leave the neighbourhood of the guess.
+static bool converges(PhotometricFitter& fitter, const InitialGuess& guess) {
+    if (guess.fields == AllowedFields::kAll) return fitter.fit_fields();
+    if (!(guess.model || fitter.approach()) || !fitter.finish()) return false;
+    return !fitter.shows_bend() || fitter.fit_fields();
+}
+
+/// The fit at a solution, with what is known of levels, prints and light.
+static RoundelFit conclude(PhotometricFitter& fitter, const InitialGuess& guess) {
     fitter.use_plateaus();
     if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
     if (guess.shading_sigma > 0 && !fitter.knows_light()) fitter.allow_shading();
     return fitter.fit();
+}
+
+std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess) {
+    PhotometricFitter fitter(image, guess);
+    return converges(fitter, guess) ? std::optional(conclude(fitter, guess)) : std::nullopt;
+}
+
+std::optional<GroundFits> fit_on_ground(const ImageView& image, const InitialGuess& guess) {
+    PhotometricFitter fitter(image, guess);
+    if (!converges(fitter, guess)) return std::nullopt;
+    GroundFits fits{conclude(fitter, guess), std::nullopt};
+    if (fitter.sees_clutter() && fitter.weigh_ground()) fits.weighed = conclude(fitter, guess);
+    return fits;
 }
 
 }  // namespace roundel

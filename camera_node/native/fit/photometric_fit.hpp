@@ -29,7 +29,8 @@ struct InitialGuess {
     std::span<const Print> prints{};    // in use, if they are known
     OcclusionMask occlusion{};          // sectors that the fit leaves out
     std::optional<Parameters> model{};  // in the image's frame, within a third of a pixel, if known
-    double noise = 0;                   // noise that the fit of `model` estimated
+    double noise = 0;                   // noise that the fit of `model` estimated,
+    double ground = 0;                  // and `RoundelFit::ground`
     double shading_sigma = 0;           // of the relative change of the light, per pixel; 0 for none
     double curvature_sigma = 0;         // of the curvature that is left in the tone curve; 0 for none
     AllowedFields fields = AllowedFields::kNone;
@@ -66,6 +67,9 @@ struct RoundelFit {
     bool unoccluded = false;  // the fit uses the unmodified image, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
+    /// How much less pixels count that see the ground: its variance over that of the noise, times the pixels
+    /// of a patch of it; 0 if all pixels count alike.
+    double ground = 0;
     Shading shading{};
     bool clipped = false;    // the paper is brighter than the camera can show
     bool uneven = false;     // the residuals show light that changes by more than the fit contains
@@ -97,5 +101,13 @@ struct RoundelFit {
 /// The covariance is that of the M-estimate. Its noise is estimated from the residuals and is at least one
 /// grey level. Returns nothing if the fit leaves the neighbourhood of the guess or the system is singular.
 std::optional<RoundelFit> fit_photometric(const ImageView& image, const InitialGuess& guess);
+
+/// The fit in which all pixels count alike, whose residuals show uneven light and occlusions, and, if the
+/// levels around the card vary, the fit in which pixels count less the more they see of them.
+struct GroundFits {
+    RoundelFit even;
+    std::optional<RoundelFit> weighed;
+};
+std::optional<GroundFits> fit_on_ground(const ImageView& image, const InitialGuess& guess);
 
 }  // namespace roundel

@@ -23,7 +23,6 @@ constexpr float kClippedPlateau = 235;  // level that compression leaves of clip
 
 /// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 22,000.
 constexpr double kUnlikelyField = 20;
-
 /// One photometric fit: the state that its stages share. `fit_photometric` calls the stages in order.
 class PhotometricFitter : GaussNewton<kCount> {
   public:
@@ -34,6 +33,10 @@ class PhotometricFitter : GaussNewton<kCount> {
     bool approach();
     /// Iterates on all pixels until convergence.
     bool finish();
+    /// Whether the residuals beyond the card show levels that vary.
+    bool sees_clutter() const;
+    /// Weights the pixels that see the ground as these residuals require, and solves again.
+    bool weigh_ground();
     double ratio() const { return p_[kRatio]; }
     RoundelFit fit() const;
 
@@ -90,6 +93,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
     double posterior_ratio_ = 0;         // given the print; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
+    double spread_ = 0, ground_ = 0;  // of the ground: in the last solution, and as its residuals show
     bool resumed_, clipped_ = false;
     double shading_sigma_, curvature_sigma_;
     Vector<kPoseCount>

@@ -126,6 +126,12 @@ void claim_misfit(RoundelFit& fit, double noise) {
         for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
 }
 
+/// The fit with what the tests of another one found.
+RoundelFit as_tested(RoundelFit fit, const RoundelFit& tested) {
+    fit.unoccluded = tested.unoccluded, fit.correlation = tested.correlation, fit.uneven = tested.uneven;
+    return fit;
+}
+
 /// A fit with its tests. `misfit` is empty if noise explains the residuals.
 struct TestedFit {
     RoundelFit fit;
@@ -152,6 +158,7 @@ TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceCo
 std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, const RoundelFit& fit,
                                     const AcceptanceContext& context) {
     guess.outer = fit.outer, guess.model = fit.p, guess.noise = fit.noise, guess.fields = AllowedFields::kAll;
+    guess.ground = 0;
     const auto even = fit_photometric(image, guess);
     if (!even) return std::nullopt;
     // Residuals that processing leaves around all of the ring remain.
@@ -198,15 +205,18 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
                                       const AcceptanceContext& context, bool known) {
     guess.prints = context.limits.prints, guess.shading_sigma = context.shading_sigma;
     guess.curvature_sigma = context.curvature_sigma, guess.fields = AllowedFields::kBend;
-    const auto first = fit_photometric(image, guess);
-    if (!first) return std::nullopt;
+    const auto fits = fit_on_ground(image, guess);
+    if (!fits) return std::nullopt;
+    const RoundelFit* const first = &fits->even;
     TestedFit tested = test(image, *first, context);
+    const bool is_even = tested.fit.unoccluded && !first->uneven;
     // Before the camera is known, its tone curve and its processing look like uneven light.
     if (context.edge_noise > 0 && (first->uneven || !tested.fit.unoccluded) &&
         is_within_limits(*first, context.limits))
         if (const auto even = fit_uneven(image, guess, *first, context);
             even && (known || tested.accepted || is_certain_roundel(image, even->fit, guess, context.noise)))
             tested = *even;
+    if (is_even && fits->weighed) tested.fit = as_tested(*fits->weighed, tested.fit);
     auto& [fit, misfit, elliptic, accepted] = tested;
     if (fit.fields.has_light())
         fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));

@@ -30,7 +30,7 @@ Parameters seen(double diameter, double slant) {
 GaussNewtonSystem<kCount> products(const EdgePixels& pixels, const Parameters& p) {
     static NormalEquations equations;
     equations.linearize(pixels, p);
-    return equations.accumulate(kAllAgree);
+    return equations.accumulate({kAllAgree, 0});
 }
 
 int main() {
