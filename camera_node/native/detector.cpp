@@ -180,11 +180,12 @@ void Detector::fit_moving_tracked(FrameState& frame) const {
     }
 }
 
-/// Fits new moving roundels at the streaks that match best.
+/// Fits new moving roundels at the streaks that match best. A streak in the middle of which the card of
+/// another roundel lies is made by that one's edge.
 void Detector::fit_moving_streaks(FrameState& frame) const {
     std::vector<MovingMatch> matches;
     for (const Streak& streak : frame.streaks) {
-        if (frame.suppression.contains_fast(double(streak.x), double(streak.y))) continue;
+        if (frame.suppression.contains(double(streak.x), double(streak.y), kCardRatio)) continue;
         if (const auto match = matcher_.match_streak(frame.image, streak)) matches.push_back(*match);
     }
     std::sort(matches.begin(), matches.end(),
