@@ -24,7 +24,9 @@ MAX_DETECTIONS = (
     1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
 )
 HISTORY = 64  # frames of a camera
-MIN_STEPS_BACK = 4  # of sequence numbers in the history, for two unknown publishers: a restarted node makes one
+MIN_STEPS_BACK = (
+    4  # of sequence numbers in the history, for two unknown publishers: a restarted node makes one
+)
 ANOTHER_NODE = "frames of another node under its name"
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
 

@@ -186,7 +186,9 @@ def of_node(publisher: int, messages: list[Detections], camera: str = "cam0") ->
 def test_frames_of_a_second_node_with_the_name_of_a_camera_change_no_pose(caplog):
     """A camera at another place, which starts later. Before, its frames were used as those of the first one."""
     messages = ARENA.messages(20)
-    first = [m for node, name in enumerate(ARENA.cameras, 1) for m in of_node(node, views(messages, name), name)]
+    first = [
+        m for node, name in enumerate(ARENA.cameras, 1) for m in of_node(node, views(messages, name), name)
+    ]
     second = of_node(9, views(messages, "cam1")[5:])
     alone, both = Pipeline(), Pipeline()
     assert [f.poses for f in play(both, first + second)] == [f.poses for f in play(alone, first)]
