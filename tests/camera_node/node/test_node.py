@@ -85,9 +85,17 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
     assert [message.t_ns for message in got.items] == [START + 50 * MS * k for k in range(40)]
     assert [message.seq for message in got.items] == list(range(40))
     assert {(message.camera, message.width, message.height) for message in got.items} == {("cam0", 320, 240)}
+    assert len({message.publisher for message in got.items}) == 1
     for message in got.items:
         np.testing.assert_allclose(message.unpack().uv, [CENTRE], atol=0.1)
         assert message.detect_us > 0
+
+
+def test_two_nodes_with_one_name_can_be_told_apart(network, inbox, running, frames):
+    got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
+    running(frames)
+    running(frames)
+    assert got.until(lambda messages: len({message.publisher for message in messages} - {0}) == 2)
 
 
 def test_the_status_is_published_once_a_second_and_the_token_ends_with_the_node(
