@@ -30,12 +30,6 @@ LIVE_FILES = (
     "test_record.py",
     "test_publish.py",
 )
-COMPUTED_FILES = (  # of these folders, but without sessions or programs
-    "test_camera_registry.py",
-    "test_ingest.py",
-    "test_memory_growth.py",
-    "test_virtual_faults.py",
-)
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _reserved_ports: set[int] = set()
 NICENESS = 10  # of tests that only compute
@@ -47,9 +41,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def is_live(item: pytest.Item) -> bool:
     """Whether the result of a test depends on real time: it runs sessions, programs or a browser."""
     fixtures = getattr(item, "fixturenames", ())
-    if "endpoint" in fixtures or item.path.name in LIVE_FILES:
-        return True
-    return item.path.parent.name in LIVE_FOLDERS and item.path.name not in COMPUTED_FILES
+    if item.get_closest_marker("computed"):
+        return False
+    in_live_file = item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
+    return "endpoint" in fixtures or in_live_file
 
 
 @pytest.hookimpl(tryfirst=True)

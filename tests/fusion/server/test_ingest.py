@@ -28,6 +28,7 @@ ARENA = Arena(
 )
 KEYS = Keys("x")
 NS = 10**9
+pytestmark = pytest.mark.computed
 
 
 class Pipeline:
