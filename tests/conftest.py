@@ -41,7 +41,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def is_live(item: pytest.Item) -> bool:
     """Whether the result of a test depends on real time: it runs sessions, programs or a browser."""
     fixtures = getattr(item, "fixturenames", ())
-    return "endpoint" in fixtures or item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
+    if item.get_closest_marker("computed"):
+        return False
+    in_live_file = item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
+    return "endpoint" in fixtures or in_live_file
 
 
 @pytest.hookimpl(tryfirst=True)

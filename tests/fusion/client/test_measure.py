@@ -182,7 +182,6 @@ def test_a_misspelt_command_gets_a_suggestion():
     [
         (("b/c", "--diameter", "0.12"), "can't name a robot"),
         (("b", "--diameter", "0.12", "--seconds", "-1"), "above 0"),
-        (("b", "--diameter", "0.12"), "no server answers at tcp/"),
     ],
 )
 def test_an_invalid_definition_is_reported_in_one_line(words, said):
