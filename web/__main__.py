@@ -12,8 +12,8 @@ from pathlib import Path
 
 from camera_node.command_line import parse
 from camera_node.config import example_file
-from camera_node.errors import run
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
 from web.feed import Feed
