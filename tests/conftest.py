@@ -18,7 +18,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
-LIVE_FOLDERS = ("web", "bridges", "client", "live", "node", "protocol", "security", "server", "storage")
+LIVE_FOLDERS = (
+    "web",
+    "bridges",
+    "client",
+    "demo",
+    "live",
+    "node",
+    "protocol",
+    "security",
+    "server",
+    "state",
+    "storage",
+)
 LIVE_FILES = (
     "test_demo.py",
     "test_readme.py",

@@ -19,7 +19,7 @@ from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import MAX_CHI2, mean_by_body
 from fusion.tracking.grouping.marker_search import MarkerSearch
 from fusion.tracking.grouping.multiview import Marker
-from fusion.tracking.identity.confirmation import Confirmation
+from fusion.tracking.identity.confirmation import WeakFits
 from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
@@ -84,7 +84,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self._markers, self._confirmation = MarkerSearch(cameras, leads), Confirmation()
+        self._markers, self._weak = MarkerSearch(cameras, leads), WeakFits()
 
     def acquire(
         self,
@@ -155,10 +155,9 @@ class Acquisition:
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
         found = none
-        for fits in (
-            *identified.fits,
-            *self._confirmation.confirmed(identified.weak, self._markers.n_frame_sets),
-        ):
+        n_frame_sets, t_ns = self._markers.n_frame_sets, table.t_ns or 0
+        confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
+        for fits in (*identified.fits, *confirmed):
             found = found.joined(fits.select(table.owned[fits.robot]))
         left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
         return found, {k: _reason(table, k, question, identified) for k in left}

@@ -23,6 +23,7 @@ from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.logs import set_up_logging
 from camera_node.node.node import Node, NodeOptions
+from camera_node.processes.program import run
 from camera_node.protocol.messages import MAX_ROUNDELS
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import Frame, Source
@@ -183,4 +184,4 @@ def main(name: str, connect: str, arena: str, epoch_ns: int, load: str, view: st
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(lambda: tyro.cli(main))
