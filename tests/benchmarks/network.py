@@ -26,6 +26,7 @@ from tests.benchmarks.faults.world import CameraFault
 
 Part = Literal["link", "cameras", "all", "server", "slow"]
 CLIENTS = ("viewer", "page", "recorder", "listener", "bridge")
+PROGRAMS = {"client": "listener", "bridge": "bridge", "recorder": "recorder"}  # that receive poses
 ODOMETRY = "0/*/odometry/**"  # of all robots in ROS 2's domain 0
 DEADLINE_S = 30.0
 FRESH_NS = 150_000_000  # age of a frame, up to which the server uses it
@@ -44,7 +45,7 @@ class Outage:
 @dataclass(frozen=True)
 class Blackout:
     """What an interruption of all links cost: the seconds from their return to the poses of all robots at the server,
-    at a client, at the ROS 2 bridge and in the recording."""
+    at a client, at the ROS 2 bridge and in the recording; 0 for a program that does not run."""
 
     away_s: float
     server_s: float
@@ -138,6 +139,7 @@ def interrupt_all(arena: LiveArena, network: Namespaces, names: Sequence[str], s
             "bridge": lambda: bridged.last_s > up_s,
             "recorder": lambda: recording_bytes(arena) > recorded,
         }
+        back |= {name: 0.0 for name, program in PROGRAMS.items() if program not in arena.extra}
 
         def all_back() -> bool:
             for name in [name for name, sign in signs.items() if name not in back and sign()]:
