@@ -21,7 +21,20 @@ from fusion.protocol.messages import FusionStatus, RobotPose, RobotPoses
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
 from tests.conftest import ROOT
-from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, connected, later, live, send, serving, until
+from tests.fusion.serving import (
+    ARENA,
+    ATTEMPT_S,
+    DEADLINE_S,
+    KEYS,
+    config,
+    connected,
+    later,
+    live,
+    send,
+    send_until_tracked,
+    serving,
+    until,
+)
 from tests.waiting import Inbox
 
 
@@ -83,29 +96,21 @@ def test_invalid_detections_are_counted_and_skipped(tmp_path):
 
 
 def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_path):
-    """All frames are sent again until they have an effect: one that is published before a subscription is lost."""
     frames = ARENA.messages(12)
     with serving(config(tmp_path)) as (server, client):
-        poses, statuses = Inbox(), Inbox()
-        client.robot("a").on_pose(poses.put)
+        statuses, fault = Inbox(), "frame set without a solution"
         client.status().on_message(statuses.put)
-
-        def is_tracked(n: int) -> bool:
-            send(server, later(frames))
-            return poses.until(lambda items: any(pose.state == "tracked" for pose in items[n:]), 3.0)
 
         def is_counted() -> bool:
             send(server, later(frames))
-            return statuses.until(lambda items: items and fault in items[-1].faults, 3.0)
+            return statuses.until(lambda items: items and fault in items[-1].faults, ATTEMPT_S)
 
-        fault = "frame set without a solution"
-        until(lambda: is_tracked(0))
+        send_until_tracked(server, client, frames)
         tracker = server.pipeline.tracker
         assert tracker is not None
         server.transport.enqueue(lambda: tracker.table.states.P.fill(np.nan))
         until(is_counted)
-        n = len(poses.items)
-        until(lambda: is_tracked(n))
+        send_until_tracked(server, client, frames)
         assert max(status.faults.get(fault, 0) for status in statuses.items) == 1
 
 
