@@ -32,9 +32,9 @@ MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
-# Profiled steps end where one is shorter than a third of a standard deviation, over all parameters: the next would be
-# a hundredth. None increases the cost by more than this factor; a step that does is halved.
-MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 15, 0.1
+# Profiled steps end after one shorter than a standard deviation, over all parameters: the next would be a tenth of it.
+# None increases the cost by more than this factor; a step that does is halved.
+MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 15, 1.0
 MAX_GROWTH, MAX_HALVINGS = 10.0, 5
 
 

@@ -64,16 +64,16 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     G = H_mm^-1 H_mc, and the derivatives of the observations by the cameras, along the optimal motion, are J_c - J_m G.
     Their information is H_cc - H_cm G - G^T P G, and their score J_c^T r - G^T J_m^T r.
     """
-    local, own = 12 * len(system.problem.wand.basis), _camera_hessian(system)
-    hessian, gradient, crossed, scores = _accumulate(system)
-    joined = _join(np.concatenate([crossed, gradient[:, :, None]], axis=2))
-    solved = _solve_chain(hessian, joined)
-    G = solved[:, :-1]
+    local = 12 * len(system.problem.wand.basis)
+    sums = _Sums.of(system)
+    joined = _join(np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2))
+    solved = _solve_chain(sums.hessian, joined)
+    G = np.ascontiguousarray(solved[:, :-1])
     pairs = _pair(G, local)
     by_prior = _join(system.motion_prior[:, :local, :local] @ pairs)
-    information = own - joined[:, :-1].T @ G - G.T @ by_prior
-    observed = gradient - system.motion_prior[:, :local, -1]
-    of_motion = scores - np.einsum("li,lin->ln", observed, pairs)
+    information = sums.of_cameras - joined[:, :-1].T @ G - G.T @ by_prior
+    observed = sums.gradient - system.motion_prior[:, :local, -1]
+    of_motion = sums.scores - (observed[:, None] @ pairs)[:, 0]
     estimated = list(system.problem.estimated_cameras())
     of_points = system.background.scores[:, estimated].reshape(-1, of_motion.shape[1])
     scores = np.concatenate([of_motion, of_points])
@@ -81,36 +81,52 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     return ProfiledMotion(information, scores, total, G, solved[:, -1])
 
 
-def _camera_hessian(system: LinearSystem) -> Array:
-    """(S d, S d) H_cc: of observations, background points and priors."""
-    estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
-    H = prior_information(system)
-    H += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
-    for _, camera, N in _normal_equations(system):
-        for k, c in enumerate(estimated):
-            H[k, :, k] += N[camera == c, -d - 1 : -1, -d - 1 : -1].sum(axis=0)
-    return H.reshape(len(estimated) * d, -1)
+@dataclass(frozen=True, slots=True)
+class _Sums:
+    """The normal equations of all residuals.
 
+    Attributes:
+        hessian, gradient: (L, 2 h, 2 h) and (L, 2 h) of the motion, by interval.
+        crossed: (L, 2 h, S d) products of the derivatives by the motion and by the cameras.
+        scores: (L, S d) gradients of the cameras, without priors.
+        of_cameras: (S d, S d) Hessian of the cameras, with background points and priors.
+    """
 
-def _accumulate(system: LinearSystem) -> tuple[Array, Array, Array, Array]:
-    """By interval: Hessians (L, 2 h, 2 h) and gradients (L, 2 h) of the motion, their products with the cameras
-    (L, 2 h, S d), and gradients of the cameras (L, S d) without priors."""
-    local, intervals = 12 * len(system.problem.wand.basis), len(system.chain)
-    estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
-    slot = np.full(len(system.problem.lenses), -1)
-    slot[estimated] = np.arange(len(estimated))
-    hessian, gradient = system.chain[:, :local, :local].copy(), system.chain[:, :local, -1].copy()
-    crossed = np.zeros((intervals, local, len(estimated), d))
-    scores = np.zeros((intervals, len(estimated), d))
-    for interval, camera, N in _normal_equations(system):
-        first = np.flatnonzero(np.diff(interval, prepend=-1))
-        hessian[interval[first]] += np.add.reduceat(N[:, :local, :local], first)
-        gradient[interval[first]] += np.add.reduceat(N[:, :local, -1], first)
-        mine = slot[camera] >= 0
-        interval, camera, N = interval[mine], slot[camera[mine]], N[mine, :, local:]
-        crossed[interval, :, camera] = N[:, :local, :-1]
-        scores[interval, camera] = N[:, local:-1, -1]
-    return hessian, gradient, crossed.reshape(intervals, local, -1), scores.reshape(intervals, -1)
+    hessian: Array
+    gradient: Array
+    crossed: Array
+    scores: Array
+    of_cameras: Array
+
+    @classmethod
+    def of(cls, system: LinearSystem) -> "_Sums":
+        local, intervals = 12 * len(system.problem.wand.basis), len(system.chain)
+        estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
+        slot = np.full(len(system.problem.lenses), -1)
+        slot[estimated] = np.arange(len(estimated))
+        hessian, gradient = system.chain[:, :local, :local].copy(), system.chain[:, :local, -1].copy()
+        crossed = np.zeros((intervals, local, len(estimated), d))
+        scores = np.zeros((intervals, len(estimated), d))
+        own = prior_information(system)
+        own += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
+        for interval, camera, N in _normal_equations(system):
+            first = np.flatnonzero(np.diff(interval, prepend=-1))
+            hessian[interval[first]] += np.add.reduceat(N[:, :local, :local], first)
+            gradient[interval[first]] += np.add.reduceat(N[:, :local, -1], first)
+            mine = slot[camera] >= 0
+            interval, camera, N = interval[mine], slot[camera[mine]], N[mine, :, local:]
+            crossed[interval, :, camera] = N[:, :local, :-1]
+            scores[interval, camera] = N[:, local:-1, -1]
+            for k in range(len(estimated)):
+                own[k, :, k] += N[camera == k, local:-1, :-1].sum(axis=0)
+        size = len(estimated) * d
+        return cls(
+            hessian,
+            gradient,
+            crossed.reshape(intervals, local, size),
+            scores.reshape(intervals, size),
+            own.reshape(size, size),
+        )
 
 
 def _prior_gradient(system: LinearSystem) -> Array:
