@@ -24,7 +24,7 @@ from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 
 MAGIC = 8  # bytes at the start of every MCAP file
 MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
-MAX_LOST = 1 / 256  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
+MAX_LOST = 1 / 64  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
 
 
 class RecordingWriter:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A thread that works ahead of the server's: what a request needs and no state of the server, such as lens tables."""
 
+import contextlib
 import logging
 import queue
 import threading
@@ -22,7 +23,9 @@ class Preparation:
     """
 
     def __init__(self) -> None:
-        self._waiting: queue.Queue[tuple[Callable[[], object], Callable[[], object]]] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[tuple[Callable[[], object], Callable[[], object]] | None] = queue.Queue(
+            WAITING
+        )
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="preparation", daemon=True)
         self._thread.start()
@@ -38,14 +41,19 @@ class Preparation:
     def close(self) -> None:
         """End after the present work."""
         self._closed.set()
+        with contextlib.suppress(queue.Full):  # then the thread is not waiting for work
+            self._waiting.put_nowait(None)
         self._thread.join(LONGEST_PAUSE_S)
 
     def _run(self) -> None:
         while not self._closed.is_set():
             try:
-                work, then = self._waiting.get(timeout=POLL_S)
+                task = self._waiting.get(timeout=POLL_S)
             except queue.Empty:
                 continue
+            if task is None:
+                break
+            work, then = task
             begun_s = time.monotonic()
             try:
                 work()

@@ -24,6 +24,7 @@ from fusion.tracking.gating import (
 )
 from fusion.tracking.grouping.multiview import Marker, find_markers
 from fusion.tracking.grouping.portions import Portion, limit_of, portion_of
+from fusion.tracking.identity.confirmation import WeakFits
 from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
@@ -42,9 +43,6 @@ MAX_PAIRS = 80_000
 # defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
 MAX_OTHER_PAIRS = 20_000
 OTHERS_EVERY = 8  # frame sets from one search for other sizes to the next, while none is found
-CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
-MAX_BETWEEN = 5  # frame sets from one to the next of these
-SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
 
@@ -86,23 +84,6 @@ class _Found:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sighting:
-    """Where the last weak fit of a robot was (3,), in which frame set, and how many were at one place so far."""
-
-    p: Array
-    frame_set: int
-    count: int
-
-    @classmethod
-    def after(cls, last: "_Sighting | None", p: Array, frame_set: int) -> "_Sighting":
-        """The next sighting."""
-        if last is None:
-            return cls(p, frame_set, 1)
-        stayed = np.linalg.norm(p - last.p) < SAME_PLACE_M * max(1, frame_set - last.frame_set)
-        return cls(p, frame_set, last.count + 1 if stayed else 1)
-
-
 class Acquisition:
     """Acquires robots of a track table.
 
@@ -115,7 +96,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self._weak: dict[int, _Sighting] = {}  # by robot
+        self._weak = WeakFits()
         self._frame_sets = 0  # searched so far
         self._has_others = False  # whether the last search for other sizes found markers
 
@@ -188,7 +169,10 @@ class Acquisition:
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
         found = none
-        for fits in (*identified.fits, *self._confirmed(identified.weak)):
+        for fits in (
+            *identified.fits,
+            *self._weak.confirm(identified.weak, table.t_ns or 0, self._frame_sets),
+        ):
             found = found.joined(fits.select(table.owned[fits.robot]))
         left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
         return found, {k: _reason(table, k, question, identified) for k in left}
@@ -248,18 +232,6 @@ class Acquisition:
         size = np.array([marker.diameter_m for marker in others])
         is_other = np.all(np.abs(size[:, None] / diameters - 1) > DIAMETER_TOLERANCE, axis=1)
         return [others[k] for k in np.flatnonzero(is_other)]
-
-    def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
-        """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""
-        now = self._frame_sets
-        self._weak = {k: seen for k, seen in self._weak.items() if now - seen.frame_set <= MAX_BETWEEN}
-        for fits in weak:
-            for robot, p in zip(fits.robot.tolist(), fits.states.p, strict=True):
-                self._weak[robot] = _Sighting.after(self._weak.get(robot), p, now)
-        return [
-            fits.select(np.array([self._weak[k].count >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
-            for fits in weak
-        ]
 
     def _refine(self, table: TrackTable, starts: Starts, detections: DetectionTable) -> RefinedFits:
         return refine(self._estimator, table, starts, detections)
