@@ -22,7 +22,16 @@ from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
 from fusion.server.config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
-from tests.fusion.serving import ARENA, DEADLINE_S, config, connected, live, run_program, send, serving, until
+from tests.fusion.serving import (
+    ARENA,
+    DEADLINE_S,
+    config,
+    connected,
+    run_program,
+    send_until_tracked,
+    serving,
+    until,
+)
 from tests.waiting import wait_for
 
 GIVEN = Rig(cameras=ARENA.cameras)
@@ -83,8 +92,7 @@ def test_subscribers_receive_the_rig_of_the_server_only(tmp_path: Path):
 
 def test_robots_stay_tracked_if_no_pose_or_that_of_one_camera_changes(tmp_path: Path):
     with serving(config(tmp_path)) as (server, client):
-        send(server, live(ARENA.messages(30)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        send_until_tracked(server, client, ARENA.messages(30))
         tracker = server.pipeline.tracker
         assert tracker is not None
         client.set_rig(Rig(cameras=ARENA.cameras, calibration={"date": "today"}))
@@ -106,8 +114,7 @@ def test_a_rig_that_cannot_be_saved_is_refused_and_the_old_one_stays(tmp_path: P
                 client.set_rig(rig)
             assert client.rig(DEADLINE_S) == GIVEN
             assert server.pipeline.cameras == ARENA.cameras
-        send(server, live(ARENA.messages(30)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        send_until_tracked(server, client, ARENA.messages(30))
 
 
 def test_changes_are_undone_and_redone_also_after_a_restart(tmp_path: Path):
