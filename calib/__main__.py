@@ -17,8 +17,9 @@ from calib.commands.undo import Redo, Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
 from camera_node.command_line import parse
-from camera_node.errors import check_command, run
+from camera_node.errors import check_command
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 
 Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]

@@ -6,8 +6,9 @@ import sys
 
 from camera_node.command_line import run_command
 from camera_node.commands.publish import Publish
-from camera_node.errors import check_command, run
+from camera_node.errors import check_command
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 
 
 def main() -> None:

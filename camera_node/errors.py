@@ -16,15 +16,9 @@ Every message names the fault, its place and the remedy. Faults in live data are
 The exit code tells a service manager whether to retry: 2 stays until a user acts, 75 (EX_TEMPFAIL) may pass by itself.
 """
 
-import atexit
-import contextlib
 import difflib
-import os
-import sys
-from collections.abc import Callable, Sequence
-from typing import ClassVar, NoReturn
-
-from camera_node.text import printable
+from collections.abc import Sequence
+from typing import ClassVar
 
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
 
@@ -57,34 +51,6 @@ class AddressError(NetworkError):
     """An address to listen on is taken, or its network is not up."""
 
     exit_code = TEMPORARY_FAILURE
-
-
-def run(program: Callable[[], int | None]) -> NoReturn:
-    """Run a command and end the process with its code; a RoundelError is one line, with its own exit code."""
-    try:
-        code = program()
-    except RoundelError as error:
-        print(f"error: {printable(error)}", file=sys.stderr)
-        code = error.exit_code
-    except KeyboardInterrupt:
-        code = 130
-    except BrokenPipeError:  # the reader closed the pipe, as in `detect --json | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
-    end_process(code or 0)
-
-
-def end_process(code: int) -> NoReturn:
-    """End the process as `sys.exit` does at its end, but without Python's finalization.
-
-    That would end Zenoh's threads in the middle of a callback, which aborts the process: about one in six ends of
-    `roundel demo --relative` beside other programs, with "FATAL: exception not rethrown".
-    """
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(code)
 
 
 def check_command(

@@ -20,10 +20,10 @@ from playwright.sync_api import Page, sync_playwright
 from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import decode
 from tests.web.browser import FLAGS, loopback
-from web.feed import Feed
-from web.messages import DemoProgress
 from web.page import add_replay_page
-from web.replay import RecordingPlayer
+from web.state.feed import Feed
+from web.state.messages import DemoProgress
+from web.state.replay import RecordingPlayer
 from web.view import SLOW_INTERVAL, View
 
 OUT = Path(__file__).with_name("demo.webp")

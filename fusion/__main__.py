@@ -10,8 +10,9 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from camera_node.command_line import run_command
-from camera_node.errors import check_command, run
+from camera_node.errors import check_command
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 from fusion.commands.serve import Serve
 
 COMMANDS = {  # and their modules in fusion.commands

@@ -18,7 +18,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
-LIVE_FOLDERS = ("web", "bridges", "client", "live", "node", "protocol", "security", "server", "storage")
+LIVE_FOLDERS = (
+    "web",
+    "bridges",
+    "client",
+    "demo",
+    "live",
+    "node",
+    "protocol",
+    "security",
+    "server",
+    "state",
+    "storage",
+)
 LIVE_FILES = (
     "test_demo.py",
     "test_readme.py",
@@ -41,7 +53,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def is_live(item: pytest.Item) -> bool:
     """Whether the result of a test depends on real time: it runs sessions, programs or a browser."""
     fixtures = getattr(item, "fixturenames", ())
-    return "endpoint" in fixtures or item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
+    if item.get_closest_marker("computed"):
+        return False
+    in_live_file = item.path.parent.name in LIVE_FOLDERS or item.path.name in LIVE_FILES
+    return "endpoint" in fixtures or in_live_file
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -16,7 +16,6 @@ from tests.conftest import ROOT
 PROGRAMS = ("camera_node", "calib", "fusion", "web")
 MAX_PARAMETERS = 6
 MAX_MODULES = 14  # of one folder
-FLAT = {"web"}  # a program that has one folder for all its modules
 COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/arrays.py defines them
 
 # Commands of the command line: tyro turns each parameter into an option, so a function may have more of them.
@@ -135,7 +134,7 @@ def test_tests_import_helpers_only():
 
 def test_folders_have_at_most_fourteen_modules():
     counts = Counter(name_of(path.parent) for path in sources(*PROGRAMS) if path.name != "__init__.py")
-    assert_none(f"{f} has {count}" for f, count in counts.items() if count > MAX_MODULES and f not in FLAT)
+    assert_none(f"{f} has {count}" for f, count in counts.items() if count > MAX_MODULES)
 
 
 def test_array_types_are_defined_once():

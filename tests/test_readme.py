@@ -79,6 +79,7 @@ def test_make_knows_its_targets(command: str):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.computed
 def test_printing_and_detecting(folder: Path):
     """The sheet and the picture with the detections are written."""
     for thing in ("wand", "robot", "roundels"):
@@ -94,6 +95,7 @@ def test_printing_and_detecting(folder: Path):
     assert cv2.imread(str(folder / "seen.png")) is not None
 
 
+@pytest.mark.computed
 def test_the_plan(folder: Path):
     """The README's figure of the planned arena is what the planner computes."""
     text = run(find("roundel plan"), folder).stdout
@@ -116,6 +118,7 @@ def test_an_arena_of_one_machine(folder: Path):
     }
 
 
+@pytest.mark.computed
 def test_lenses_and_world(folder: Path):
     """Pictures of a board become a rig; surveyed positions need calibrated cameras, or exit with an error."""
     (folder / "board" / "north").mkdir(parents=True)
@@ -127,6 +130,7 @@ def test_lenses_and_world(folder: Path):
     assert "error: " in run(find("roundel calibrate world"), folder, expected=2).stderr
 
 
+@pytest.mark.computed
 def test_a_recording_from_frames_to_poses(folder: Path):
     """A shorter recording of the simulator; the resulting poses contain all three robots."""
     shorter = {"--seconds 15": "--seconds 8", "--seconds 5": "--seconds 1"}

@@ -12,13 +12,13 @@ from pathlib import Path
 
 from camera_node.command_line import parse
 from camera_node.config import example_file
-from camera_node.errors import run
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 from camera_node.protocol.connection import ServerConnection
 from camera_node.service import stopped_by_signals
-from web.feed import Feed
-from web.replay import RecordingPlayer
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.replay import RecordingPlayer
+from web.state.subscription import Subscription
 from web.tables import describe_arena
 
 
@@ -119,7 +119,7 @@ def _print_lines(feed: Feed, stop: threading.Event) -> None:
 
 def play_demo(options: Options) -> int:
     """Run the demo and return its exit code."""
-    from web.demo import run_demo
+    from web.demo.demo import run_demo
     from web.view import check_port
 
     if not options.headless:

@@ -10,7 +10,7 @@ import numpy as np
 from camera_node.arrays import Array
 from fusion.protocol.messages import FusionStatus
 from web.condition import Condition
-from web.feed import ArenaState
+from web.state.feed import ArenaState
 
 LENGTH_S = 60
 MAX_EVENTS = 50

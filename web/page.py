@@ -5,15 +5,16 @@ import contextlib
 import threading
 from pathlib import Path
 
-from web.feed import Feed
-from web.replay import RecordingPlayer
 from web.scene.coverage import CoverageVolume
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.replay import RecordingPlayer
+from web.state.subscription import Subscription
 from web.tabs.calibrate import CalibrationInForce, RigHistoryPanel
 from web.tabs.cameras import CameraSettings, CameraTable, LivePictures
 from web.tabs.header import Header
 from web.tabs.marker_picker import MarkerPicker
-from web.tabs.record import Recorder, RecordingList, ReplayControls
+from web.tabs.record import Recorder, RecordingList
+from web.tabs.replay_controls import ReplayControls
 from web.tabs.rig_change import CalibrationFiles
 from web.tabs.robots import RobotEditor, RobotTable
 from web.tabs.status import StatusTab

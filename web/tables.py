@@ -8,8 +8,8 @@ import numpy as np
 from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, RobotPose
 from web.colours import css, robot_colour
-from web.feed import ArenaState
 from web.html_tables import Column, HtmlTable, TableRow
+from web.state.feed import ArenaState
 
 STALE_S = 2.0  # a robot or camera without a message for so long counts as absent
 NO_VALUE = "–"

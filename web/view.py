@@ -12,7 +12,6 @@ import viser
 from calib.rig.rig import Rig
 from camera_node.service import ServiceManager
 from web.errors import PortError, WebError
-from web.feed import ArenaState, Feed
 from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding
 from web.scene.cameras import CameraDrawing
@@ -21,6 +20,7 @@ from web.scene.relative import RelativeFrames
 from web.scene.robots import RobotDrawing
 from web.scene.surroundings import add_floor, add_lights
 from web.scene.viewpoint import Viewpoints
+from web.state.feed import ArenaState, Feed
 
 PERIOD_S = 1 / 30
 SLOW_INTERVAL = 3  # drawings from one update of trails and labels to the next

@@ -16,6 +16,7 @@ from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
 from camera_node.arrays import Array
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.publishers import Publishers
 from camera_node.terminal import progress_console
 
 INSPECT_EVERY_S = 0.2
@@ -35,6 +36,7 @@ class CollectedFrames:
         last_seen_s: time of the last message, by camera.
         moved_s: when a roundel was last seen to move; None before.
         invalid: number of messages that could not be decoded.
+        publishers: whose frames count where two nodes publish under one name.
     """
 
     messages: list[Detections] = field(default_factory=list)
@@ -43,6 +45,7 @@ class CollectedFrames:
     last_seen_s: dict[str, float] = field(default_factory=dict)
     moved_s: float | None = None
     invalid: int = 0
+    publishers: Publishers = field(default_factory=Publishers)
     _compared: dict[str, tuple[int, Array]] = field(default_factory=dict)  # time and centres of a frame
 
     def silent_cameras(self, now_s: float) -> list[str]:
@@ -55,6 +58,8 @@ class CollectedFrames:
             message = decode(data, Detections)
         except MessageError:
             self.invalid += 1
+            return
+        if not self.publishers.admits(message, round(now_s * 1e9)):
             return
         self.messages.append(message)
         self.last_seen_s[message.camera] = now_s

@@ -24,7 +24,7 @@ from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 
 MAGIC = 8  # bytes at the start of every MCAP file
 MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
-MAX_LOST = 1 / 256  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
+MAX_LOST = 1 / 64  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
 
 
 class RecordingWriter:
@@ -124,7 +124,9 @@ def read_messages(path: Path, faults: Counter[str] | None = None) -> Iterator[tu
                     yield channel.topic, message.data, message.log_time
             except (McapError, EOFError, struct.error) as error:
                 if faults is None or file.tell() <= MAGIC:
-                    raise ConfigError(f"{path} is not an MCAP recording: {error}") from None
+                    raise ConfigError(
+                        f"{path} is not an MCAP recording ({error}); give a file of roundel record"
+                    ) from None
                 faults["end: the recording was cut off"] += 1
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None

@@ -146,7 +146,7 @@ void Detector::fit_seeds(FrameState& frame) {
     for (; done < n && frame.n_fits < most; ++done) {
         const Seed& seed = frame.seeds[(first + done) % n];
         if (frame.suppression.contains_fast(double(seed.x), double(seed.y))) continue;
-        fit_and_accept(fit_rays(frame.image, seed, limits_), -1, frame);
+        fit_and_accept(fit_rays(frame.image, seed, frame.limits), -1, frame);
     }
     n_postponed_ = int(n - done);
     begin_at_ = n_postponed_ ? double((first + done) % n) / double(n) : 0;
@@ -180,11 +180,12 @@ void Detector::fit_moving_tracked(FrameState& frame) const {
     }
 }
 
-/// Fits new moving roundels at the streaks that match best.
+/// Fits new moving roundels at the streaks that match best. A streak in the middle of which the card of
+/// another roundel lies is made by that one's edge.
 void Detector::fit_moving_streaks(FrameState& frame) const {
     std::vector<MovingMatch> matches;
     for (const Streak& streak : frame.streaks) {
-        if (frame.suppression.contains_fast(double(streak.x), double(streak.y))) continue;
+        if (frame.suppression.contains(double(streak.x), double(streak.y), kCardRatio)) continue;
         if (const auto match = matcher_.match_streak(frame.image, streak)) matches.push_back(*match);
     }
     std::sort(matches.begin(), matches.end(),
@@ -254,6 +255,7 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
     if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
+    if (track < 0 && !has_black_ink(*fit)) return false;
     const bool known = has_known_ratio(*fit, limits_);
     const auto depths = std::span(kRingDepths).first(known ? 1 : std::size(kRingDepths));
     if (std::any_of(depths.begin(), depths.end(),

@@ -4,6 +4,7 @@
 import contextlib
 import logging
 import math
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -96,6 +97,7 @@ class Node:
         self._source, self._detector, self._session = source, detector, session
         self._options, self._keys = options, Keys(options.arena)
         self._clock = ClockSync(session, self._keys)
+        self._publisher = secrets.randbits(63)
         self._statistics = NodeStatistics(name)
         self.on_settings: Callable[[Settings], object] = lambda wanted: None
         self._readout_us: float | None = None  # as set; None: as the source says
@@ -181,6 +183,7 @@ class Node:
         height, width = frame.image.shape
         message = Detections.pack(
             detected.published,
+            publisher=self._publisher,
             readout_us=frame.readout_us if self._readout_us is None else self._readout_us,
             detect_us=detected.detect_us,
             width=width,

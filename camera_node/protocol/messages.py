@@ -101,6 +101,7 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     version: int = VERSION
     camera: str
     seq: int
+    publisher: int = 0  # random number of the node that runs, 0 if unknown: see `Publishers`
     t_ns: int
     exposure_us: float = 0.0
     readout_us: float = 0.0  # of all rows, see above; 0 of a global shutter or if unknown
@@ -166,6 +167,8 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("an impossible readout_us")
         if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
             raise MessageError("an impossible clock_error_us")
+        if not 0 <= self.publisher < 2**63:
+            raise MessageError("an impossible publisher")
         _check_ratios(self.found_ratios)
 
 

@@ -17,7 +17,9 @@ log = logging.getLogger("camera_node.device")
 
 DEFAULTS = SourceSettings()
 REOPEN_S = 1.0
-CLOSE_S = 10.0  # longest wait for the thread, which may be waiting for a frame
+CLOSE_S = (
+    2.0  # longest wait for the thread, which may be waiting for a camera that is away; it releases it later
+)
 
 
 class Capture(Protocol):

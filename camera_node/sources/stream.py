@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Network streams (RTSP, MJPEG over HTTP) through PyAV. No text of this module contains credentials."""
 
+import errno
+import socket
 import time
 from collections.abc import Iterator, Mapping
+from itertools import chain, repeat
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -16,10 +20,14 @@ from camera_node.protocol.messages import ControlValue
 from camera_node.sources.address import URL, without_credentials
 from camera_node.sources.controls import Control
 from camera_node.sources.frame import Frame
-from camera_node.sources.live import REOPEN_S, Capture, LiveSource
+from camera_node.sources.live import Capture, LiveSource
 
-SCHEMES = ("rtsp", "rtsps", "http", "https")
+SCHEMES = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}  # with their ports
 TIMEOUT_S = 5.0  # of opening and of each read
+# Of a lost camera: one request to connect, since a second one would follow the first after a second, a third after two
+# more, and a camera that returns between them would have to wait.
+CONNECT_S = 1.0
+REOPEN_S = 0.5  # between attempts
 MAX_PIXELS = 64_000_000
 OPTIONS = {
     "rtsp_transport": "tcp",  # a lost UDP packet damages all frames until the next key frame
@@ -35,6 +43,7 @@ class StreamCapture(Capture):
 
     Args:
         url: rtsp://, rtsps://, http:// or https://, with user and password if the camera needs them.
+        connect_s: longest wait for the camera's machine to answer.
 
     Raises:
         ConfigError: the scheme is another one, or PyAV is missing.
@@ -44,7 +53,7 @@ class StreamCapture(Capture):
     incomplete = lost_packets = 0
     has_exposure = False
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, connect_s: float = TIMEOUT_S) -> None:
         self.name = without_credentials(url)
         match = URL.match(url)
         if match is None or match.group()[:-3].lower() not in SCHEMES:
@@ -54,11 +63,12 @@ class StreamCapture(Capture):
         self._clock = ArrivalClock()
         # FFmpeg counts the frames of HTTP streams instead of reading their times.
         self._has_times = not url.lower().startswith("http")
-        self._container = self._open(url)
+        self._container = self._open(url, connect_s)
         self._frames = self._decode()
 
-    def _open(self, url: str) -> Any:
+    def _open(self, url: str, connect_s: float) -> Any:
         try:
+            _require_answer(url, connect_s)
             container = self._av.open(url, options=OPTIONS, timeout=TIMEOUT_S)
         except (OSError, self._av.FFmpegError) as error:
             raise CameraAbsentError(
@@ -109,7 +119,23 @@ class StreamCapture(Capture):
 
 def open_stream(url: str, reopen_s: float = REOPEN_S) -> LiveSource:
     """A source of frames of a network stream; raises as `StreamCapture`."""
-    return LiveSource(lambda settings, controls: StreamCapture(url), reopen_s=reopen_s)
+    waits = chain([TIMEOUT_S], repeat(CONNECT_S))
+    return LiveSource(lambda settings, controls: StreamCapture(url, next(waits)), reopen_s=reopen_s)
+
+
+def _require_answer(url: str, connect_s: float) -> None:
+    """Raise OSError if the stream's machine does not accept a connection; FFmpeg itself has no timeout for that."""
+    address = urlsplit(url)
+    try:
+        host, port = address.hostname, address.port or SCHEMES[address.scheme]
+    except ValueError:
+        return  # a password with unescaped characters, which FFmpeg may understand
+    if not host:
+        return
+    try:
+        socket.create_connection((host, port), connect_s).close()
+    except TimeoutError:
+        raise TimeoutError(errno.ETIMEDOUT, f"no answer within {connect_s:g} s") from None
 
 
 def _reason(error: Exception) -> str:

@@ -16,6 +16,7 @@ import tyro
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.server_address import ServerAddress
 from fusion.client.arena import Arena
+from fusion.client.silence import cause_of_silence
 from fusion.protocol.messages import RobotPose
 
 log = logging.getLogger("fusion.bridge")
@@ -32,14 +33,16 @@ class PoseQueue:
 
     Args:
         client: connected to the arena.
+        arena: its name.
+        robot: of which poses are expected; None for all.
 
     Attributes:
         client: as given.
         faults: skipped poses, by reason.
     """
 
-    def __init__(self, client: Arena) -> None:
-        self.client = client
+    def __init__(self, client: Arena, arena: str, robot: str | None = None) -> None:
+        self.client, self._arena, self._robot = client, arena, robot
         self.faults: Counter[str] = Counter()
         self._poses: deque[RobotPose] = deque(maxlen=QUEUE_SIZE)
         self._is_signaled = False
@@ -77,8 +80,8 @@ class PoseQueue:
             self._received_s, self._is_silent = now_s, False
         elif not self._is_silent and now_s - self._received_s >= SILENCE_S:
             self._is_silent = True
-            message = "no pose %s within %g s; is roundel server running there?"
-            log.warning(message, self.client.origin, SILENCE_S)
+            cause = cause_of_silence(self.client.connection, self._arena, self._robot)
+            log.warning("no pose %s within %g s; %s", self.client.origin, SILENCE_S, cause)
 
     def _put(self, poses: Sequence[RobotPose]) -> None:
         if (excess := len(self._poses) + len(poses) - QUEUE_SIZE) > 0:
@@ -103,7 +106,7 @@ class PoseServer(ServerAddress):
             ConfigError: the Zenoh configuration is missing or invalid.
         """
         with Arena(ServerConnection(self.connect, self.zenoh), self.arena, robot or "*") as client:
-            poses = PoseQueue(client)
+            poses = PoseQueue(client, self.arena, robot)
             try:
                 yield poses
             finally:

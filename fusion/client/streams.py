@@ -6,7 +6,6 @@ A reader that is slower than the messages gets the newest one and skips the othe
 
 import asyncio
 import contextlib
-import difflib
 import threading
 from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from typing import Generic, TypeVar
@@ -14,10 +13,10 @@ from typing import Generic, TypeVar
 from camera_node.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.relative import RelativePositions
+from fusion.client.silence import NO_SERVER, no_such_robot
 from fusion.protocol.messages import RobotPose
 
 T = TypeVar("T")
-MAX_NAMED = 20  # robots in one error
 
 
 class Stream(Generic[T]):
@@ -108,7 +107,7 @@ class Stream(Generic[T]):
 
     def _cause(self) -> str:
         """The likely cause of silence, with what to do."""
-        return "is roundel server running there?"
+        return NO_SERVER
 
     def _put(self, message: T) -> None:
         with self._changed:
@@ -142,9 +141,7 @@ class RobotStream(Stream[RobotPose]):
         known = sorted(self._known)
         if not known or self._name in known:
             return super()._cause()
-        similar = difflib.get_close_matches(self._name, known, 1)
-        hint = f"; did you mean {similar[0]}?" if similar else ""
-        return f"the arena has no such robot, but {', '.join(known[:MAX_NAMED])}{hint}"
+        return no_such_robot(self._name, known)
 
     def on_pose(self, callback: Callable[[RobotPose], object]) -> Callable[[], None]:
         """Call `callback` with every pose, on Zenoh's thread: it must be fast. Returns its removal."""

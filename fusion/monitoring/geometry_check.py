@@ -14,7 +14,8 @@ import numpy as np
 from camera_node.arrays import Array, Index, Mask
 from camera_node.detection.disc_pose import decompose
 from fusion.model.camera_array import CameraArray
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.states import States
 
 MISFIT_PX = 1.0  # RMS residual; a good calibration has 0.1 to 0.5
 MAX_PX = 3.0  # larger residuals count as this: a few frame sets with a wrong clock blame no robot
@@ -73,23 +74,38 @@ class SizeCheck:
 
     Args:
         names, diameters: (N,) of the robots, metres.
+        cameras: cameras of the rig.
+        markers: of all robots.
     """
 
-    def __init__(self, names: tuple[str, ...], diameters: Array) -> None:
+    def __init__(
+        self, names: tuple[str, ...], diameters: Array, cameras: CameraArray, markers: MarkerTable
+    ) -> None:
         self._names, self._diameters = names, diameters
+        self._cameras, self._markers = cameras, markers
         self._mean_log, self._count = np.zeros(len(names)), np.zeros(len(names), int)
         self._turn = 0
         self._reported: set[str] = set()
 
-    def sample(self, n: int) -> Index:
-        """The rows, of n detections, to measure in this frame set; others the next time."""
+    def observe(self, states: States, detections: DetectionTable, assignments: Assignments) -> None:
+        """Measure the discs of some assigned detections of a frame set, of others the next time."""
+        rows = self._sample(len(assignments))
+        if not len(rows):
+            return
+        marker, seen = assignments.marker[rows], detections.select(assignments.detection[rows])
+        owner = self._markers.robot[marker]
+        arms = np.einsum("nij,jn->ni", states.R[owner], self._markers.position.take(marker, 1))
+        self._measure(seen, owner, states.p[owner] + arms)
+
+    def _sample(self, n: int) -> Index:
+        """The rows, of n detections, to measure in this frame set."""
         self._turn += 1
         if not n or self._turn % SAMPLE_EVERY:
             return np.arange(0)
         step = -(-n // SAMPLE)
         return np.arange(self._turn // SAMPLE_EVERY % step, n, step)
 
-    def note(self, cameras: CameraArray, detections: DetectionTable, robot: Index, position: Array) -> None:
+    def _measure(self, detections: DetectionTable, robot: Index, position: Array) -> None:
         """Measure the discs of detections (N,) of robots (N,), whose centres are at positions (N, 3), world."""
         known = np.flatnonzero(np.isfinite(detections.axes_px[1]) & np.isfinite(detections.xy[0]))
         if not len(known):
@@ -97,7 +113,7 @@ class SizeCheck:
         seen, robot = detections.select(known), robot[known]
         # Range of a disc of radius 1.
         unit_m = np.linalg.norm(decompose(seen.conics(), 1.0)[0], axis=2).mean(1)
-        range_m = np.linalg.norm(position[known] - cameras.centres[seen.camera], axis=1)
+        range_m = np.linalg.norm(position[known] - self._cameras.centres[seen.camera], axis=1)
         log_ratio = np.log(2 * range_m / unit_m / self._diameters[robot])
         for k, value in zip(robot.tolist(), log_ratio.tolist(), strict=True):
             if np.isfinite(value):

@@ -12,6 +12,7 @@ import numpy as np
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.publishers import Publishers
 from fusion.model.frames import CalibratedFrame
 from fusion.server.status import ServerStatistics
 
@@ -23,7 +24,10 @@ MAX_DETECTIONS = (
     1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
 )
 HISTORY = 64  # frames of a camera
-MIN_STEPS_BACK = 4  # of sequence numbers in the history, for two publishers: a restarted node makes one
+MIN_STEPS_BACK = (
+    4  # of sequence numbers in the history, for two unknown publishers: a restarted node makes one
+)
+ANOTHER_NODE = "frames of another node under its name"
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
 
 
@@ -47,6 +51,7 @@ class Ingest:
     def __init__(self, keys: Keys, statistics: ServerStatistics) -> None:
         self._keys, self._statistics = keys, statistics
         self._histories: dict[str, _FrameHistory] = {}
+        self._publishers = Publishers()
         self._calibrated: set[str] = set()
         self._uncalibrated: set[str] = set()
 
@@ -67,10 +72,13 @@ class Ingest:
         name, camera = message.camera, cameras.get(message.camera)
         if not self._is_admitted(name, camera is not None):
             return self._refuse("too many cameras")
+        has_size = camera is None or (message.width, message.height) == (camera.width, camera.height)
+        if has_size and not self._publishers.admits(message, received_ns):
+            return self._refuse(ANOTHER_NODE, name)
         self._statistics.count_arrival(name, message.t_ns, received_ns)
         if camera is None:
             return self._refuse("unknown camera", name) if cameras else None
-        if (message.width, message.height) != (camera.width, camera.height):
+        if not has_size:
             return self._refuse("wrong image size", name)
         if not self._is_new(message):
             return self._refuse("duplicate frame", name)
@@ -108,15 +116,18 @@ class Ingest:
         return True
 
     def _is_new(self, message: Detections) -> bool:
-        """Whether the frame is no duplicate. Sequence numbers that alternate show two publishers of one name."""
+        """Whether the frame is no duplicate. Two publishers of one name are reported.
+
+        Where nodes do not say who they are, sequence numbers that alternate show them.
+        """
         history = self._histories.setdefault(message.camera, _FrameHistory())
         if message.t_ns in history.times:
             return False
         history.times.append(message.t_ns)
         history.steps_back.append(message.seq <= history.seq)
         history.seq = message.seq
-        has_two_publishers = sum(history.steps_back) >= MIN_STEPS_BACK
-        self._statistics.note_publishers(message.camera, has_two_publishers)
+        has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK
+        self._statistics.note_publishers(message.camera, has_two)
         return True
 
 

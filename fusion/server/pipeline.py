@@ -22,7 +22,8 @@ from fusion.server.config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.storage.active_rig import ActiveRig
 from fusion.server.storage.persistence import PersistedFile
-from fusion.tracking.tracker import AssociatedFrames, Tracker
+from fusion.tracking.association import AssociatedFrames
+from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
 

@@ -70,6 +70,7 @@ class Server:
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
+            stack.callback(self.pipeline.active_rig.close)
             self.session = stack.enter_context(open_session(self.config, self.shard))
             if self.shard.leads:
                 self.endpoints = listening_endpoints(self.session, self.config.listen)

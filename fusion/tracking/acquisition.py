@@ -9,21 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.arrays import Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
-from fusion.tracking.gating import (
-    ANY_DIAMETERS,
-    DIAMETER_TOLERANCE,
-    MAX_CHI2,
-    mean_by_body,
-)
-from fusion.tracking.grouping.multiview import Marker, find_markers
-from fusion.tracking.grouping.portions import Portion, limit_of, portion_of
+from fusion.tracking.gating import MAX_CHI2, mean_by_body
+from fusion.tracking.grouping.marker_search import MarkerSearch
+from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.identity.confirmation import WeakFits
 from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
 from fusion.tracking.identity.single_markers import (
@@ -35,16 +31,6 @@ from fusion.tracking.identity.trial_updates import Starts, refine
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
 
-# Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
-# more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
-MAX_PAIRS = 80_000
-# The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
-# defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
-MAX_OTHER_PAIRS = 20_000
-OTHERS_EVERY = 8  # frame sets from one search for other sizes to the next, while none is found
-CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
-MAX_BETWEEN = 5  # frame sets from one to the next of these
-SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
 
@@ -86,23 +72,6 @@ class _Found:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sighting:
-    """Where the last weak fit of a robot was (3,), in which frame set, and how many were at one place so far."""
-
-    p: Array
-    frame_set: int
-    count: int
-
-    @classmethod
-    def after(cls, last: "_Sighting | None", p: Array, frame_set: int) -> "_Sighting":
-        """The next sighting."""
-        if last is None:
-            return cls(p, frame_set, 1)
-        stayed = np.linalg.norm(p - last.p) < SAME_PLACE_M * max(1, frame_set - last.frame_set)
-        return cls(p, frame_set, last.count + 1 if stayed else 1)
-
-
 class Acquisition:
     """Acquires robots of a track table.
 
@@ -115,9 +84,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self._weak: dict[int, _Sighting] = {}  # by robot
-        self._frame_sets = 0  # searched so far
-        self._has_others = False  # whether the last search for other sizes found markers
+        self._markers, self._weak = MarkerSearch(cameras, leads), WeakFits()
 
     def acquire(
         self,
@@ -143,7 +110,7 @@ class Acquisition:
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
         n_missing = int(np.isin(table.markers.robot, missing).sum())
-        markers, crowded = self._find_markers(table, n_missing, detections, of_bodies)
+        markers, crowded = self._markers.find(table.markers, n_missing, detections, of_bodies)
         found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
         of_bodies = of_bodies.joined(found.assignments)
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
@@ -188,7 +155,9 @@ class Acquisition:
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
         found = none
-        for fits in (*identified.fits, *self._confirmed(identified.weak)):
+        n_frame_sets, t_ns = self._markers.n_frame_sets, table.t_ns or 0
+        confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
+        for fits in (*identified.fits, *confirmed):
             found = found.joined(fits.select(table.owned[fits.robot]))
         left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
         return found, {k: _reason(table, k, question, identified) for k in left}
@@ -204,62 +173,6 @@ class Acquisition:
         starts = Starts.of_singles([robot for robot, _ in pairs], [m for _, m in pairs], R, table.markers)
         refined = self._refine(table, starts, detections)
         return refined.select(refined.misfit < MAX_CHI2)
-
-    def _find_markers(
-        self, table: TrackTable, n_missing: int, detections: DetectionTable, assignments: Assignments
-    ) -> tuple[list[Marker], Index]:
-        """Triangulate markers from unassigned detections; and the cameras that have too many of these.
-
-        With part of the detections, a robot can be taken for another one whose markers are not in this part. So all are
-        searched that the markers of missing robots, `n_missing`, can explain.
-        """
-        free = np.ones(len(detections), bool)
-        free[assignments.detection] = False
-        diameters = np.unique(2 * table.markers.radius) if len(table.names) else np.array(ANY_DIAMETERS)
-        if not free.any():
-            return [], free.nonzero()[0][:0]
-        self._frame_sets += 1
-        limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
-        portion = Portion(limit, self._frame_sets, float(np.median(diameters)))
-        rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
-        markers = find_markers(self._cameras, detections, rows, diameters)
-        if self._leads and len(table.names) and (self._has_others or self._frame_sets % OTHERS_EVERY == 0):
-            others = self._find_other_sizes(detections, rows, markers, diameters)
-            self._has_others = len(others) > 0
-            markers += others
-        return markers, crowded
-
-    def _find_other_sizes(
-        self, detections: DetectionTable, rows: Index, markers: list[Marker], diameters: Array
-    ) -> list[Marker]:
-        """Triangulate markers that no robot declares: a new robot may have another diameter.
-
-        Args:
-            detections: of a frame set.
-            rows: that were searched.
-            markers: that were found, of the declared `diameters`.
-        """
-        rest = np.setdiff1d(rows, np.concatenate([rows[:0], *(marker.detections for marker in markers)]))
-        rest = rest[np.isfinite(detections.axes_px[0, rest])]
-        count = np.bincount(detections.frame[rest])
-        if not 0 < (count.sum() ** 2 - (count**2).sum()) // 2 <= MAX_OTHER_PAIRS:
-            return []
-        others = find_markers(self._cameras, detections, rest, np.array(ANY_DIAMETERS))
-        size = np.array([marker.diameter_m for marker in others])
-        is_other = np.all(np.abs(size[:, None] / diameters - 1) > DIAMETER_TOLERANCE, axis=1)
-        return [others[k] for k in np.flatnonzero(is_other)]
-
-    def _confirmed(self, weak: list[RefinedFits]) -> list[RefinedFits]:
-        """The weak fits that were at one place in `CONFIRMATIONS` frame sets, and nowhere else between these."""
-        now = self._frame_sets
-        self._weak = {k: seen for k, seen in self._weak.items() if now - seen.frame_set <= MAX_BETWEEN}
-        for fits in weak:
-            for robot, p in zip(fits.robot.tolist(), fits.states.p, strict=True):
-                self._weak[robot] = _Sighting.after(self._weak.get(robot), p, now)
-        return [
-            fits.select(np.array([self._weak[k].count >= CONFIRMATIONS for k in fits.robot.tolist()], bool))
-            for fits in weak
-        ]
 
     def _refine(self, table: TrackTable, starts: Starts, detections: DetectionTable) -> RefinedFits:
         return refine(self._estimator, table, starts, detections)

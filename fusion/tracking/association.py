@@ -19,6 +19,7 @@ from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
+from fusion.tracking.estimator import Prediction
 
 UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
 MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
@@ -89,6 +90,10 @@ class Association:
         expected = marker_table.expected(rows, states)
         return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns, floor_px)
 
+    def is_of(self, t_ns: int, cameras: CameraArray, marker_table: MarkerTable) -> bool:
+        """Whether this is of the frame set at `t_ns`, of these markers, and of the present poses of the cameras."""
+        return self.t_ns == t_ns and self.marker_table is marker_table and self.revision == cameras.revision
+
     def pending(self, frames: Sequence[CalibratedFrame]) -> tuple[CalibratedFrame, ...]:
         """The frames that are not assigned yet."""
         assigned = {id(frame) for part in self.parts for frame in part.frames}
@@ -123,6 +128,21 @@ class Association:
         pairs, cost = self.expected.candidates(poses, detections.columns, focal)
         marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
         return detection, self.markers[marker]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AssociatedFrames:
+    """A frame set whose frames may be associated before all of them have arrived.
+
+    Attributes:
+        prediction: all robots at the time of the frame set.
+        tracked: (R,) robots whose detections are associated; the others are acquired.
+        association: the assignments so far.
+    """
+
+    prediction: Prediction
+    tracked: Mask
+    association: Association
 
 
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:

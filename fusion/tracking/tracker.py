@@ -21,7 +21,7 @@ from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.protocol.messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
-from fusion.tracking.association import Association
+from fusion.tracking.association import AssociatedFrames, Association
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.own_detections import OwnDetections
@@ -39,21 +39,6 @@ from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
 PAUSED = "no robot is acquired while the wand is recorded"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AssociatedFrames:
-    """A frame set whose frames may be associated before all of them have arrived.
-
-    Attributes:
-        prediction: all robots at the time of the frame set.
-        tracked: (R,) robots whose detections are associated; the others are acquired.
-        association: the assignments so far.
-    """
-
-    prediction: Prediction
-    tracked: Mask
-    association: Association
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +103,7 @@ class Tracker:
         self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
-        self.sizes = SizeCheck(self.table.names, diameters)
+        self.sizes = SizeCheck(self.table.names, diameters, self.cameras, self.table.markers)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
 
@@ -143,7 +128,7 @@ class Tracker:
             t_ns: time of the frame set.
             early: an earlier return value; returned again if it is for this frame set, robots and camera poses.
         """
-        if early is not None and self._is_current(early.association, t_ns):
+        if early is not None and early.association.is_of(t_ns, self.cameras, self.table.markers):
             return early
         self.table.apply_received()
         dt = np.full(len(self.table.robots), self.table.interval_s(t_ns))
@@ -191,7 +176,7 @@ class Tracker:
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
-        self._check_sizes(update.detections, update.assignments)
+        self.sizes.observe(self.table.states, update.detections, update.assignments)
         update, found = self._acquire(update)
         table = self.table
         now = Snapshot(update.t_ns, table.states, table.tracked)
@@ -244,26 +229,6 @@ class Tracker:
             return detections, assignments
         frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
         return association.collect(FrameSet(frame_set.t_ns, frames))
-
-    def _check_sizes(self, detections: DetectionTable, assignments: Assignments) -> None:
-        """Compare some assigned detections with the declared diameters."""
-        rows = self.sizes.sample(len(assignments))
-        if not len(rows):
-            return
-        marker, seen = assignments.marker[rows], detections.select(assignments.detection[rows])
-        owner = self.table.markers.robot[marker]
-        arms = np.einsum(
-            "nij,jn->ni", self.table.states.R[owner], self.table.markers.position.take(marker, 1)
-        )
-        self.sizes.note(self.cameras, seen, owner, self.table.states.p[owner] + arms)
-
-    def _is_current(self, association: Association, t_ns: int) -> bool:
-        """Whether an association is of this frame set, and of the present robots and camera poses."""
-        return (
-            association.t_ns == t_ns
-            and association.marker_table is self.table.markers
-            and association.revision == self.cameras.revision
-        )
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""

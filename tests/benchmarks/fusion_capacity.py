@@ -26,7 +26,8 @@ from fusion.protocol.messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import collecting_between_frame_sets
-from fusion.tracking.tracker import AssociatedFrames, Tracker, Update
+from fusion.tracking.association import AssociatedFrames
+from fusion.tracking.tracker import Tracker, Update
 from tests.benchmarks.fusion_load import Load
 
 T = TypeVar("T")

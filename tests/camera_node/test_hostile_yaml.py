@@ -14,7 +14,7 @@ READ = """
 import resource, sys
 from pathlib import Path
 from camera_node.config import load_yaml
-from camera_node.errors import run
+from camera_node.processes.program import run
 from camera_node.geometry.body import Body
 resource.setrlimit(resource.RLIMIT_AS, (1 << 31, 1 << 31))
 run(lambda: print(load_yaml(Path(sys.argv[1]), Body)))

@@ -22,12 +22,13 @@ from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
-from tests.waiting import wait_for
+from tests.waiting import Inbox, wait_for
 
 T = TypeVar("T")
 DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
+ATTEMPT_S = 3.0  # from a burst of frames to poses, before the burst is sent again
 WIDE_MOTION = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))  # of a robot that the server does not know
 
 
@@ -94,6 +95,21 @@ def send(server: Server, messages: list[Detections]) -> None:
     """Publish messages on the server's own session; its queue keeps their order."""
     for message in messages:
         server.session.put(KEYS.detections(message.camera), encode(message))
+
+
+def send_until_tracked(server: Server, client: Client, messages: list[Detections]) -> None:
+    """Publish messages until a pose of robot a arrives that is tracked.
+
+    On a busy machine all poses of a burst may be published before the subscription reaches the server.
+    """
+    poses = Inbox()
+    client.robot("a").on_pose(poses.put)
+
+    def is_tracked() -> bool:
+        send(server, later(messages))
+        return poses.until(lambda items: any(pose.state == "tracked" for pose in items), ATTEMPT_S)
+
+    until(is_tracked)
 
 
 @contextmanager

@@ -20,8 +20,8 @@ from fusion.protocol.requests import request_robots
 from tests.fusion.serving import KEYS, config, serving
 from tests.waiting import DEADLINE_S, wait_for
 from tests.web.arena import four_cameras
-from web.feed import Feed
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 
 AHEAD_NS = 100_000_000
 ANY_PORT = ["tcp/127.0.0.1:0"]

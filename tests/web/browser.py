@@ -11,8 +11,8 @@ import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
-from web.feed import Feed
 from web.page_access import PageAccess
+from web.state.feed import Feed
 from web.view import PanelSection, View
 
 Panel = TypeVar("Panel", bound=PanelSection)

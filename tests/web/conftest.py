@@ -10,9 +10,9 @@ from camera_node.protocol.connection import ServerConnection
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import drawing, loopback
-from web.feed import Feed
 from web.page import add_live_page
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 from web.view import View
 
 

@@ -22,9 +22,9 @@ from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
-from web.feed import Feed
 from web.scene.cameras import CameraDrawing
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 from web.tabs.calibrate import RigHistoryPanel
 from web.tabs.rig_change import CalibrationFiles, apply_rig
 from web.tabs.world import L_FRAME as BY_L_FRAME

@@ -11,7 +11,7 @@ from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import own_colours, robot_colour
 from web.condition import CONNECT_S, Condition, assess, next_step
-from web.feed import ArenaState, Feed, TimedMessage
+from web.state.feed import ArenaState, Feed, TimedMessage
 
 ENDPOINT = "tcp/lab:7447"
 

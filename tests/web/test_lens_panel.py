@@ -15,7 +15,7 @@ from tests.calib.boards import LENS, SPEC, board_poses, render
 from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, showing
-from web.subscription import Subscription
+from web.state.subscription import Subscription
 from web.tabs.cameras import CameraSettings
 from web.tabs.lens import describe_lens
 from web.tabs.rig_change import CalibrationFiles

@@ -17,8 +17,8 @@ from tests.fusion.serving import DEADLINE_S, WIDE_MOTION, serving_an_unknown_rob
 from tests.fusion.synthetic import WIDE
 from tests.waiting import wait_for
 from tests.web.browser import browsing, showing
-from web.feed import Feed
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 from web.tabs.cameras import CameraTable
 from web.tabs.marker_picker import MarkerPicker
 from web.view import View

@@ -20,8 +20,8 @@ from camera_node.errors import ConfigError
 from tests.conftest import free_port
 from tests.waiting import DEADLINE_S, Inbox, wait_for
 from tests.web.browser import browsing, drawing
-from web.feed import Feed
 from web.page_access import MAX_MESSAGE, PageAccess, Tokens, is_loopback
+from web.state.feed import Feed
 from web.view import READ_ONLY, View
 
 CAMERA = {

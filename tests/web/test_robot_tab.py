@@ -16,9 +16,9 @@ from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE
 from tests.waiting import wait_for
 from tests.web.browser import browsing, drawing, loopback
-from web.feed import Feed
 from web.page import add_live_page
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 from web.view import View
 
 

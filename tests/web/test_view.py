@@ -21,9 +21,9 @@ from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, loopback
 from web.errors import WebError
-from web.feed import Feed
-from web.messages import DemoProgress, progress_key
 from web.scene.viewpoint import FIELD_OF_VIEW, MARGIN, USUAL_ROOM, default_viewpoint
+from web.state.feed import Feed
+from web.state.messages import DemoProgress, progress_key
 from web.tabs.cameras import decode_jpeg
 from web.view import View, check_port
 

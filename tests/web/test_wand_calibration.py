@@ -23,7 +23,7 @@ from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
-from web.subscription import Subscription
+from web.state.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles
 from web.tabs.wand_session import (
     WandSessionPanel,

@@ -27,7 +27,7 @@ from web.formation.formation import SETTLED_S, FormationScore, controllers, star
 from web.formation.live import LiveRobot, RobotDrive, RobotSource, WorldClock
 from web.formation.vision import FPS, RobotCamera, camera_matrix, light, paint_background, roundel_matrix
 from web.formation.world import RobotWorld
-from web.messages import DemoProgress, progress_key
+from web.state.messages import DemoProgress, progress_key
 
 ARENA = "formation"
 USUAL, ANY_PORT = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:0"

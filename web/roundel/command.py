@@ -18,8 +18,9 @@ from importlib.metadata import requires, version
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from camera_node.command_line import parse, run_command
-from camera_node.errors import ConfigError, check_command, run
+from camera_node.errors import ConfigError, check_command
 from camera_node.logs import set_up_logging
+from camera_node.processes.program import run
 
 Runner = Callable[[str, Sequence[str], Sequence[str]], int | None]
 

@@ -10,7 +10,7 @@ import viser
 from calib.plan.planner import DIAMETER_M, PlannedArena, plan_around
 from calib.rig.rig import Rig
 from camera_node.arrays import Array, Index
-from web.feed import ArenaState
+from web.state.feed import ArenaState
 
 POINTS = 2500  # of the volume, about
 HIGHEST_M = 2.0

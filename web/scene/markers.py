@@ -9,8 +9,8 @@ import viser
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from web.colours import LABELED, TRUE_POINT, UNLABELED
-from web.feed import ArenaState
 from web.scene.bodies import cylinder_mesh
+from web.state.feed import ArenaState
 
 MARKERS_S = 0.5  # markers disappear after so long without a message
 DISC_RADIUS_M, DISC_HEIGHT_M = 0.03, 0.002

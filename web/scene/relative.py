@@ -6,7 +6,7 @@ import viser
 
 from camera_node.arrays import Array
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
-from web.feed import ArenaState
+from web.state.feed import ArenaState
 
 RECENT_S = 0.5  # frames disappear after so long without a message
 AXES_M = 0.1  # of a roundel; cameras have twice the size

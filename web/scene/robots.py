@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.geometry.pose import rotation_from_wxyz, rotation_with_z
 from fusion.model.robots import Robot
 from web.colours import BACKGROUND, CARD, CARD_UNSEEN, own_colours, robot_colours
-from web.feed import ArenaState
 from web.scene.bodies import FixedParts, Part, box_mesh, cylinder_mesh, enclosing_part, ring_mesh
 from web.scene.trails import Trails, fade
+from web.state.feed import ArenaState
 from web.tables import robot_state
 
 INNER_RATIO = 0.6  # of the white disc that is drawn in each black one

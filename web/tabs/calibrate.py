@@ -9,9 +9,9 @@ from calib.rig.messages import RigHistory, RigVersion
 from calib.rig.rig import Rig
 from camera_node.text import printable
 from fusion.protocol.health import assess_calibration, calibration_problems, describe_calibration
-from web.feed import ArenaState
 from web.html_tables import Column, HtmlTable, TableRow, small
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.tables import NO_VALUE
 from web.widgets import ActionButton, Answer, set_content
 

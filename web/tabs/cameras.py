@@ -19,11 +19,11 @@ from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Preview, Settings
 from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
-from web.coverage_picture import montage
-from web.feed import ArenaState
 from web.html_tables import MARGIN_PX
 from web.scene.cameras import CameraDrawing
-from web.subscription import REQUEST_TIMEOUT_S, Subscription
+from web.state.coverage_picture import montage
+from web.state.feed import ArenaState
+from web.state.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
 from web.tabs.lens import LensPanel
 from web.tabs.mask_editor import MaskEditor

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import viser
 
 from web.condition import assess
-from web.feed import ArenaState
 from web.html_tables import STYLE, status_line
+from web.state.feed import ArenaState
 from web.widgets import GREY, escape_markdown, set_content, set_property
 
 TABS = ("Cameras", "Calibrate", "Robots", "Record", "Status")  # in the order of the work

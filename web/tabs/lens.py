@@ -23,9 +23,9 @@ from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig
 from web.errors import WebError
-from web.feed import ArenaState
 from web.html_tables import COLOURS, MARGIN_PX, small
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer, LongAction, set_content, set_property
 

@@ -12,9 +12,9 @@ from fusion.client.measure import StationaryMarkers, find_stationary_markers, ro
 from fusion.errors import FusionError
 from web.colours import SELECTED
 from web.condition import next_step
-from web.feed import ArenaState
 from web.html_tables import small
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
 MAX_ANGLE_RAD = 0.03  # between the ray of a click and the direction of the selected marker

@@ -13,9 +13,9 @@ from camera_node.errors import ConfigError
 from camera_node.protocol.camera_requests import Polygon, complete_corners, mask_of, mask_polygon
 from camera_node.protocol.messages import Settings
 from web.errors import WebError
-from web.feed import ArenaState
 from web.scene.picture_plane import PicturePlane
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.widgets import ActionButton, Answer
 
 MAX_CORNERS = 64  # of one polygon

@@ -11,7 +11,7 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.errors import RoundelError
 from camera_node.geometry.body import PrintedWand
-from web.subscription import Subscription
+from web.state.subscription import Subscription
 
 
 @dataclass(frozen=True)

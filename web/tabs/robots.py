@@ -12,8 +12,8 @@ from fusion.errors import FusionError
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import save_robots
 from fusion.protocol.messages import Robots, RobotsRequest
-from web.feed import ArenaState
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.tables import tabulate_robots
 from web.widgets import ActionButton, Answer, set_content
 

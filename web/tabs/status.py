@@ -9,9 +9,9 @@ from viser import uplot
 
 from camera_node.arrays import Array
 from web.condition import assess
-from web.feed import ArenaState
 from web.history import LENGTH_S, Event, EventLog, FigureHistory
 from web.html_tables import COLOURS, MARGIN_PX, small
+from web.state.feed import ArenaState
 from web.tables import describe_latency, describe_server, tabulate_faults
 from web.widgets import set_content, set_property
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Calibrates the cameras from the page with a wand; `python -m calib wand --live` does so in a terminal."""
 
-import subprocess
-import sys
 import tempfile
 import threading
 from functools import partial
@@ -23,13 +21,14 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand
 from web.colours import PREVIEW
+from web.commands import run_command
 from web.condition import next_step
 from web.errors import WebError
-from web.feed import ArenaState
 from web.html_tables import Column, HtmlTable, TableRow
 from web.scene.cameras import CameraDrawing
 from web.scene.wand import WandDrawing
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer, LongAction, set_content
 
@@ -199,16 +198,10 @@ def recalibrate_one(recording: Path, files: CalibrationFiles, rig: Rig, name: st
 def _run_calib(recording: Path, files: CalibrationFiles, rest: list[str]) -> None:
     files.candidate.unlink(missing_ok=True)  # of a session without a decision
     options = ["--recording", recording, "--wand", files.wand, "--out", files.candidate, *rest]
-    command = [sys.executable, "-m", "calib", "wand", *map(str, options)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=SOLVE_S, check=False)
-    except subprocess.TimeoutExpired:
-        raise WebError(
-            f"the calibration did not end within {SOLVE_S:.0f} s; the recording is {recording}"
-        ) from None
-    if done.returncode:
-        error = done.stderr.strip().removeprefix("error: ") or f"calib wand ended with {done.returncode}"
-        raise WebError(f"{error}; the recording is {recording}")
+        run_command("calib", "wand", *options, timeout_s=SOLVE_S)
+    except WebError as error:
+        raise WebError(f"{error}; the recording is {recording}") from None
 
 
 def describe_move(before: Rig, after: Rig, name: str) -> str:

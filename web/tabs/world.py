@@ -14,9 +14,9 @@ from calib.world.world_frame import is_collinear
 from camera_node.config import example_file, load_yaml
 from camera_node.geometry.body import Body
 from web.errors import WebError
-from web.feed import ArenaState
 from web.scene.surroundings import WorldPreview
-from web.subscription import Subscription
+from web.state.feed import ArenaState
+from web.state.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer
 

@@ -82,20 +82,14 @@ class Strips {
     double area_ = 0, most_ = 0, top_ = 1e9, bottom_ = -1e9;
 };
 
-/// Eight grey levels, of which `left` are in the image. (Widened in two steps: compilers convert bytes to
-/// words of four times their size one by one.)
+/// Eight grey levels, of which `left` are in the image.
 ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
-    typedef uint8_t Bytes __attribute__((vector_size(2 * kLanes)));
-    typedef int16_t Wide __attribute__((vector_size(4 * kLanes)));
-    typedef uint64_t Pair __attribute__((vector_size(2 * kLanes)));
     uint64_t seen = 0;
     if (left >= kLanes)
         std::memcpy(&seen, from, kLanes);
     else
         for (int i = 0; i < left; ++i) seen |= uint64_t(from[i]) << (8 * i);
-    const Wide wide = __builtin_convertvector(Bytes(Pair{seen, 0}), Wide);
-    return __builtin_convertvector(
-        __builtin_convertvector(__builtin_shufflevector(wide, wide, 0, 1, 2, 3, 4, 5, 6, 7), Bits), Lanes);
+    return __builtin_convertvector(widen(seen), Lanes);
 }
 
 /// Appends the columns [begin, end) of row y that are inside the image, eight at a time. The next call

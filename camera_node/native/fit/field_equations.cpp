@@ -35,10 +35,31 @@ struct FieldBasis {
     }
 };
 
+/// Products of N further columns with those of the parameters and, last, with the residuals.
 template <int N>
 struct FurtherSums {
-    Lanes by[N][kCount], own[N][N], residual[N];
+    Lanes by[N][kCount + 1], own[N][N];
 };
+
+/// Adds the products of two weighted columns with those from the j-th on, four at a time: eight sums that do
+/// not depend on each other. The last column is that of the residuals.
+template <Edge edge, int j>
+ROUNDEL_INLINE void multiply_pair(const Lanes (*weighted)[kChunk], const Gradient& at, int count,
+                                  Lanes (*sums)[kCount + 1]) {
+    constexpr int all = kUnknowns<edge> + 1, n = std::min(4, all - j);
+    const Lanes* columns[n];
+    Lanes s[2][n];
+    const auto target = [](int m) { return j + m < all - 1 ? int(kBy<edge>[size_t(j + m)]) : int(kCount); };
+    for (int m = 0; m < n; ++m) {
+        columns[m] = target(m) < kCount ? at.by[target(m)] : at.residual;
+        s[0][m] = sums[0][target(m)], s[1][m] = sums[1][target(m)];
+    }
+    for (int k = 0; k < count; ++k)
+        for (int m = 0; m < n; ++m)
+            s[0][m] += weighted[0][k] * columns[m][k], s[1][m] += weighted[1][k] * columns[m][k];
+    for (int m = 0; m < n; ++m) sums[0][target(m)] = s[0][m], sums[1][target(m)] = s[1][m];
+    if constexpr (j + n < all) multiply_pair<edge, j + n>(weighted, at, count, sums);
+}
 
 /// A part's pixels: columns from its first one on.
 struct PartPixels {
@@ -52,6 +73,7 @@ template <Edge edge, typename Basis>
 ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels at, const Basis& basis,
                                  const Weighting& weighting, FurtherSums<Basis::kSize>& sums) {
     constexpr int N = Basis::kSize;
+    static_assert(N % 2 == 0);
     Lanes weighted[N][kChunk], columns[N];
     for (; lanes > 0; lanes -= kChunk, ++chunks) {
         const int count = std::min(kChunk, lanes);
@@ -64,15 +86,7 @@ ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels a
                 for (int b = 0; b <= a; ++b) sums.own[a][b] += weighted[a][k] * columns[b];
             }
         }
-        const auto multiply = [&](const Lanes* column, const auto& sum_of) __attribute__((always_inline)) {
-            for (int a = 0; a < N; ++a)
-                for (int k = 0; k < count; ++k) sum_of(a) += weighted[a][k] * column[k];
-        };
-        for (const int i : kBy<edge>)
-            multiply(chunks->by[i],
-                     [&](int a) __attribute__((always_inline)) -> Lanes& { return sums.by[a][i]; });
-        multiply(chunks->residual,
-                 [&](int a) __attribute__((always_inline)) -> Lanes& { return sums.residual[a]; });
+        for (int a = 0; a < N; a += 2) multiply_pair<edge, 0>(&weighted[a], *chunks, count, &sums.by[a]);
     }
 }
 
@@ -91,7 +105,7 @@ ROUNDEL_CLONES void add_fields(const LinearPart& part, PartPixels at, const Fiel
 }
 
 /// Transforms products with the columns of a part's gradient to those of all parameters.
-Parameters to_parameters(const Lanes (&by)[kCount], Edge edge, const EdgeEllipse::Jacobian& J) {
+Parameters to_parameters(const Lanes (&by)[kCount + 1], Edge edge, const EdgeEllipse::Jacobian& J) {
     Parameters to{};
     for (size_t i = 0; i < kCount; ++i) to[i] = double(sum(by[i]));
     if (edge == kAnyEdge) return to;
@@ -111,7 +125,7 @@ void add_sums(const FurtherSums<N>& sums, const LinearPart& part, FurtherProduct
         const Parameters of_part = to_parameters(sums.by[a], part.edge, part.jacobian);
         for (size_t i = 0; i < kCount; ++i) to.parameters[a][i] += of_part[i];
         for (size_t b = 0; b <= a; ++b) to.own[a][b] += double(sum(sums.own[a][b]));
-        to.residuals[a] += double(sum(sums.residual[a]));
+        to.residuals[a] += double(sum(sums.by[a][kCount]));
     }
 }
 

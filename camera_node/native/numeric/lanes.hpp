@@ -23,6 +23,16 @@ ROUNDEL_INLINE Lanes load(const float* from) {
     return v;
 }
 ROUNDEL_INLINE void store(float* to, const Lanes& v) { __builtin_memcpy(to, &v, sizeof v); }
+
+/// Eight bytes as integers, in two steps: compilers convert bytes to words of four times their size one by
+/// one.
+ROUNDEL_INLINE Bits widen(uint64_t bytes) {
+    typedef uint8_t Bytes __attribute__((vector_size(2 * kLanes)));
+    typedef int16_t Wide __attribute__((vector_size(4 * kLanes)));
+    typedef uint64_t Pair __attribute__((vector_size(2 * kLanes)));
+    const Wide wide = __builtin_convertvector(Bytes(Pair{bytes, 0}), Wide);
+    return __builtin_convertvector(__builtin_shufflevector(wide, wide, 0, 1, 2, 3, 4, 5, 6, 7), Bits);
+}
 ROUNDEL_INLINE Lanes clamped(const Lanes& value, const Lanes& low, const Lanes& high) {
     const Lanes above = value > low ? value : low;
     return above < high ? above : high;

@@ -14,13 +14,15 @@ constexpr int kRays = 16;
 
 struct Direction {
     float x, y;
+    float per_x, per_y;  // 1 over their amounts, at most 1e6
 };
 
 inline const std::array<Direction, kRays> kDirections = [] {
     std::array<Direction, kRays> directions;
     for (int k = 0; k < kRays; ++k) {
         const double angle = 2 * std::numbers::pi * k / kRays;
-        directions[size_t(k)] = {float(std::cos(angle)), float(std::sin(angle))};
+        const auto x = float(std::cos(angle)), y = float(std::sin(angle));
+        directions[size_t(k)] = {x, y, 1 / std::max(std::abs(x), 1e-6f), 1 / std::max(std::abs(y), 1e-6f)};
     }
     return directions;
 }();
@@ -44,7 +46,7 @@ class Ray {
           x_(x),
           y_(y),
           d_(d),
-          end_(std::min(room(x, d.x, image.width), room(y, d.y, image.height))) {}
+          end_(std::min(room(x, d.x, d.per_x, image.width), room(y, d.y, d.per_y, image.height))) {}
     /// The first pixel before `limit` at which the ray becomes darker than `theta` (`dark`), or no longer is
     /// (not `dark`); negative if there is none. The next walk continues from there.
     template <bool dark>
@@ -69,10 +71,10 @@ class Ray {
 
   private:
     /// The length of a ray up to half a pixel before the image's last pixel; 0 from outside of the image.
-    static float room(float at, float step, int length) {
+    static float room(float at, float step, float per_step, int length) {
         if (!(at >= 0 && at <= float(length - 1))) return 0;
         const float left = step > 0 ? float(length) - 1.5f - at : at - 0.5f;
-        return left < 0 ? 0 : left / std::max(std::abs(step), 1e-6f);
+        return left < 0 ? 0 : left * per_step;
     }
     float level(float t) const { return sample(image_, x_ + t * d_.x, y_ + t * d_.y); }
 

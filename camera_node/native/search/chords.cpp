@@ -197,9 +197,9 @@ int ChordSearch::run_length(int x, int y, int dx, int dy) const {
     if (!is_inside(x, y)) return 0;
     const int across = dx > 0 ? image_->width - x : x + 1, down = dy > 0 ? image_->height - y : y + 1;
     const int most = std::min({across, down, fine_.most});
-    const bool dark = rows_.is_dark(y / 2, x);
+    const bool dark = rows_.is_dark(y >> 1, x);
     int n = 1;
-    while (n < most && rows_.is_dark((y + n * dy) / 2, x + n * dx) == dark) ++n;
+    while (n < most && rows_.is_dark((y += dy) >> 1, x += dx) == dark) ++n;
     return n;
 }
 

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <cmath>
 
 #include "numeric/cholesky.hpp"
@@ -163,9 +164,10 @@ constexpr std::array<uint16_t, 12> kVisibleParts = [] {
 /// The spread of the ratios of a set of rays.
 float ratio_spread(const Crossings& crossings, uint16_t rays) {
     float least = 1, most = 0;
-    for (int k = 0; k < crossings.count; ++k)
-        if (crossings.ratio[k] > 0 && rays >> crossings.ray[k] & 1)
-            least = std::min(least, crossings.ratio[k]), most = std::max(most, crossings.ratio[k]);
+    for (unsigned left = rays & crossings.seen[0] & crossings.seen[1]; left; left &= left - 1) {
+        const float ratio = crossings.ratio_of[std::countr_zero(left)];
+        least = std::min(least, ratio), most = std::max(most, ratio);
+    }
     return most - least;
 }
 

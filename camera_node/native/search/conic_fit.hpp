@@ -16,7 +16,8 @@ struct Crossings {
     static constexpr int kMost = 2 * kRays;
     explicit Crossings(double length) : unit(length) {}
     alignas(4 * kLanes) float x[kMost]{}, y[kMost]{}, inner[kMost]{};  // inner is 1 or 0
-    float ratio[kMost]{};  // inner over outer distance on the ray; 0 if it has only one
+    float ratio[kMost]{};   // inner over outer distance on the ray; 0 if it has only one
+    float ratio_of[kRays];  // the same by ray, of those that cross both
     int ray[kMost]{}, count = 0;
     uint16_t seen[2]{};  // one bit per ray: whether it crosses the disc's edge, and the hole's
     double unit;
@@ -24,7 +25,8 @@ struct Crossings {
         const Direction direction = kDirections[size_t(number)];
         const float away = at / float(unit);
         x[count] = away * direction.x, y[count] = away * direction.y, inner[count] = is_inner;
-        ratio[count] = its_ratio, ray[count++] = number, seen[is_inner] |= uint16_t(1 << number);
+        ratio_of[number] = ratio[count] = its_ratio, ray[count++] = number;
+        seen[is_inner] |= uint16_t(1 << number);
     }
     int count_of(uint16_t rays) const {
         return std::popcount(uint16_t(seen[0] & rays)) + std::popcount(uint16_t(seen[1] & rays));

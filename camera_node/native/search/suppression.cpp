@@ -10,8 +10,8 @@ namespace {
 
 constexpr int kTile = 8;
 
-bool is_inside(const Ellipse& e, double x, double y) {
-    const double dx = x - e.x, dy = y - e.y;
+bool is_inside(const Ellipse& e, double x, double y, double scale = 1) {
+    const double dx = (x - e.x) / scale, dy = (y - e.y) / scale;
     if (std::abs(dx) > e.major / 2 || std::abs(dy) > e.major / 2) return false;
     const double c = std::cos(e.angle), s = std::sin(e.angle);
     const double along = (c * dx + s * dy) / e.major, across = (c * dy - s * dx) / e.minor;
@@ -39,9 +39,9 @@ void Suppression::add(const Ellipse& e) {
     }
 }
 
-bool Suppression::contains(double x, double y) const {
+bool Suppression::contains(double x, double y, double scale) const {
     return std::any_of(ellipses_.begin(), ellipses_.end(),
-                       [&](const Ellipse& e) { return is_inside(e, x, y); });
+                       [&](const Ellipse& e) { return is_inside(e, x, y, scale); });
 }
 
 bool Suppression::contains_fast(double x, double y) const {

@@ -13,8 +13,8 @@ class Suppression {
   public:
     Suppression(int width, int height);
     void add(const Ellipse& ellipse);
-    /// Whether a point lies in one of the ellipses.
-    bool contains(double x, double y) const;
+    /// Whether a point lies in one of the ellipses, all of them scaled by a factor.
+    bool contains(double x, double y, double scale = 1) const;
     /// The same in constant time. Tests only the last ellipse added near the point, so the result can be
     /// falsely negative where two ellipses touch.
     bool contains_fast(double x, double y) const;

@@ -31,6 +31,10 @@ constexpr double kMinCard = 1.1;           // outer diameters: least diameter of
 constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
 constexpr double kMaxProcessing = 0.1;     // of the contrast: residuals that processing may make
 constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
+// A ring of fewer pixels than this shows the product of its width and its contrast, whose factors hardly
+// differ from those of a thinner and darker ring: its ink must be black, below this share of the paper's
+// level.
+constexpr double kThinRing = 3.6, kBlackInk = 0.7;
 // Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
@@ -185,6 +189,10 @@ std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits
     return std::nullopt;
 }
 
+bool has_black_ink(const RoundelFit& fit) {
+    return (1 - fit.ratio) * fit.outer.major / 2 >= kThinRing || fit.dark < kBlackInk * fit.bright;
+}
+
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
     return !exceeded_limit(fit, limits);
 }
@@ -198,6 +206,7 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
     // A cover biases ratio, card, residuals and levels, but neither contrast nor size.
     if (failure == Refusal::kContrast || failure == Refusal::kSize || (failure && !covered)) return failure;
     if (covered) return Refusal::kCover;
+    if (!has_black_ink(fit)) return Refusal::kContrast;
     return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt : std::optional(Refusal::kEdges);
 }
 

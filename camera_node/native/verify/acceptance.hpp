@@ -12,6 +12,10 @@ namespace roundel {
 /// roundels.
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits);
 
+/// Whether the ink is black if the ring is so thin that the picture does not tell a pale ring from a thinner
+/// one. New roundels must pass.
+bool has_black_ink(const RoundelFit& fit);
+
 /// The test that a ring-like shape fails. The numbers are those of `camera_node.detection.refusals`.
 enum class Refusal {
     kNoFit,      // the model of a roundel does not converge on it

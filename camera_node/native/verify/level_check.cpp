@@ -31,6 +31,9 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     return samples;
 }
 
+/// Spread of a further ring's distance, in radii of the first one, from direction to direction.
+constexpr float kMaxSpread = 1.3f;
+
 bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
     const float theta = float(fit.bright - depth * fit.contrast());
     const int below = int(std::ceil(theta));
@@ -48,8 +51,9 @@ bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
         const double along = u * c + v * s, across = v * c - u * s;
         const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
         least = std::min(least, share), most = std::max(most, share);
+        if (most >= kMaxSpread * least) return false;
     }
-    return most < 1.3f * least;
+    return true;
 }
 
 }  // namespace roundel

@@ -27,6 +27,7 @@ from fusion.monitoring.clocks.clock_comparison import FAST_NS, ClockComparison
 from fusion.monitoring.clocks.clock_drift import Drift
 from fusion.monitoring.clocks.time_offsets import Disagreement
 from fusion.monitoring.clocks.time_search import Snapshot, TimeShift, find_time_shift
+from fusion.monitoring.clocks.undecided_stamps import UndecidedStamps
 
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
@@ -45,9 +46,6 @@ STATIC_NS = 500_000_000  # without sufficient motion of robots, after which the 
 ARRIVAL_SIGMA_S = 0.005  # of an offset that only the arrival shows
 PAUSE_NS = 5_000_000_000  # after a false alarm, without another from the same evidence
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
-UNDECIDED_NS = 10_000_000_000  # between reports that no majority decides
-MAX_SPREAD_S = 0.1  # standard deviation of all stamps while cameras contradict each other
-HELD_NS = 3_000_000_000  # after such a contradiction no camera counts as moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +99,8 @@ class CameraClocks:
         self._clocks = {name: _Clock() for name in cameras.names}
         self._arrivals = ArrivalMonitor(cameras.names)
         self._comparison = ClockComparison(cameras, markers, single)
-        self._now_ns = self._undecided_ns = self._reported_ns = 0
-        self._undecided_s = 0.0
+        self._undecided = UndecidedStamps(cameras.names)
+        self._now_ns = 0
 
     @property
     def excluded(self) -> set[str]:
@@ -126,7 +124,9 @@ class CameraClocks:
         self._arrivals.observe(frame.camera, frame.t_ns, frame.received_ns)
         self._correct_all(self._arrivals.impossible_ns)
         self._exclude_jumped(frame.received_ns)
-        sigma_s = np.sqrt(frame.clock_sigma_s**2 + clock.sigma_s**2 + self._common_sigma_s() ** 2)
+        sigma_s = np.sqrt(
+            frame.clock_sigma_s**2 + clock.sigma_s**2 + self._undecided.sigma_s(self._now_ns) ** 2
+        )
         frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=float(sigma_s))
         clock.frames.append(frame)
         if clock.state == "excluded":
@@ -167,7 +167,7 @@ class CameraClocks:
         clock = self._clocks[name]
         if clock.state != "excluded":
             shift = self._shift(name, clock)
-            if self._is_undecided():
+            if self._undecided.holds(self._now_ns):
                 return True
             if shift is None or not shift.explains(MIN_EXPECTED) or shift.is_zero:
                 return False
@@ -181,18 +181,10 @@ class CameraClocks:
         self._arrivals.reset(name)
         self._comparison.forget()
 
-    def _is_undecided(self) -> bool:
-        """Whether cameras contradicted each other lately and no majority decided."""
-        return bool(self._undecided_ns) and self._now_ns < self._undecided_ns + HELD_NS
-
-    def _common_sigma_s(self) -> float:
-        """The standard deviation of all stamps, as long as it is not known which of them are wrong."""
-        return self._undecided_s if self._is_undecided() else 0.0
-
     def _exclude_contradicted(self, found: Disagreement) -> None:
         """Exclude the cameras that the last frame sets contradict, if it is clear which ones these are."""
         if not found.cameras:
-            self._report_undecided(found.spread_s)
+            self._undecided.note(found.spread_s, self._now_ns)
             return
         for k in found.cameras:
             clock = self._clocks[self._cameras.names[k]]
@@ -303,16 +295,6 @@ class CameraClocks:
     def rebase(self) -> None:
         """A camera has another pose: its calibration errors, which bias offsets, are others."""
         self._comparison.forget()
-
-    def _report_undecided(self, spread_s: float) -> None:
-        self._undecided_ns, self._undecided_s = self._now_ns, min(spread_s, MAX_SPREAD_S)
-        if self._now_ns > self._reported_ns + UNDECIDED_NS:
-            self._reported_ns = self._now_ns
-            log.warning(
-                "the stamps of the cameras contradict each other, and it is not clear which of them are wrong; "
-                "check the clocks of %s",
-                ", ".join(self._cameras.names),
-            )
 
 
 def _state_in_use(clock: _Clock) -> ClockState:

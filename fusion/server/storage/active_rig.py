@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The active rig and the history of its changes: loads, saves, undoes and redoes them."""
 
-import atexit
 import contextlib
 import logging
 import shutil
 import tempfile
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
@@ -41,7 +41,12 @@ class ActiveRig:
     def __init__(self, given: Path | None, saved: Path | None) -> None:
         self._given, self._saved = given, saved
         self._files: History | None = None
+        self._remove_folder: Callable[[], object] = lambda: None
         self.message: RigMessage | None = None
+
+    def close(self) -> None:
+        """Remove the history of changes that last until the program ends."""
+        self._remove_folder()
 
     @property
     def rig(self) -> Rig | None:
@@ -190,8 +195,13 @@ class ActiveRig:
     def _history(self) -> History:
         """The history of the saved file, or of one in a temporary folder."""
         if self._files is None:
-            self._files = History(self._saved or _temporary_folder() / "rig.yaml")
+            self._files = History(self._saved or self._temporary_folder() / "rig.yaml")
         return self._files
+
+    def _temporary_folder(self) -> Path:
+        folder = tempfile.mkdtemp(prefix="roundel-rig-")
+        self._remove_folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return Path(folder)
 
     def _saved_rigs(self) -> Iterator[Path]:
         """The saved rig and those before it, newest first; none if the user's file is newer."""
@@ -202,9 +212,3 @@ class ActiveRig:
             return
         yield self._saved
         yield from reversed(self._history.older())
-
-
-def _temporary_folder() -> Path:
-    folder = tempfile.mkdtemp(prefix="roundel-rig-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)

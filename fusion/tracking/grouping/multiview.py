@@ -29,11 +29,19 @@ from camera_node.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import DetectionTable
-from fusion.tracking.grouping.rays import Rays, misses, rays_of, triangulate
+from fusion.tracking.grouping.motion import (
+    diameters_of,
+    frames_of,
+    has_usual_size,
+    join_moving,
+    triangulate,
+)
+from fusion.tracking.grouping.rays import Rays, misses, misses_of_all, rays_of
 from fusion.tracking.grouping.two_views import misfit_of, pair_rays
 
 CLEARLY = 0.5  # largest ratio of a ray's distances to the closest and the second closest marker
 BLOCK = 64  # rays compared with all markers at a time: the distances stay in the cache
+MOVING_ROUNDS = 2  # in which groups of a usual size claim their rays before the others
 JOIN_ROUNDS = 2  # of refinement before ambiguous rays are reassigned
 
 
@@ -95,23 +103,52 @@ def _without_parts(rays: Rays, group: Index, centres: Array) -> tuple[Index, Arr
     """Without the groups that may be a part of a moving marker's rays: motion explains another ray or group, too."""
     if not len(centres):
         return group, centres
-    free, has_ray = np.flatnonzero(group < 0), _frames_of(rays, group, len(centres))
-    explained = (_misses_of_all(rays, free, centres) < 1) & ~has_ray[:, rays.frame[free]].T
+    free, has_ray = np.flatnonzero(group < 0), frames_of(rays, group, len(centres))
+    explained = (misses_of_all(rays, free, centres) < 1) & ~has_ray[:, rays.frame[free]].T
     whole: Mask = np.logical_not(np.any(explained, axis=0))
     pairs = KDTree(centres).query_pairs(2 * float(np.abs(rays.moved).max()), output_type="ndarray")
     apart = ~(has_ray[pairs[:, 0]] & has_ray[pairs[:, 1]]).any(1)
     whole[pairs[apart]] = False
-    number = np.where(whole, np.cumsum(whole) - 1, -1)
-    return np.append(number, -1)[group], centres[whole]
+    return _select(group, centres, whole)
 
 
 def _with_moving(rays: Rays, group: Index, centres: Array, radius: float) -> tuple[Index, Array]:
-    """With the markers among the remaining rays that moved between frames: groups (N,) and centres (K, 3)."""
+    """With the markers among the remaining rays that moved between frames: groups (N,) and centres (K, 3).
+
+    Motion lets rays of several discs meet at a wrong range, where the discs have another size. So groups of an unusual
+    size come after the others have joined all rays that they predict.
+    """
+    made, usual = (group, centres), np.ones(len(centres), bool)
+    for _ in range(MOVING_ROUNDS):
+        made = _with_remaining(rays, group, centres, radius)
+        usual = has_usual_size(diameters_of(rays, *made))
+        group, centres = join_moving(rays, *_select(*made, usual))
+        if usual.all():
+            return group, centres
+    group, centres = _restore(group, centres, made, ~usual)
+    return _with_remaining(rays, group, centres, radius)
+
+
+def _with_remaining(rays: Rays, group: Index, centres: Array, radius: float) -> tuple[Index, Array]:
+    """With the markers among the remaining rays that three cameras or more see: groups (N,) and centres (K, 3)."""
     left = np.flatnonzero(group < 0)
     of_moving, more = _seen_by_three(rays.select(left), radius)
     group = group.copy()
     group[left] = np.where(of_moving < 0, -1, len(centres) + of_moving)
     return group, np.concatenate([centres, more])
+
+
+def _select(group: Index, centres: Array, chosen: Mask) -> tuple[Index, Array]:
+    """Groups (N,) and centres of the chosen ones of K groups."""
+    return np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)[group], centres[chosen]
+
+
+def _restore(group: Index, centres: Array, before: tuple[Index, Array], chosen: Mask) -> tuple[Index, Array]:
+    """With the chosen ones of the groups before, with their centres, if all their rays are free."""
+    of_before, centres_before = before
+    taken = np.bincount(of_before[(of_before >= 0) & (group >= 0)], minlength=len(centres_before)) > 0
+    restored, more = _select(of_before, centres_before, chosen & ~taken)
+    return np.where(restored >= 0, len(centres) + restored, group), np.concatenate([centres, more])
 
 
 def _with_pairs(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
@@ -171,31 +208,14 @@ def _ambiguous(rays: Rays) -> Mask:
     return ambiguous
 
 
-def _misses_of_all(rays: Rays, rows: Index, points: Array) -> Array:
-    """(N, K) `misses` of N rays and K points."""
-    o, d = rays.o[rows], rays.d[rows]
-    along = d @ points.T - np.einsum("ni,ni->n", o, d)[:, None]
-    squared = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ points.T + np.einsum("ki,ki->k", points, points)
-    distance = np.sqrt(np.maximum(squared - along**2, 0))
-    reach = rays.reach[rows][:, None] * along + np.abs(rays.moved[rows])[:, None]
-    return np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
-
-
-def _frames_of(rays: Rays, group: Index, n: int) -> Mask:
-    """(n, F) whether a group has a ray in a frame."""
-    has_ray = np.zeros((n, int(rays.frame.max()) + 1), bool)
-    has_ray[group[group >= 0], rays.frame[group >= 0]] = True
-    return has_ray
-
-
 def _join_unassigned(rays: Rays, group: Index, centres: Array) -> Index:
     """Add each unassigned ray to the one marker that it clearly intersects, unless that has a ray in its frame."""
     free = np.flatnonzero(group < 0)
     if not len(free) or not len(centres):
         return group
-    joined, has_ray = group.copy(), _frames_of(rays, group, len(centres))
+    joined, has_ray = group.copy(), frames_of(rays, group, len(centres))
     for block in np.array_split(free, -(-len(free) // BLOCK)):
-        miss = _misses_of_all(rays, block, centres)
+        miss = misses_of_all(rays, block, centres)
         best, of_block = np.argmin(miss, 1), np.arange(len(block))
         first = miss[of_block, best]
         second = np.partition(np.column_stack([miss, np.full(len(block), np.inf)]), 1, axis=1)[:, 1]

@@ -93,38 +93,20 @@ def _possible_ranges(size: Array, diameters: Array) -> Array:
     return ranges
 
 
-def triangulate(rays: Rays, group: Index, near: Array) -> tuple[Array, Array]:
-    """(K, 3) positions of the markers of K groups at the time of the frame set, and covariances (K, 3, 3).
-
-    The ray of time tau passes p + tau v. Least squares give p and the velocity v of each group, whose prior has the
-    standard deviation `MAX_SPEED_M_S` / `SIGMAS` in each direction. The weights follow from the noise at the range of
-    `near` (K, 3).
-    """
-    rows = np.flatnonzero(group >= 0)
-    k, o, d = group[rows], rays.o[rows], rays.d[rows]
-    range_m, tau = np.einsum("ni,ni->n", near[k] - o, d), rays.tau[rows]
-    weight = 1 / (rays.sigma[rows] * range_m) ** 2
-    across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
-    side = np.einsum("ijn,nj->in", across, o)
-    of_p, of_pv, of_v = (_sums(across * tau**power, k, len(near)) for power in range(3))
-    gain = of_pv @ np.linalg.inv(of_v + (SIGMAS / MAX_SPEED_M_S) ** 2 * np.eye(3))
-    right = _sums(side, k, len(near)) - (gain @ _sums(side * tau, k, len(near))[:, :, None])[:, :, 0]
-    covariance = np.asarray(np.linalg.inv(of_p - gain @ of_pv + 1e-9 * np.eye(3)), float)
-    return np.einsum("nij,nj->ni", covariance, right), covariance
-
-
-def _sums(values: Array, group: Index, n: int) -> Array:
-    """(n, ...) sums over the last axis of `values` in each of n groups."""
-    sums = np.zeros((n, *values.shape[:-1]))
-    for entry in np.ndindex(values.shape[:-1]):
-        sums[:, *entry] = np.bincount(group, values[entry], n)
-    return sums
-
-
 def misses(rays: Rays, rows: Index, points: Array) -> Array:
     """(N,) distances between rays and points (N, 3), relative to what noise and motion explain."""
     to = points - rays.o[rows]
     along = np.einsum("ni,ni->n", to, rays.d[rows])
     distance = np.sqrt(np.maximum(np.einsum("ni,ni->n", to, to) - along**2, 0))
     reach = SIGMAS * rays.sigma[rows] * along + MAX_SPEED_M_S * np.abs(rays.tau[rows])
+    return np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)
+
+
+def misses_of_all(rays: Rays, rows: Index, points: Array) -> Array:
+    """(N, K) `misses` of N rays and K points."""
+    o, d = rays.o[rows], rays.d[rows]
+    along = d @ points.T - np.einsum("ni,ni->n", o, d)[:, None]
+    squared = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ points.T + np.einsum("ki,ki->k", points, points)
+    distance = np.sqrt(np.maximum(squared - along**2, 0))
+    reach = rays.reach[rows][:, None] * along + np.abs(rays.moved[rows])[:, None]
     return np.where(along > 0, distance / np.maximum(reach, 1e-9), np.inf)

@@ -16,7 +16,8 @@ import numpy as np
 
 from camera_node.arrays import Array, Index
 from fusion import _core
-from fusion.tracking.grouping.rays import SIGMAS, Rays, misses, triangulate
+from fusion.tracking.grouping.motion import triangulate
+from fusion.tracking.grouping.rays import SIGMAS, Rays, misses
 
 PROBABLE = 0.9
 FAR = 5.0  # tolerances: within, but beyond one tolerance, rays pass each other by chance

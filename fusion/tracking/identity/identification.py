@@ -9,8 +9,9 @@ other robots. So may be the fit of a robot whose markers are not quite as declar
 markers are seen and no good fit contradicts it, in several frame sets.
 
 Three markers of a larger robot are weak evidence: somewhere three of different robots have the distances of a robot
-whose own markers are covered. So are three markers with fewer than `STRONG_DETECTIONS`. Such a fit is accepted at once
-where the robot was last; elsewhere it must win in several frame sets too.
+whose own markers are covered. So are three markers with fewer than `STRONG_DETECTIONS`, and three of which most frames
+see one only: they face one way, so that a camera that sees one of them sees all. Such a fit is accepted at once where
+the robot was last; elsewhere it must win in several frame sets too.
 
 A robot with markers on several sides has so many distances that three or four markers fit some of them by chance. Such
 a fit is refused unless the cameras detect most of the other markers that they should see, and weak unless they detect
@@ -59,6 +60,7 @@ class RefinedFits:
         is_expected: (K,) fits where the robot was last, or starts.
         explained: (K,) shares of the expected views that are detected, of robots with markers on several sides; NaN
             for others.
+        shared: (K,) shares of their markers that a frame detects on average, of the frames that detect one of them.
         assignments, body: detections, and the fit of each.
     """
 
@@ -68,6 +70,7 @@ class RefinedFits:
     misfit: Array
     is_expected: Mask
     explained: Array
+    shared: Array
     assignments: Assignments
     body: Index
 
@@ -84,6 +87,7 @@ class RefinedFits:
             self.misfit[rows],
             self.is_expected[rows],
             self.explained[rows],
+            self.shared[rows],
             self.assignments.select(used),
             number[self.body[used]],
         )
@@ -221,13 +225,14 @@ class _Decisions:
         return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 
     def _is_evident(self, level: _Level) -> Mask:
-        """(K,) fits with more than three markers, or with all three of a robot and enough detections.
+        """(K,) fits with more than three markers, or with all three of a robot and enough detections in common frames.
 
         Of a robot with several sides, those whose expected views are detected.
         """
         mappings = level.fits.mappings
         n_detections = np.bincount(level.refined.body, minlength=len(mappings))
         is_whole = self._has_all(mappings) & (n_detections >= STRONG_DETECTIONS)
+        is_whole &= level.refined.shared >= MIN_EXPLAINED
         explained = level.refined.explained
         many = is_whole | (mappings.points.shape[1] > MIN_MARKERS)
         return np.where(np.isnan(explained), many, explained >= EVIDENT)

@@ -57,38 +57,36 @@ class OwnDetections:
         groups = [(robot == row, cost[row] - CHANGED) for row in np.flatnonzero(fallen).tolist()]
         groups += [(view == at, CHANGED) for at in np.flatnonzero(unseen).tolist()]
         beyond_question = own.copy()
+        density = self._density(given.detections) if groups else np.empty(0)
         for rows, prior in groups:
             beside = beyond_question & (robot == robot[rows][0])
-            own[rows] = prior + self._log_ratio(given, rows, beside) > 0
+            own[rows] = prior + self._log_ratio(given, rows, beside, density) > 0
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
-    def _log_ratio(self, given: AssignedFrames, rows: Mask, beside: Mask) -> float:
+    def _log_ratio(self, given: AssignedFrames, rows: Mask, beside: Mask, density: Array) -> float:
         """Log-likelihood of assignments `rows` as those of their robot, minus that as any roundels of their images.
 
-        The likelihood is conditional on the robot's assignments `beside`.
+        The likelihood is conditional on the robot's assignments `beside`. `density` (F,) is that of all roundels in the
+        frames, per pixel^2.
         """
-        density = np.bincount(given.detections.frame) / self._image_px2(given.detections)
-        frames = given.detections.frame[given.assignments.detection[rows]]
-        likelihood = self._log_likelihood(given, rows | beside) - self._log_likelihood(given, beside)
-        return likelihood - float(np.log(density[frames]).sum())
-
-    def _log_likelihood(self, given: AssignedFrames, rows: Mask) -> float:
-        """Of assignments of one robot, per pixel^2."""
-        if not rows.any():
-            return 0.0
-        observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
+        both = np.flatnonzero(rows | beside)
+        observations = MatchedObservations.of(given.assignments.select(both), given.detections, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
         S = A @ given.states.P[observations.discs.body[0]] @ A.T + np.eye(len(nu))
-        cov = observations.detections.cov.transpose(2, 0, 1)
-        areas = np.linalg.slogdet(S)[1] + np.log(np.linalg.det(cov)).sum()
-        return float(-0.5 * (nu @ np.linalg.solve(S, nu) + areas) - len(observations) * LOG_2PI)
+        known, new = np.repeat(beside[both], 2), rows[both]
+        cov = observations.detections.cov[:, :, new].transpose(2, 0, 1)
+        likelihood = _log_normal(nu, S) - _log_normal(nu[known], S[np.ix_(known, known)])
+        likelihood -= 0.5 * np.log(np.linalg.det(cov)).sum()  # of pixels instead of whitened centres
+        return float(likelihood - np.log(density[observations.detections.frame[new]]).sum())
 
-    def _image_px2(self, detections: DetectionTable) -> Array:
-        """(F,) areas of the images up to the last frame with a detection."""
-        n = int(detections.frame.max()) + 1
-        lenses = [self._cameras[self._cameras.names[k]] for k in detections.exposures.camera[:n].tolist()]
-        return np.array([lens.width * lens.height for lens in lenses], float)
+    def _density(self, detections: DetectionTable) -> Array:
+        """(F,) detections per pixel^2 in the frames up to the last one with a detection."""
+        counts = np.bincount(detections.frame)
+        lenses = [
+            self._cameras[self._cameras.names[k]] for k in detections.exposures.camera[: len(counts)].tolist()
+        ]
+        return counts / np.array([lens.width * lens.height for lens in lenses], float)
 
     def _count(self, view: Index) -> Index:
         """(R, C) numbers of assignments."""
@@ -102,3 +100,8 @@ class OwnDetections:
         self._learned[at] += 1
         rate = 1 / np.minimum(self._learned[at], LEARNED)
         self._usual[at] += rate * (count[at] / frames[frames > 0] - self._usual[at])
+
+
+def _log_normal(x: Array, S: Array) -> float:
+    """Log-density of a normal distribution of covariance S at a distance x from its mean."""
+    return float(-0.5 * (x @ np.linalg.solve(S, x) + np.linalg.slogdet(S)[1] + len(x) * LOG_2PI))

@@ -22,7 +22,7 @@ from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.constellation import Fits
 from fusion.tracking.identity.identification import RefinedFits
 from fusion.tracking.identity.single_markers import history_chi2, is_local
-from fusion.tracking.identity.verification import explained_shares
+from fusion.tracking.identity.verification import explained_shares, shared_views
 from fusion.tracking.track_table import TrackTable
 
 SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
@@ -88,6 +88,7 @@ def refine(
         mean_by_body(d2, body, n),
         is_expected,
         explained_shares(estimator.cameras, table.markers, detections, starts.robot, states),
+        shared_views(starts.assignments, body, detections, n),
         starts.assignments.with_residuals(residuals),
         body,
     )

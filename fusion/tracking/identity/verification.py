@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray, Discs, Views
-from fusion.model.observations import DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import States
 from fusion.tracking.association import assign
 
@@ -81,3 +81,24 @@ def explained_shares(
         state = states.select(np.array([k]))
         shares[k] = explained_share(cameras, markers, detections, int(robots[k]), state)
     return shares
+
+
+def shared_views(assignments: Assignments, body: Index, detections: DetectionTable, n: int) -> Array:
+    """The share of its assigned markers that a frame detects, of the frames that detect one of them, for n fits (n,).
+
+    Args:
+        assignments: of all fits.
+        body: the fit of each assignment.
+        detections: of the frame set.
+        n: number of fits.
+    """
+    n_markers = _different(assignments.marker, body, n)
+    seen_in = _different(detections.frame[assignments.detection], body, n)
+    share: Array = np.bincount(body, minlength=n).astype(float) / np.maximum(n_markers * seen_in, 1)
+    return share
+
+
+def _different(numbers: Index, body: Index, n: int) -> Index:
+    """(n,) how many different numbers each fit has."""
+    pairs = np.unique(np.column_stack([body, numbers]), axis=0)
+    return np.asarray(np.bincount(pairs[:, 0], minlength=n), np.intp)

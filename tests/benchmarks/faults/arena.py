@@ -130,9 +130,10 @@ class LiveArena:
             for event in self.world.events.values():
                 self._command(name, CameraCommand(event=event))
 
-    def start_twin(self, camera: str, name: str) -> None:
-        """Start another node with the name of a camera."""
-        self.programs.start(name, self.network.command(name, self._camera(camera)))
+    def start_twin(self, camera: str, view: str, name: str) -> None:
+        """Start another node with the name of a camera, at the place of the camera `view`."""
+        command = [*self._camera(camera), "--view", view]
+        self.programs.start(name, self.network.command(name, command))
 
     def start_recorder_on_full_disk(self, free_bytes: int) -> None:
         """Start the recorder with a limit on the size of its file."""

@@ -23,6 +23,7 @@ from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.logs import set_up_logging
 from camera_node.node.node import Node, NodeOptions
+from camera_node.processes.program import run
 from camera_node.protocol.messages import MAX_ROUNDELS
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import Frame, Source
@@ -161,25 +162,26 @@ def obey(camera: SceneCamera, world: World) -> None:
             camera.place(command.fault)
 
 
-def main(name: str, connect: str, arena: str, epoch_ns: int, load: str) -> None:
+def main(name: str, connect: str, arena: str, epoch_ns: int, load: str, view: str = "") -> None:
     """Publish until SIGTERM.
 
     Args:
-        name: of the camera in the load.
+        name: under which it publishes.
         connect: Zenoh endpoint of the server.
         arena: its name.
         epoch_ns: Unix time of the load's time 0.
         load: the `Load` as JSON.
+        view: the camera of the load whose view it has; without one, that of its name.
     """
     set_up_logging()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     world = World(msgspec.json.decode(load, type=Load), epoch_ns)
     detector = SceneDetector()
-    camera = SceneCamera(world, name, detector)
+    camera = SceneCamera(world, view or name, detector)
     threading.Thread(target=obey, args=(camera, world), daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt), open_client([connect]) as session:
         Node(name, camera, detector, session, NodeOptions(arena)).run()
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(lambda: tyro.cli(main))

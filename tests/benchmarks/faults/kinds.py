@@ -149,17 +149,18 @@ def moved_camera(arena: LiveArena, rng: random.Random) -> Fault:
 
 
 def doubled_camera(arena: LiveArena, rng: random.Random) -> Fault:
-    """A second node publishes under the name of a camera."""
-    name, twin = rng.choice(arena.cameras), "twin"
+    """The node of a second camera, at another place, publishes under the name of a camera."""
+    name, view = rng.sample(arena.cameras, 2)
+    twin = "twin"
 
     def report(seen: Evidence) -> str:
         health = seen.health(name)
         return seen.logged("two nodes", name) or ("status" if health and health.duplicate_publisher else "")
 
     def begin() -> None:
-        arena.start_twin(name, twin)
+        arena.start_twin(name, view, twin)
 
-    return Fault(name, begin, lambda: arena.programs.kill(twin), report, 4.0, LATE_S)
+    return Fault(name, begin, lambda: arena.programs.kill(twin), report, 6.0, LATE_S)
 
 
 # Faults of robots.

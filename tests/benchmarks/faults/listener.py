@@ -11,6 +11,7 @@ import time
 import tyro
 
 from camera_node.errors import NetworkError
+from camera_node.processes.program import run
 from camera_node.terminal import say
 from fusion.client.arena import Arena
 
@@ -34,4 +35,4 @@ def main(connect: str, arena: str) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(lambda: tyro.cli(main))

@@ -69,6 +69,48 @@ def test_the_usual_prints_are_found_beside_a_new_one():
     assert len(detector.detect(frame(0.41, CLEAN, 9, (30.0,)))) == 1
 
 
+def test_each_camera_has_its_own_print():
+    """Two detectors in turn, as in a process with two cameras."""
+    detectors = {0.3: Detector(), 0.7: Detector()}
+    counts = [
+        [len(detector.detect(frame(ratio, CLEAN, seed))) for ratio, detector in detectors.items()]
+        for seed in range(3)
+    ]
+    assert counts[-1] == [len(SIZES)] * 2
+    for ratio, detector in detectors.items():
+        assert detector.found_ratios == pytest.approx([ratio], abs=0.01)
+        assert len(detector.detect(frame(1 - ratio, CLEAN, 9))) == 0
+
+
+def test_a_print_that_replaces_another_one_is_found_within_128_frames():
+    """One frame in 128 is searched for any print."""
+    detector = Detector()
+    for seed in range(3):
+        detector.detect(frame(0.5, CLEAN, seed))
+    later = [frame(0.3, CLEAN, seed) for seed in (4, 5)]
+    counts = [len(detector.detect(later[k % 2])) for k in range(130)]
+    assert counts[0] == 0
+    assert counts[-1] == len(SIZES)
+    assert sorted(detector.found_ratios) == pytest.approx([0.3, 0.5], abs=0.01)
+
+
+def test_beside_rings_that_recur_the_usual_prints_are_found_and_given_ratios_exclude_the_rings():
+    """A carpet with rings of 0.3 and one roundel of 0.6: no picture tells which of both somebody printed."""
+    carpet, own = light(0.3, 1, SIZES), light(0.6, 7, (30.0,))
+    scene = np.hstack([carpet, own[:, :110]])
+    detector, given = Detector(), Detector(inner_ratios=(0.6,))
+    counts = []
+    for seed in range(4):
+        image = CLEAN.expose(scene, np.random.default_rng(seed))
+        found, strict = detector.detect(image), given.detect(image)
+        counts.append(len(found))
+        assert np.sum(np.abs(found.ratio - 0.6) < 0.02) == 1
+        assert len(strict) == 1
+        assert strict.ratio[0] == pytest.approx(0.6, abs=0.02)
+    assert counts[-1] == 1 + len(SIZES)
+    assert detector.found_ratios == pytest.approx([0.3], abs=0.01)
+
+
 def test_given_ratios_are_the_only_ones():
     detector = Detector(inner_ratios=(0.6,))
     assert sum(len(detector.detect(frame(0.41, CLEAN, seed))) for seed in range(3)) == 0

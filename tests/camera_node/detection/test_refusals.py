@@ -13,9 +13,11 @@ from camera_node.commands.detect import Detect
 from camera_node.detection.detector import Detector
 from camera_node.detection.refusals import Reason, RefusedRing, explain
 from camera_node.errors import CameraError, ConfigError
-from tests.benchmarks.detector.pictures import Card, expose, flat, paste
+from camera_node.simulation.sensor import MILD
+from tests.benchmarks.detector.pictures import Card, expose, flat, grid, paste
 
 SIZE, MIDDLE = (120, 160), (80.3, 60.2)
+THIN_SIZE = (200, 260)
 
 
 def picture(*cards: Card, floor: float = 90.0, **levels: float) -> np.ndarray:
@@ -56,6 +58,25 @@ def test_a_refused_ring_is_listed_with_the_test_that_it_fails(light, settings: d
 
 def test_a_roundel_that_is_found_is_not_listed():
     assert refused(picture(Card(MIDDLE, 30), Card((30, 30), 20, 0.6))) == []
+
+
+def test_thin_rings_are_no_roundels_with_pale_ink():
+    """Blur makes rings of 0.8 to 0.9 and 12 to 20 px look like rings of a print with a sixth of the contrast."""
+    rng = np.random.default_rng(1)
+    cards = [
+        Card(uv, float(rng.uniform(12, 20)), ratio=float(rng.uniform(0.8, 0.92)))
+        for uv in grid(30, THIN_SIZE, rng)
+    ]
+    light = paste(flat(THIN_SIZE, 190.0), cards, blur=1.2)
+    assert len(Detector(inner_ratios=(0.6, 0.41)).detect(MILD.expose(light, rng))) == 0
+
+
+def test_thin_rings_that_are_refused_are_those_of_pale_ink():
+    """Roundels of the same sizes are found at a contrast of 50 on paper of 120, as in poor light."""
+    rng = np.random.default_rng(2)
+    cards = [Card(uv, float(rng.uniform(12, 20))) for uv in grid(30, THIN_SIZE, rng)]
+    light = paste(flat(THIN_SIZE, 120.0), cards, dark=70.0, bright=120.0)
+    assert len(Detector().detect(expose(light, 2.0, rng))) == len(cards)
 
 
 def test_flat_noise_has_no_rings():

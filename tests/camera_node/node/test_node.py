@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera node over Zenoh: its publications, its replies, and its end."""
 
+import contextlib
 import logging
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -83,9 +85,17 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
     assert [message.t_ns for message in got.items] == [START + 50 * MS * k for k in range(40)]
     assert [message.seq for message in got.items] == list(range(40))
     assert {(message.camera, message.width, message.height) for message in got.items} == {("cam0", 320, 240)}
+    assert len({message.publisher for message in got.items}) == 1
     for message in got.items:
         np.testing.assert_allclose(message.unpack().uv, [CENTRE], atol=0.1)
         assert message.detect_us > 0
+
+
+def test_two_nodes_with_one_name_can_be_told_apart(network, inbox, running, frames):
+    got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
+    running(frames)
+    running(frames)
+    assert got.until(lambda messages: len({message.publisher for message in messages} - {0}) == 2)
 
 
 def test_the_status_is_published_once_a_second_and_the_token_ends_with_the_node(
@@ -217,25 +227,36 @@ def test_settings_are_reported_and_changed(network, inbox, running, slow):
     assert statuses.until(lambda items: items and items[-1].refused == len(bad))
 
 
-@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
-def test_the_program_runs_on_while_the_server_is_away(network, inbox, eventually, slow, tmp_path, stop):
+def test_a_program_runs_on_while_the_server_is_away(network, inbox, eventually, slow, tmp_path):
     """It logs the absence once, delivers after the router opens, and ends with code 0 on a signal."""
-    errors = tmp_path / "stderr"
-    command = [sys.executable, "-m", "camera_node", "--source", str(slow), "--name", "cam0"]
-    with errors.open("w") as file:
-        node = subprocess.Popen([*command, "--connect", network.endpoint], stderr=file)
-    try:
-        assert eventually(lambda: "the server is away" in errors.read_text())
+    stops = {"cam0": signal.SIGTERM, "cam1": signal.SIGINT}
+    with contextlib.ExitStack() as closing:
+        nodes = {name: closing.enter_context(node_program(name, slow, network, tmp_path)) for name in stops}
+        assert eventually(lambda: all("the server is away" in log.read_text() for _, log in nodes.values()))
         router = network.router_again()
-        got = subscribe(router, KEYS.detections(), Detections, inbox)
+        got = {name: subscribe(router, KEYS.detections(name), Detections, inbox) for name in stops}
         token = router.liveliness().declare_token(KEYS.fusion_alive)
-        assert got.until(len)
-        assert eventually(lambda: "the server is back" in errors.read_text())
-        node.send_signal(stop)
-        assert node.wait(10) == 0
+        assert eventually(lambda: all("the server is back" in log.read_text() for _, log in nodes.values()))
+        for name, stop in stops.items():
+            node, log = nodes[name]
+            assert got[name].until(len)
+            node.send_signal(stop)
+            assert node.wait(10) == 0
+            assert log.read_text().count("the server is away") == 1
+            assert "Traceback" not in log.read_text()
         token.undeclare()
-        assert errors.read_text().count("the server is away") == 1
-        assert "Traceback" not in errors.read_text()
-    finally:
-        node.kill()
-        node.wait(10)
+
+
+@contextlib.contextmanager
+def node_program(name: str, source: Path, network, folder: Path) -> Iterator[tuple[subprocess.Popen, Path]]:
+    """A camera node in a process of its own, and the file with its log."""
+    path = folder / name
+    command = [sys.executable, "-m", "camera_node", "--source", str(source), "--name", name]
+    with (
+        path.open("w") as log,
+        subprocess.Popen([*command, "--connect", network.endpoint], stderr=log) as node,
+    ):
+        try:
+            yield node, path
+        finally:
+            node.kill()

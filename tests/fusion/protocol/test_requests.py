@@ -19,7 +19,18 @@ from fusion.model.robots import load_robots
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.protocol.requests import change_robots
 from fusion.tracking.tracker import PAUSED
-from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, later, live, send, serving, until
+from tests.fusion.serving import (
+    ARENA,
+    DEADLINE_S,
+    KEYS,
+    config,
+    later,
+    live,
+    send,
+    send_until_tracked,
+    serving,
+    until,
+)
 from tests.fusion.synthetic import WIDE
 
 
@@ -40,8 +51,7 @@ def robots_of(data: bytes | None) -> Robots:
 def test_robots_are_defined_renamed_and_removed_while_tracked(tmp_path):
     with serving(config(tmp_path)) as (server, client):
         key = robots_key("test")
-        send(server, live(ARENA.messages(30)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        send_until_tracked(server, client, ARENA.messages(30))
         assert set(robots_of(request_reply(client, key)[0]).robots) == {"a"}
         request = RobotsRequest(rename={"a": "rover"}, define={"wide": WIDE})
         change = set_robots_key("test")

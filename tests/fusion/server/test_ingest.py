@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
+from camera_node.protocol.publishers import HANDOVER_NS
 from fusion.model.frames import CalibratedFrame
 from fusion.protocol.messages import FusionStatus
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.ingest import MAX_UNCALIBRATED, Ingest
+from fusion.server.ingest import ANOTHER_NODE, MAX_UNCALIBRATED, Ingest
 from fusion.server.status import PipelineStatus, ServerStatistics
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
@@ -27,6 +28,7 @@ ARENA = Arena(
 )
 KEYS = Keys("x")
 NS = 10**9
+pytestmark = pytest.mark.computed
 
 
 class Pipeline:
@@ -175,6 +177,47 @@ def test_two_nodes_with_one_name_are_reported_and_a_restarted_one_is_not(second,
     status = pipeline.status()
     assert status.cameras["cam0"].duplicate_publisher == shared
     assert ("two nodes publish as camera cam0" in caplog.text) == shared
+
+
+def of_node(publisher: int, messages: list[Detections], camera: str = "cam0") -> list[Detections]:
+    """The messages of a node that publishes as this camera."""
+    return [msgspec.structs.replace(m, publisher=publisher, camera=camera) for m in messages]
+
+
+def test_frames_of_a_second_node_with_the_name_of_a_camera_change_no_pose(caplog):
+    """A camera at another place, which starts later. Before, its frames were used as those of the first one."""
+    messages = ARENA.messages(20)
+    first = [
+        m for node, name in enumerate(ARENA.cameras, 1) for m in of_node(node, views(messages, name), name)
+    ]
+    second = of_node(9, views(messages, "cam1")[5:])
+    alone, both = Pipeline(), Pipeline()
+    assert [f.poses for f in play(both, first + second)] == [f.poses for f in play(alone, first)]
+    assert both.faults == {ANOTHER_NODE: len(second)}
+    assert both.status().cameras["cam0"].duplicate_publisher
+    assert "two nodes publish as camera cam0" in caplog.text
+
+
+def test_a_restarted_node_gets_its_name_back_once_the_name_was_silent(caplog):
+    """It is no second node; its frames are used a second after the last one of its predecessor."""
+    pipeline, messages = Pipeline(), views(ARENA.messages(80), "cam0")
+    frames = of_node(1, messages[:10]) + of_node(2, messages[15:])
+    play(pipeline, frames)
+    refused = [m for m in messages[15:] if m.t_ns - messages[9].t_ns <= HANDOVER_NS]
+    assert pipeline.faults == {ANOTHER_NODE: len(refused)}
+    assert "two nodes" not in caplog.text
+
+
+def test_a_node_that_can_not_be_the_camera_does_not_hold_its_name():
+    """The first frames have another size."""
+    pipeline, messages = Pipeline(), views(ARENA.messages(20), "cam0")
+    wrong = [msgspec.structs.replace(m, width=640, t_ns=m.t_ns - 1_000_000) for m in messages]
+    play(pipeline, of_node(1, wrong) + of_node(2, messages))
+    assert pipeline.faults == {"wrong image size": len(wrong)}
+
+
+def views(messages: list[Detections], camera: str) -> list[Detections]:
+    return [m for m in messages if m.camera == camera]
 
 
 def test_impossible_outlines_become_nan():

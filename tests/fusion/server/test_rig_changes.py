@@ -5,6 +5,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -145,14 +146,20 @@ def test_a_rig_that_the_server_can_t_save_is_refused(tmp_path: Path):
         assert rig_of(endpoint).cameras == ARENA.cameras
 
 
-@pytest.mark.parametrize("program", ["calib", "fusion"])
-def test_without_a_server_a_command_exits_with_2_and_one_line(tmp_path: Path, program: str):
+def test_without_a_server_commands_exit_with_2_and_one_line(tmp_path: Path):
+    """All at once, because each waits for a server until its time is over."""
     save_rig(OTHER, tmp_path / "mine.yaml")
-    words = {"calib": ("apply", "--rig", str(tmp_path / "mine.yaml")), "fusion": ("robots", "list")}[program]
-    done = run_program(program, *words, *to_server(f"tcp/127.0.0.1:{free_port()}")[1:])
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert "no server answers" in line
+    commands = (
+        ("calib", "apply", "--rig", str(tmp_path / "mine.yaml")),
+        ("fusion", "robots", "list"),
+        ("fusion", "define", "b", "--diameter", "0.12"),
+    )
+    where = to_server(f"tcp/127.0.0.1:{free_port()}")[1:]
+    with ThreadPoolExecutor() as pool:
+        for done in pool.map(lambda words: run_program(*words, *where), commands):
+            assert done.returncode == 2
+            (line,) = done.stderr.splitlines()
+            assert "no server answers" in line
 
 
 def test_a_rig_with_new_lenses_costs_no_frame_set(tmp_path: Path):

@@ -21,7 +21,20 @@ from fusion.protocol.messages import FusionStatus, RobotPose, RobotPoses
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
 from tests.conftest import ROOT
-from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, connected, live, send, serving, until
+from tests.fusion.serving import (
+    ARENA,
+    ATTEMPT_S,
+    DEADLINE_S,
+    KEYS,
+    config,
+    connected,
+    later,
+    live,
+    send,
+    send_until_tracked,
+    serving,
+    until,
+)
 from tests.waiting import Inbox
 
 
@@ -83,17 +96,22 @@ def test_invalid_detections_are_counted_and_skipped(tmp_path):
 
 
 def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_path):
+    frames = ARENA.messages(12)
     with serving(config(tmp_path)) as (server, client):
-        send(server, live(ARENA.messages(12)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        statuses, fault = Inbox(), "frame set without a solution"
+        client.status().on_message(statuses.put)
+
+        def is_counted() -> bool:
+            send(server, later(frames))
+            return statuses.until(lambda items: items and fault in items[-1].faults, ATTEMPT_S)
+
+        send_until_tracked(server, client, frames)
         tracker = server.pipeline.tracker
         assert tracker is not None
         server.transport.enqueue(lambda: tracker.table.states.P.fill(np.nan))
-        status = client.status(DEADLINE_S)
-        send(server, live(ARENA.messages(12), ago_ns=5 * 10**8))
-        until(lambda: status.next().faults == {"frame set without a solution": 1})
-        send(server, live(ARENA.messages(12), ago_ns=4 * 10**8))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        until(is_counted)
+        send_until_tracked(server, client, frames)
+        assert max(status.faults.get(fault, 0) for status in statuses.items) == 1
 
 
 def send_in_real_time(server: Server, n_frames: int) -> None:

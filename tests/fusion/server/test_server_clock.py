@@ -1,24 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Setting the system clock of the server's and the cameras' machine changes no pose."""
 
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from camera_node.clocks.host_clock import unix_ahead_ns
-from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import RobotPose
 from fusion.server.server_clock import ServerClock
-from tests.conftest import ROOT
-from tests.fusion.moving_cameras import MOVING
-from tests.fusion.serving import DEADLINE_S, config
+from tests.benchmarks.faults.arena import small_load
+from tests.benchmarks.faults.live_clocks import drift_live
+from tests.fusion.settable_arena import error_m, running_arena
 from tests.fusion.settable_clock import SettableClock
-from tests.waiting import Inbox, wait_for
+from tests.waiting import Inbox
 
 SETTLED, WATCHED = 60, 90  # poses: two seconds to converge, three seconds after the clock is set
 MAX_ERROR_M = 0.01
@@ -52,30 +46,12 @@ def test_the_time_is_unix_time_at_the_start_and_monotonic_since():
     assert before <= clock.reply().t_ns <= clock.now_ns()
 
 
-def error_m(pose: RobotPose, server_ahead_ns: int) -> float:
-    """The distance between a pose and the truth at its time."""
-    _, p = MOVING.motions["a"]((pose.t_ns - server_ahead_ns) * 1e-9)
-    return float(np.linalg.norm(pose.position - p))
-
-
-@contextmanager
-def running_arena(folder: Path, clock: SettableClock) -> Iterator[Client]:
-    """A server and cameras, each in a process with the settable clock; and a client of the server."""
-    settings, path = config(folder), folder / "endpoints"
-    files = ["--rig", str(settings.rig), "--robots", settings.robots, "--endpoints-file", str(path)]
-    serve = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
-    environment = clock.environment
-    with subprocess.Popen(serve, cwd=ROOT, env=environment) as server:
-        try:
-            wait_for(path.exists)
-            (endpoint,) = path.read_text().splitlines()
-            publish = [sys.executable, "-m", "tests.fusion.moving_cameras", endpoint]
-            with subprocess.Popen(publish, cwd=ROOT, env=environment) as cameras:
-                try:
-                    with Client.connect(endpoint, arena="test") as client:
-                        client.robot("a", DEADLINE_S).next()
-                        yield client
-                finally:
-                    cameras.terminate()
-        finally:
-            server.terminate()
+@pytest.mark.slow  # the drift is reported after 15 s
+def test_a_camera_that_drifts_by_200_ppm_is_reported_and_makes_no_pose_wrong(tmp_path: Path):
+    """Between programs: a camera node whose clock drifts and is set right. The robots drive at 0.5 m/s."""
+    outcome = drift_live(tmp_path, 200.0)
+    assert outcome.reported_s * 200e-6 * small_load().speed_m_s < 0.0025
+    assert np.isfinite(outcome.recovered_s)
+    assert outcome.others == ()
+    assert outcome.judged.wrong == 0
+    assert outcome.judged.share > 0.9

@@ -11,6 +11,7 @@ from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault
 
 SECONDS = 20.0
+pytestmark = pytest.mark.computed
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from fusion.model.observations import DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking import acquisition
+from fusion.tracking.grouping import marker_search
 from fusion.tracking.grouping.multiview import find_markers
 from fusion.tracking.identity import identification
 from fusion.tracking.identity.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
@@ -173,7 +174,7 @@ def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.
     module, value = {
         "MAX_COMPARED": (identification, 3),
         "MAX_BODIES": (acquisition, 1),
-        "MAX_PAIRS": (acquisition, 1),
+        "MAX_PAIRS": (marker_search, 1),
     }[limit]
     monkeypatch.setattr(module, limit, value)
     load = Load(12, 4, 6, 30.0, seed=5, false=60.0 if limit == "MAX_PAIRS" else 1.0)

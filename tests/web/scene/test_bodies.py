@@ -12,9 +12,9 @@ from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.model.robots import Robot, load_robots
 from fusion.protocol.messages import Markers, RobotPose
 from web.colours import CARD, CARD_UNSEEN
-from web.feed import ArenaState, TimedMessage
 from web.scene.bodies import Mesh, box_mesh, cylinder_mesh, enclosing_part
 from web.scene.robots import RobotDrawing
+from web.state.feed import ArenaState, TimedMessage
 
 CUBE = load_robots(example_file("cube/robots.yaml"))["cube"]
 SIDE_M = 0.38

@@ -133,6 +133,27 @@ def test_a_camera_that_loses_power_is_opened_again_without_a_leak(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("is_noticed", [True, False])
+def test_a_camera_that_is_away_is_closed_within_2_s(
+    fake_camera: Starter, caplog: pytest.LogCaptureFixture, is_noticed: bool
+):
+    """Each request waits for an answer for three seconds; the thread that reads releases the camera later."""
+    caplog.set_level(logging.WARNING, "camera_node.device")
+    camera = fake_camera(9)
+    source = open_source(f"genicam:{camera.serial}", SourceSettings(**SMALL, fps=50.0))
+    next(iter(source))
+    camera.stop()
+    if is_noticed:
+        wait_for(lambda: "delivers no frames" in caplog.text)
+    started_s = time.monotonic()
+    source.close()
+    took_s = time.monotonic() - started_s
+    assert list(source) == []
+    wait_for(lambda: not any(camera.serial in thread.name for thread in threading.enumerate()))
+    assert took_s < 2.2
+
+
+@pytest.mark.slow
 def test_cameras_are_found_by_serial_number_and_address(fake_camera: Starter):
     """Each look at the network takes a second."""
     first = fake_camera(5)

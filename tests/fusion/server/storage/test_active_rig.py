@@ -14,13 +14,24 @@ from calib.live.rig_requests import set_rig
 from calib.rig.history import History
 from calib.rig.messages import RigHistory
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
+from camera_node.errors import NetworkError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.requests import RequestError
+from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
 from fusion.server.config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
-from tests.fusion.serving import ARENA, DEADLINE_S, config, connected, live, run_program, send, serving, until
+from tests.fusion.serving import (
+    ARENA,
+    DEADLINE_S,
+    config,
+    connected,
+    run_program,
+    send_until_tracked,
+    serving,
+    until,
+)
 from tests.waiting import wait_for
 
 GIVEN = Rig(cameras=ARENA.cameras)
@@ -81,8 +92,7 @@ def test_subscribers_receive_the_rig_of_the_server_only(tmp_path: Path):
 
 def test_robots_stay_tracked_if_no_pose_or_that_of_one_camera_changes(tmp_path: Path):
     with serving(config(tmp_path)) as (server, client):
-        send(server, live(ARENA.messages(30)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        send_until_tracked(server, client, ARENA.messages(30))
         tracker = server.pipeline.tracker
         assert tracker is not None
         client.set_rig(Rig(cameras=ARENA.cameras, calibration={"date": "today"}))
@@ -104,8 +114,7 @@ def test_a_rig_that_cannot_be_saved_is_refused_and_the_old_one_stays(tmp_path: P
                 client.set_rig(rig)
             assert client.rig(DEADLINE_S) == GIVEN
             assert server.pipeline.cameras == ARENA.cameras
-        send(server, live(ARENA.messages(30)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        send_until_tracked(server, client, ARENA.messages(30))
 
 
 def test_changes_are_undone_and_redone_also_after_a_restart(tmp_path: Path):
@@ -272,12 +281,12 @@ def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
         until(lambda: client.status(DEADLINE_S).next().rig_t_ns == t_ns)
 
 
-def test_a_client_without_a_server_is_told(endpoint: str):
+def test_without_a_server_a_request_fails(endpoint: str):
     with (
-        Client.connect(endpoint, arena="test") as client,
-        pytest.raises(Exception, match="no server answers"),
+        open_router([endpoint]) as router,
+        pytest.raises(NetworkError, match=r"no server answers on test/rig/set within 0\.2 s"),
     ):
-        set_rig(client.session, "test", GIVEN, "test", timeout_s=0.2)
+        set_rig(router, "test", GIVEN, "test", timeout_s=0.2)
 
 
 def test_the_saved_file_is_the_rig_in_force(tmp_path: Path):

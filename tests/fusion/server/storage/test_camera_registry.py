@@ -13,6 +13,7 @@ from camera_node.protocol.requests import RequestError
 from fusion.server.storage.camera_registry import MAX_CAMERAS, CameraRegistry
 
 MASK = (((0.0, 0.0), (9.0, 0.0), (9.0, 9.0)),)
+pytestmark = pytest.mark.computed
 
 
 def request(id: str, name: str = "", **fields) -> CameraRegistration:

@@ -14,7 +14,7 @@ import zenoh
 from calib.rig.recording import read_messages
 from camera_node.errors import ConfigError
 from fusion.protocol.messages import robots_key
-from web.feed import Feed
+from web.state.feed import Feed
 
 LEAD_S = 2.0  # a jump also replays the messages of so long before it: one status of every program
 STEP_S = 1 / 60

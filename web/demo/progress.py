@@ -11,10 +11,10 @@ from calib.rig.camera import transform
 from camera_node.arrays import Array
 from camera_node.protocol.messages import encode
 from camera_node.simulation.scene import Scene
-from web.feed import ArenaState
-from web.messages import DemoProgress, progress_key
-from web.score import PoseScore
-from web.usage import ResourceUsage
+from web.demo.score import PoseScore
+from web.demo.usage import ResourceUsage
+from web.state.feed import ArenaState
+from web.state.messages import DemoProgress, progress_key
 
 RECENT = 100  # poses whose median latency is shown
 

@@ -19,8 +19,8 @@ from camera_node.protocol.relative import RelativePositions
 from camera_node.text import printable
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, robots_key
-from web.coverage_picture import CoveragePicture
-from web.messages import DemoProgress, progress_key
+from web.state.coverage_picture import CoveragePicture
+from web.state.messages import DemoProgress, progress_key
 
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
@@ -85,9 +85,10 @@ class PendingMessage:
 class Feed:
     """Decodes the messages of an arena and stores the latest of each kind.
 
-    Messages arrive through `receive`, from Zenoh (`web.subscription`) or from a recording (`web.replay`). Invalid
-    messages are counted in `ArenaState.faults` and have no other effect. Poses, markers and detections arrive far more
-    often than they are drawn: of each key, only the latest message is decoded, by `state`. All methods are thread-safe.
+    Messages arrive through `receive`, from Zenoh (`web.state.subscription`) or from a recording
+    (`web.state.replay`). Invalid messages are counted in `ArenaState.faults` and have no other effect. Poses,
+    markers and detections arrive far more often than they are drawn: of each key, only the latest message is
+    decoded, by `state`. All methods are thread-safe.
     """
 
     def __init__(

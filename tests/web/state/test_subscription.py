@@ -12,8 +12,8 @@ from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
-from web.feed import Feed
-from web.subscription import Subscription
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 
 
 def test_a_late_subscriber_receives_the_rig(arena: LiveArena):

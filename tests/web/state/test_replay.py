@@ -19,10 +19,10 @@ from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
 from web.__main__ import Options, show_recording
 from web.errors import WebError
-from web.feed import Feed
-from web.replay import RecordingPlayer
+from web.state.feed import Feed
+from web.state.replay import RecordingPlayer
 from web.tables import tabulate_robots
-from web.tabs.record import ReplayControls
+from web.tabs.replay_controls import ReplayControls
 from web.view import View
 
 HZ, SECONDS = 10, 20

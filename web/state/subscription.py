@@ -22,7 +22,7 @@ from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
 from fusion.protocol.requests import change_robots, reframe_robot, request_robots
-from web.feed import Feed
+from web.state.feed import Feed
 
 REQUEST_TIMEOUT_S = 2.0
 RIG_REQUESTS_HZ = 1.0  # however many status messages arrive

@@ -27,19 +27,19 @@ from fusion.protocol.messages import RobotPose
 from fusion.server.config import load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import CALIBRATION, ArenaPrograms
-from web.demo_progress import (
+from web.demo.failures import ProgramFailed, interrupt_on_signals, raise_failure
+from web.demo.progress import (
     ProgressReporter,
     SceneClock,
     describe_calibration_step,
     describe_errors,
     describe_tracking_step,
 )
+from web.demo.score import PoseScore, summarize
+from web.demo.usage import ResourceUsage
 from web.errors import WebError
-from web.failures import ProgramFailed, interrupt_on_signals, raise_failure
-from web.feed import Feed
-from web.score import PoseScore, summarize
-from web.subscription import Subscription
-from web.usage import ResourceUsage
+from web.state.feed import Feed
+from web.state.subscription import Subscription
 
 ARENA = "demo"
 USUAL, ANY_PORT = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:0"  # the README's client connects to the usual port

@@ -13,11 +13,11 @@ import pytest
 from camera_node.processes.supervisor import Supervisor, log_path
 from tests.conftest import free_port
 from tests.waiting import wait_for
-from web.demo import Demo
+from web.demo.demo import Demo
+from web.demo.failures import ProgramFailed, interrupt_on_signals, raise_failure
+from web.demo.usage import ResourceUsage
 from web.errors import WebError
-from web.failures import ProgramFailed, interrupt_on_signals, raise_failure
-from web.feed import Feed
-from web.usage import ResourceUsage
+from web.state.feed import Feed
 
 # Small modules in place of the programs of an arena, run as `python -m NAME`.
 PROGRAMS = {

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
-from web.feed import Feed
+from web.state.feed import Feed
 
 
 class ResourceUsage:

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Position and velocity of grouped markers, and further rays that see them.
+
+Cameras that do not expose at once see a moving marker at several places. A group of three rays determines position and
+velocity together with the prior of the velocity, and predicts the marker for the time of any other ray.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera_node.arrays import Array, Index, Mask
+from fusion.tracking.gating import DIAMETER_TOLERANCE, MAX_SPEED_M_S
+from fusion.tracking.grouping.rays import SIGMAS, Rays, misses_of_all
+
+GATE = 13.8  # chi-square with 2 degrees of freedom; rejects one true ray in 1000
+EQUAL_SIZES = 0.06  # relative: measured diameters of equal prints differ by noise and blur
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """K markers at the time of the frame set.
+
+    Attributes:
+        state: (K, 6) position and velocity, world, m and m/s.
+        covariance: (K, 6, 6) of the state.
+    """
+
+    state: Array
+    covariance: Array
+
+    @property
+    def positions(self) -> Array:
+        """(K, 3)."""
+        return self.state[:, :3]
+
+    def misfit(self, rays: Rays, rows: Index, markers: Index) -> Array:
+        """(N,) chi-square, with 2 degrees of freedom, of rays that are in no group and markers; inf behind a camera."""
+        o, d, tau = rays.o[rows], rays.d[rows], rays.tau[rows]
+        at_time = np.concatenate([np.tile(np.eye(3), (len(rows), 1, 1)), tau[:, None, None] * np.eye(3)], 2)
+        to = np.einsum("nij,nj->ni", at_time, self.state[markers]) - o
+        along = np.einsum("ni,ni->n", to, d)
+        across = np.eye(3) - d[:, :, None] * d[:, None, :]
+        off = np.einsum("nij,nj->ni", across, to)
+        spread = across @ at_time
+        noise = (rays.sigma[rows] * along) ** 2
+        # Along the ray `off` is zero, so that the noise there has no effect.
+        S = spread @ self.covariance[markers] @ spread.transpose(0, 2, 1) + noise[:, None, None] * np.eye(3)
+        chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(S, off[:, :, None])[:, :, 0])
+        return np.where(along > 0, chi2, np.inf)
+
+
+def fit_motions(rays: Rays, group: Index, near: Array) -> Motions:
+    """Least squares for position and velocity of each of K groups of rays.
+
+    The ray of time tau passes p + tau v. The prior of v has the standard deviation `MAX_SPEED_M_S` / `SIGMAS` in each
+    direction. The weights follow from the noise at the range of `near` (K, 3).
+    """
+    rows = np.flatnonzero(group >= 0)
+    k, o, d = group[rows], rays.o[rows], rays.d[rows]
+    range_m, tau = np.einsum("ni,ni->n", near[k] - o, d), rays.tau[rows]
+    weight = 1 / (rays.sigma[rows] * range_m) ** 2
+    across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
+    side = np.einsum("ijn,nj->in", across, o)
+    information, right = np.zeros((len(near), 6, 6)), np.zeros((len(near), 6))
+    information[:, :3, :3] = _sums(across, k, len(near)) + 1e-9 * np.eye(3)
+    information[:, :3, 3:] = information[:, 3:, :3] = _sums(across * tau, k, len(near))
+    information[:, 3:, 3:] = _sums(across * tau**2, k, len(near)) + (SIGMAS / MAX_SPEED_M_S) ** 2 * np.eye(3)
+    right[:, :3], right[:, 3:] = _sums(side, k, len(near)), _sums(side * tau, k, len(near))
+    covariance = np.asarray(np.linalg.inv(information), float)
+    return Motions(np.einsum("nij,nj->ni", covariance, right), covariance)
+
+
+def _sums(values: Array, group: Index, n: int) -> Array:
+    """(n, ...) sums over the last axis of `values` in each of n groups."""
+    sums = np.zeros((n, *values.shape[:-1]))
+    for entry in np.ndindex(values.shape[:-1]):
+        sums[:, *entry] = np.bincount(group, values[entry], n)
+    return sums
+
+
+def triangulate(rays: Rays, group: Index, near: Array) -> tuple[Array, Array]:
+    """(K, 3) positions of K groups at the time of the frame set, and covariances (K, 3, 3); see `fit_motions`."""
+    motions = fit_motions(rays, group, near)
+    return motions.positions, motions.covariance[:, :3, :3]
+
+
+def frames_of(rays: Rays, group: Index, n: int) -> Mask:
+    """(n, F) whether a group has a ray in a frame."""
+    has_ray = np.zeros((n, int(rays.frame.max()) + 1), bool)
+    has_ray[group[group >= 0], rays.frame[group >= 0]] = True
+    return has_ray
+
+
+def diameters_of(rays: Rays, group: Index, centres: Array) -> Array:
+    """(K,) median diameter of each group, m; NaN where unknown."""
+    rows = np.flatnonzero(group >= 0)
+    size = rays.size[rows] * np.linalg.norm(centres[group[rows]] - rays.o[rows], axis=1)
+    known = np.isfinite(size)
+    k, size = group[rows][known], size[known]
+    order, count = np.lexsort((size, k)), np.bincount(k, minlength=len(centres))
+    middle = np.minimum(np.cumsum(count) - count + count // 2, max(len(size) - 1, 0))
+    return np.where(count > 0, size[order][middle], np.nan) if len(size) else np.full(len(centres), np.nan)
+
+
+def has_usual_size(diameters: Array) -> Mask:
+    """(K,) markers whose diameter is not that of few among many of a similar one.
+
+    Rays of several discs meet at a wrong range by chance, at which the discs seem too large or too small. Prints of one
+    size seem equal, also where the declared diameter is wrong.
+    """
+    ratio = np.abs(np.log(diameters[:, None] / diameters))
+    count = (ratio < EQUAL_SIZES).sum(1)
+    most = np.max(np.where(ratio < 2 * DIAMETER_TOLERANCE, count, 0), axis=1, initial=0)
+    return (2 * count >= most) | np.isnan(diameters)
+
+
+def join_moving(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]:
+    """Add each ray without a group to the one marker whose motion predicts it, if that predicts no other of its frame.
+
+    Returns:
+        groups (N,), and the centres (K, 3) at the time of the frame set.
+    """
+    free = np.flatnonzero(group < 0)
+    if not len(centres) or not len(free):
+        return group, centres
+    motions, has_ray = fit_motions(rays, group, centres), frames_of(rays, group, len(centres))
+    near = (
+        misses_of_all(rays, free, motions.positions) < 2
+    )  # the velocity that is fitted is not that of the gate
+    ray, marker = np.nonzero(near & ~has_ray[:, rays.frame[free]].T)
+    size = rays.size[free[ray]] * np.linalg.norm(motions.positions[marker] - rays.o[free[ray]], axis=1)
+    of_size = ~(np.abs(size / diameters_of(rays, group, centres)[marker] - 1) > DIAMETER_TOLERANCE / 2)
+    ray, marker = ray[of_size], marker[of_size]
+    fits = motions.misfit(rays, free[ray], marker) < GATE
+    ray, marker = ray[fits], marker[fits]
+    view = marker * has_ray.shape[1] + rays.frame[free[ray]]
+    single = (np.bincount(ray, minlength=1)[ray] == 1) & (np.bincount(view, minlength=1)[view] == 1)
+    joined = group.copy()
+    joined[free[ray[single]]] = marker[single]
+    return joined, fit_motions(rays, joined, centres).positions
