@@ -13,6 +13,7 @@ import numpy as np
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.adjustment import RoughRig, adjust_coarsely, scale_rig
+from calib.wand.bundle_adjustment.problem import State
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.initialization.initial_rig import build_initial_rig
 from calib.wand.initialization.two_view import TwoViewGeometry
@@ -78,10 +79,10 @@ def _prefer(
     by_stamps: WandRecording, by_clocks: WandRecording, wand: Body, share: float
 ) -> tuple[WandRecording, str]:
     """Return the recording whose model fits held-out instants better, and the reason."""
-    cameras, residuals = zip(
-        *(_fit_half(recording, wand) for recording in (by_stamps, by_clocks)), strict=True
-    )
-    stamps_px, clocks_px = residuals
+    by_model = [_fit_half(recording, wand) for recording in (by_stamps, by_clocks)]
+    cameras, clocks_px = [placed for placed, _, _ in by_model], by_model[1][1]
+    # The motion model of the second also makes poses and lenses better: offsets must explain the difference.
+    stamps_px = min(without_px for _, _, without_px in by_model)
     equal = f"at least {share:.0%} of each camera's frames share their stamps with another camera"
     if cameras[0] != cameras[1]:
         held_out = f"{cameras[0]} cameras can be placed without clock offsets, {cameras[1]} with"
@@ -95,27 +96,31 @@ def _prefer(
     return by_clocks, f"clock offsets are estimated, although {equal}: {held_out}"
 
 
-def _fit_half(recording: WandRecording, wand: Body) -> tuple[int, float]:
-    """Fit every other run of instants; return the number of cameras placed, and the median residual of the others,
-    pixels; infinite where nothing can be fitted."""
+def _fit_half(recording: WandRecording, wand: Body) -> tuple[int, float, float]:
+    """Fit every other run of instants; return the number of cameras placed, and the median residuals of the others,
+    pixels, with and without the clocks that were found; infinite where nothing can be fitted."""
     instant = recording.timing.instants(recording.detections.t_s)
     fitted = (instant // RUN) % 2 == 0
     half, pairs = _select(recording, wand, fitted)
     start = build_initial_rig(pairs, range(len(recording.names)))
     if len(start.placed) < 2:
-        return 0, np.inf
+        return 0, np.inf, np.inf
     try:
         poses = np.array([start.poses[k] for k in start.placed])
         offset_s = np.array([start.offset_s[k] for k in start.placed])
         rough = scale_rig(RoughRig(poses, offset_s, start.metric))
         state = adjust_coarsely(LabeledRecording.of(half, pairs, start.placed), rough, BUDGET).state
     except CalibrationError:
-        return 0, np.inf
+        return 0, np.inf, np.inf
     rest = LabeledRecording.of(*_select(recording, wand, ~fitted), start.placed)
-    residuals = triangulated_residuals(rest, state).pixels
-    norms = np.linalg.norm(residuals, axis=1)
+    without = replace(state, clocks=np.zeros_like(state.clocks))
+    return len(start.placed), _median_residual(rest, state), _median_residual(rest, without)
+
+
+def _median_residual(recording: LabeledRecording, state: State) -> float:
+    norms = np.linalg.norm(triangulated_residuals(recording, state).pixels, axis=1)
     norms = norms[np.isfinite(norms)]
-    return len(start.placed), float(np.median(norms)) if len(norms) else np.inf
+    return float(np.median(norms)) if len(norms) else np.inf
 
 
 def _select(recording: WandRecording, wand: Body, rows: Mask) -> tuple[WandRecording, TwoViewGeometry]:

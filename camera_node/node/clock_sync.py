@@ -36,6 +36,7 @@ class ClockSync:
             timeout=TIMEOUT_S,
             consolidation=zenoh.ConsolidationMode.NONE,  # deliver the first reply at once
             priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.DROP,  # a query that waits for a full link blocks the session
             express=True,
         )
         self._estimator = OffsetEstimator()

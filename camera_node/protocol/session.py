@@ -25,12 +25,14 @@ ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|vsock|serial|unixsock-stream|unixpi
 OVER = b"Timeout"  # Zenoh's own error reply
 ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the operating system chooses
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
-OPEN_TIMEOUT_MS = 2000  # of one attempt; `close` waits this long for a listener that is not Zenoh
-LEASE_MS = 2000  # of a silent connection, which is then re-established; TCP would retry ever more rarely
+OPEN_TIMEOUT_MS = 1000  # of one attempt; `close` waits this long for a listener that is not Zenoh
+LEASE_MS = 1500  # of a silent connection, which is then re-established; TCP would retry ever more rarely
 # Bytes; the largest are snapshots. Zenoh's own limit is 1 GB, which each receiver assembles.
 MAX_MESSAGE = 1 << 24
 ALWAYS = {
     "transport/link/tx/lease": LEASE_MS,
+    # A request that waits for a full link holds a lock that the end of the lease needs; Zenoh's own limit is 5 s.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 1000 * LEASE_MS,  # us
     "transport/link/rx/max_message_size": MAX_MESSAGE,
     # It maps 16 MB for each program that sends, bypasses access rights of the network, and a killed program leaves it.
     "transport/shared_memory/enabled": False,

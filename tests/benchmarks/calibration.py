@@ -3,35 +3,31 @@
 
 Rows are simulated recordings (`tests.calib.recordings`), and the real recordings of ../shared/data if they are beside
 the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the
-same run. `honesty` measures whether covariances are true (`calibration_honesty`).
+same run. `honesty` measures whether covariances are true (`calibration_honesty`), and `data` compares with a plain
+bundle adjustment (`calibration_data`).
 """
 
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib.rig.camera import Camera
-from calib.rig.rig import Rig, load_rig
+from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.result import WandCalibration
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body
-from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import read_observations
+from tests.benchmarks.calibration_data import run as run_data
 from tests.benchmarks.calibration_honesty import run as run_honesty
+from tests.benchmarks.calibration_recordings import DATA, SQUARE_M, board_corners, corner_errors, recording
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-SQUARE_M = 0.054
 SEEDS = 3  # recordings of each simulated row
 Row = tuple[str, str, str]
 T = TypeVar("T")
@@ -158,81 +154,6 @@ def webcams_board() -> tuple[list[Row], float]:
     return rows, cost
 
 
-def board_corners() -> tuple[tuple[float, float, float], ...]:
-    """The twelve inner corners, metres."""
-    return tuple(((k % 3 + 1) * SQUARE_M, (k // 3 + 1) * SQUARE_M, 0.0) for k in range(12))
-
-
-def recording(path: Path) -> tuple[Rig, list[Detections]]:
-    """Lenses and observations.
-
-    Raises:
-        FileNotFoundError: the recording is not beside the checkout.
-    """
-    if not path.exists():
-        raise FileNotFoundError(path)
-    rig = load_rig(path.parent / "cameras.yaml")
-    return rig, read_observations(path, {n: (c.width, c.height) for n, c in rig.cameras.items()})
-
-
-def corner_errors(rig: Rig, messages: list[Detections], step_s: float = 0.17) -> Array:
-    """Errors of the distances between corners that are triangulated at the same time, metres.
-
-    Corners are triangulated at the time of one frame in each `step_s`; the other cameras' corners are interpolated
-    between two frames, at their corrected times.
-    """
-    tracks = {name: _tracks(camera, name, messages) for name, camera in rig.placed().items()}
-    times = np.unique(np.concatenate([t for track in tracks.values() for t, _ in track.values()]))
-    sampled = times[np.diff(times // step_s, prepend=-1) > 0]
-    board, errors = np.array(board_corners()), []
-    for t_s in sampled:
-        found = {
-            corner: point
-            for corner in range(12)
-            if (point := _triangulate(rig, tracks, corner, t_s, 2 * step_s)) is not None
-        }
-        errors += [
-            np.linalg.norm(found[a] - found[b]) - np.linalg.norm(board[a] - board[b])
-            for a, b in combinations(found, 2)
-        ]
-    return np.array(errors)
-
-
-def _tracks(camera: Camera, name: str, messages: list[Detections]):
-    rows: dict[int, list[tuple[float, float, float]]] = {}
-    for message in messages:
-        if message.camera == name:
-            seen = message.unpack()
-            for corner, uv in zip(seen.id.tolist(), seen.uv, strict=True):
-                rows.setdefault(corner, []).append(
-                    (message.t_ns * 1e-9 + camera.time_offset_ms * 1e-3, *uv.tolist())
-                )
-    tables = {corner: np.array(sorted(table)) for corner, table in rows.items()}
-    return {corner: (table[:, 0], camera.normalise(table[:, 1:])) for corner, table in tables.items()}
-
-
-def _triangulate(rig: Rig, tracks, corner: int, t_s: float, gap_s: float) -> Array | None:
-    centres, rays = [], []
-    for name, track in tracks.items():
-        if corner not in track:
-            continue
-        t, xy = track[corner]
-        k = int(np.searchsorted(t, t_s, side="right"))
-        if not 0 < k < len(t) or t[k] - t[k - 1] > gap_s:
-            continue
-        share = (t_s - t[k - 1]) / (t[k] - t[k - 1])
-        T = rig.cameras[name].matrix()
-        centres.append(T[:3, 3])
-        rays.append(T[:3, :3] @ np.append((1 - share) * xy[k - 1] + share * xy[k], 1.0))
-    return _intersect(np.array(centres), np.array(rays)) if len(rays) >= 2 else None
-
-
-def _intersect(centres: Array, rays: Array) -> Array:
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None]
-    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
-
-
 ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "simulated-8": lambda: simulated(WandScenario(cameras=8), 5),
     "simulated-16": lambda: simulated(WandScenario(cameras=16), 10),
@@ -273,5 +194,7 @@ def main(names: list[str]) -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["honesty"]:
         run_honesty(sys.argv[2:])
+    elif sys.argv[1:2] == ["data"]:
+        run_data(sys.argv[2:])
     else:
         main(sys.argv[1:])

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import Problem, gauge_directions
+from calib.wand.bundle_adjustment.problem import Problem
+from calib.wand.bundle_adjustment.schur_complement import invert_information
 from camera_node.arrays import Array, Index
 
 BLOCK_S = 1.0  # longer than the wand stays in one place
@@ -68,11 +69,7 @@ def camera_covariance(adjusted: Adjusted) -> CameraCovariance:
 
 def inverse_information(adjusted: Adjusted) -> Array:
     """(S d, S d) pseudo-inverse of the information, without the gauge."""
-    if adjusted.problem.estimated is not None:
-        return np.asarray(np.linalg.inv(adjusted.information), float)
-    gauge = gauge_directions(adjusted.state, adjusted.problem.free)
-    rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
-    return np.asarray(rest @ np.linalg.inv(rest.T @ adjusted.information @ rest) @ rest.T, float)
+    return invert_information(adjusted.problem, adjusted.state, adjusted.information)
 
 
 def _prior_root(adjusted: Adjusted) -> Array:

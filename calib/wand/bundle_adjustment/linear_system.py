@@ -39,6 +39,8 @@ class LinearSystem:
         bounds: (V + 1,) the first row of each view, and the number of rows.
         chain: (L, 12 B + 1, 12 B + 1) augmented Hessians of the motion terms, by interval: knot k's own terms are in
             interval k, the last knot's in the last interval.
+        motion_prior: (L, 12 B + 1, 12 B + 1) the part of `chain` from the prior of the motion: constant velocity and
+            zero speed.
         priors: of the cameras.
         background: information of the background points on the cameras.
     """
@@ -48,6 +50,7 @@ class LinearSystem:
     rows: Array
     bounds: Index
     chain: Array
+    motion_prior: Array
     priors: list[CameraPrior]
     background: PointInformation
 
@@ -81,12 +84,14 @@ def linearize(
     view = motion.location.interval * len(problem.lenses) + observations.camera
     order = np.argsort(view, kind="stable")
     first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    motion_prior = _linearize_prior(problem, state, weights)
     return LinearSystem(
         problem,
         views=view[order][first],
         rows=rows[order].reshape(-1, rows.shape[2]),
         bounds=2 * np.append(first, len(view)),
-        chain=_linearize_motion(problem, state, weights),
+        chain=motion_prior + _linearize_lengths(problem, state),
+        motion_prior=motion_prior,
         priors=camera_priors(problem, state),
         background=eliminate_points(problem, state, weights.background),
     )
@@ -115,33 +120,41 @@ def reprojection_jacobians(
     return error, J_camera[:, :, list(problem.free)], J_point
 
 
-def _linearize_motion(problem: Problem, state: State, weights: Weights) -> Array:
-    """`LinearSystem.chain`: constant velocity between knots; lengths, speed and damping at each knot."""
+def _linearize_prior(problem: Problem, state: State, weights: Weights) -> Array:
+    """`LinearSystem.motion_prior`: constant velocity between knots, and zero speed at each."""
     B, K = len(problem.wand.basis), len(state.motion)
     local = 12 * B
-    smooth, lengths, speed = motion_errors(problem, state, weights)
+    smooth, _, speed = motion_errors(problem, state, weights)
     chain = np.zeros((K - 1, local + 1, local + 1))
     weighted = weights.interval[:, None, None] * weights.motion
     H = np.einsum("lri,lrj->lij", weighted, weights.motion)
     chain[:, :local, :local] = np.kron(H, np.eye(3 * B)[None])
     chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
-    J = _knot_jacobians(problem, state.motion)
-    error = -np.concatenate([lengths, speed.reshape(K, -1)], axis=1)
-    H, g = np.swapaxes(J, 1, 2) @ J, np.einsum("kri,kr->ki", J, error)
-    H += np.diag(np.repeat([STEP_SIGMA_M**-2, 0.0], 3 * B))
-    for knots, intervals, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), 6 * B)):
-        chain[intervals, at : at + 6 * B, at : at + 6 * B] += H[knots]
-        chain[intervals, at : at + 6 * B, -1] += g[knots]
-    return chain
+    H, g = np.diag(np.repeat([0.0, SPEED_SIGMA**-2], 3 * B)), np.zeros((K, 2, 3 * B))
+    g[:, 1] = -speed.reshape(K, -1) / SPEED_SIGMA
+    return _add_to_knots(chain, np.broadcast_to(H, (K, *H.shape)), g.reshape(K, -1))
 
 
-def _knot_jacobians(problem: Problem, motion: Array) -> Array:
-    """(K, E + 3 B, 6 B) derivatives of the whitened lengths and speeds by each knot."""
-    B, pairs = len(problem.wand.basis), problem.wand.pairs
-    J = np.zeros((len(motion), len(pairs) + 3 * B, 2, B, 3))
-    for e, (i, j) in enumerate(pairs):
-        gap = motion[:, 0, i] - motion[:, 0, j]
-        along = gap / np.linalg.norm(gap, axis=1, keepdims=True) / LENGTH_SIGMA_M
+def _linearize_lengths(problem: Problem, state: State) -> Array:
+    """The part of `LinearSystem.chain` from the wand's lengths, and the damping."""
+    B, (K, local) = len(problem.wand.basis), (len(state.motion), 12 * len(problem.wand.basis))
+    gap = state.motion[:, 0][:, problem.wand.pairs]
+    gap = gap[:, :, 0] - gap[:, :, 1]
+    length = np.linalg.norm(gap, axis=2)
+    J = np.zeros((K, len(problem.wand.pairs), 2, B, 3))
+    for e, (i, j) in enumerate(problem.wand.pairs):
+        along = gap[:, e] / length[:, e, None] / LENGTH_SIGMA_M
         J[:, e, 0, i], J[:, e, 0, j] = along, -along
-    J[:, len(pairs) :, 1] = (np.eye(3 * B) / SPEED_SIGMA).reshape(1, 3 * B, B, 3)
-    return J.reshape(len(motion), -1, 6 * B)
+    J = J.reshape(K, -1, 6 * B)
+    error = (problem.wand.lengths - length) / LENGTH_SIGMA_M
+    H = np.swapaxes(J, 1, 2) @ J + np.diag(np.repeat([STEP_SIGMA_M**-2, 0.0], 3 * B))
+    return _add_to_knots(np.zeros((K - 1, local + 1, local + 1)), H, np.einsum("kri,kr->ki", J, error))
+
+
+def _add_to_knots(chain: Array, H: Array, g: Array) -> Array:
+    """Add Hessians (K, 6 B, 6 B) and gradients (K, 6 B) of the knots to a `chain`."""
+    half = g.shape[1]
+    for knots, intervals, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), half)):
+        chain[intervals, at : at + half, at : at + half] += H[knots]
+        chain[intervals, at : at + half, -1] += g[knots]
+    return chain

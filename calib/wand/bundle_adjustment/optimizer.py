@@ -2,7 +2,8 @@
 """Optimizes the cameras, their clocks and lenses, and the wand's motion, with Levenberg-Marquardt.
 
 A rough start is optimized robustly by iteratively reweighted least squares: Cauchy's weights at a scale that the
-residuals give. The final estimate is plain least squares without the observations that the statistics reject.
+residuals give. The final estimate is plain least squares without the observations that the statistics reject, with the
+motion profiled out (`ProfiledMotion`): otherwise cameras would be moved to make the wand's path smoother.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from calib.wand.bundle_adjustment.residuals import (
     find_weights,
     reprojection_errors,
 )
-from calib.wand.bundle_adjustment.schur_complement import eliminate_motion
+from calib.wand.bundle_adjustment.schur_complement import profile_motion
 from camera_node.arrays import Array, Mask
 
 CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
@@ -31,6 +32,10 @@ MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
+# Profiled steps end after one shorter than a standard deviation, over all parameters: the next would be a tenth of it.
+# None increases the cost by more than this factor; a step that does is halved.
+MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 15, 1.0
+MAX_GROWTH, MAX_HALVINGS = 10.0, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +84,7 @@ def adjust(
     """
     optimum = _optimize_exactly(problem, observations, start, rounds)
     state, inliers, weights = optimum.state, observations.select(optimum.used), optimum.weights
-    cameras = eliminate_motion(linearize(problem, inliers, state, weights))
+    cameras = profile_motion(linearize(problem, inliers, state, weights))
     return Adjusted(
         problem=problem,
         state=state,
@@ -100,7 +105,7 @@ def with_information(adjusted: Adjusted, problem: Problem, observations: WandObs
     interrupted = error_norms(problem, observations, state, weights).interval > INTERRUPTED
     inliers = observations.select(used)
     chosen = weights.select(Choice(used, interrupted, adjusted.background_used))
-    cameras = eliminate_motion(linearize(problem, inliers, state, chosen))
+    cameras = profile_motion(linearize(problem, inliers, state, chosen))
     return replace(adjusted, problem=problem, information=cameras.information, scores=cameras.scores)
 
 
@@ -122,7 +127,7 @@ class _Optimum:
 def _optimize_exactly(
     problem: Problem, observations: WandObservations, state: State, rounds: int
 ) -> _Optimum:
-    iterations, none = 0, np.zeros(len(observations), bool)
+    iterations, none, profiled = 0, np.zeros(len(observations), bool), None
     choice = Choice(none, np.zeros(len(problem.knot_s) - 1, bool), np.zeros(len(problem.background.uv), bool))
     for _ in range(rounds):
         weights = find_weights(problem, observations, state)
@@ -132,8 +137,13 @@ def _optimize_exactly(
         choice = better
         inliers, their_weights = observations.select(choice.observations), weights.select(choice)
         state = locate(problem, state, choice.background)
-        state, more = _levenberg_marquardt(problem, inliers, their_weights, state, robust=False)
-        iterations += more
+        objective = _Objective(problem, inliers, their_weights)
+        if profiled is not None:
+            profiled = _profile(objective, state)
+        if profiled is None:
+            state, more = _levenberg_marquardt(problem, inliers, their_weights, state, robust=False)
+            iterations, profiled = iterations + more, _profile(objective, state)
+        state = state if profiled is None else profiled
     else:
         weights = find_weights(problem, observations, state)
     return _Optimum(state, choice.observations, weights.select(choice), iterations)
@@ -226,6 +236,41 @@ def _levenberg_marquardt(
         if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
             return state, iteration
     return state, MAX_ITERATIONS
+
+
+def _profile(objective: _Objective, state: State) -> State | None:
+    """The state at which the cameras fit the observations best, with the motion that is optimal for these cameras, by
+    Gauss-Newton; None where it does not converge."""
+    norms = objective.norms(state)
+    for _ in range(MAX_PROFILED_STEPS):
+        try:
+            steps = profile_motion(objective.linearize(state, norms)).step(objective.problem, state)
+        except np.linalg.LinAlgError:
+            return None
+        stepped = _step_profiled(objective, state, norms, steps[:2])
+        if stepped is None:
+            return None
+        state, norms = stepped
+        if steps[2] < PROFILED_TOLERANCE:
+            return state
+    return None
+
+
+def _step_profiled(
+    objective: _Objective, state: State, norms: ErrorNorms, steps: tuple[Array, Array]
+) -> tuple[State, ErrorNorms] | None:
+    """Take the `steps` of cameras and motion, or a part of them; None where the cost grows much with all parts."""
+    most = MAX_GROWTH * objective.cost(norms) + 1
+    for share in 0.5 ** np.arange(MAX_HALVINGS):
+        try:
+            moved = objective.problem.retract(state, share * steps[0], share * steps[1])
+            moved = locate(objective.problem, moved, objective.weights.background)
+            after = objective.norms(moved)
+            if objective.cost(after) < most:
+                return moved, after
+        except ValueError:  # Lens: impossible parameters
+            pass
+    return None
 
 
 def _descend(objective: _Objective, before: _Step) -> _Step | None:

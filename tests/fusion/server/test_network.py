@@ -8,7 +8,7 @@ import pytest
 
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.network import Namespaces, why_not
-from tests.benchmarks.network import interrupt, restart_server, squeeze
+from tests.benchmarks.network import interrupt, interrupt_all, restart_server, squeeze
 
 LOAD = small_load(robots=3)
 BACK_S = 2.0  # the acceptance limits of issue 16
@@ -30,6 +30,13 @@ def apart(tmp_path: Path) -> Iterator[tuple[LiveArena, Namespaces]]:
 def test_a_camera_is_used_again_soon_after_its_link_is_up(apart: tuple[LiveArena, Namespaces]):
     """Longer than the interval at which TCP would retry, shorter than Zenoh's own lease."""
     assert interrupt(*apart, "cam1", 7.0).back_s < BACK_S
+
+
+@pytest.mark.slow  # namespaces and a loaded machine: python -m tests.benchmarks.network measures them
+def test_poses_return_soon_after_the_links_of_all_cameras(apart: tuple[LiveArena, Namespaces]):
+    """Shorter than the lease, about as long, and longer: TCP, or Zenoh, or both re-establish the connections."""
+    outages = [interrupt_all(*apart, tuple(LOAD.rig), seconds) for seconds in (0.7, 1.0, 1.4, 3.0)]
+    assert max(outage.server_s for outage in outages) < BACK_S, outages
 
 
 @pytest.mark.slow  # namespaces and a loaded machine: python -m tests.benchmarks.network measures them
