@@ -124,7 +124,9 @@ def read_messages(path: Path, faults: Counter[str] | None = None) -> Iterator[tu
                     yield channel.topic, message.data, message.log_time
             except (McapError, EOFError, struct.error) as error:
                 if faults is None or file.tell() <= MAGIC:
-                    raise ConfigError(f"{path} is not an MCAP recording: {error}") from None
+                    raise ConfigError(
+                        f"{path} is not an MCAP recording ({error}); give a file of roundel record"
+                    ) from None
                 faults["end: the recording was cut off"] += 1
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None

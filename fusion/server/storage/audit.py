@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Notes who changed the rig and the robots: a line in the log, and in a file that is only appended to."""
+"""Notes who changed the rig and the robots: a line in the log, and in a file."""
 
 import logging
-import os
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,7 +12,9 @@ import zenoh
 
 from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource, payload_of, sender_of
+from camera_node.rate_limit import RateLimit
 from camera_node.text import printable
+from fusion.server.storage.audit_file import AuditFile
 
 log = logging.getLogger("fusion.audit")
 Answer = Callable[[zenoh.Query], bytes]
@@ -20,22 +22,29 @@ MAX_ENTRIES = 32  # of each list or map in a request that a line quotes
 MAX_TEXT = 64
 MAX_SOURCE_TEXT = 200  # of a claimed source in the log
 DEPTH = 2  # of a request that a line quotes
+MAX_QUOTED = 4000  # bytes of a request in a line
+# Of refused requests, which anybody may send: 4 MB a day at 500 bytes, so that the files hold the changes of weeks.
+REFUSED_HZ, REFUSED_BURST = 0.1, 20
 
 
 class AuditLog:
     """Notes every request for a change: what, when, from whom, and whether it was done.
+
+    Refused requests are noted at a bounded rate; the next one that is noted tells how many were not.
 
     Proven is what Zenoh knows of a connection: its address, and with TLS the name in the client's certificate. Claimed
     is what a request says of itself: the session that sent it and its `source`. Without access rights anybody can claim
     anything; with them only sessions with the right to change have requests that arrive here.
 
     Args:
-        path: the file to append to, one JSON object a line; None for the log only.
+        path: the file to append to, one JSON object a line, with older ones beside it; None for the log only.
         session: the server's, whose connections are known.
     """
 
     def __init__(self, path: str | None, session: zenoh.Session) -> None:
         self._path, self._session = path, session
+        self._file = AuditFile(Path(path)) if path else None
+        self._refused, self._omitted = RateLimit(REFUSED_HZ, REFUSED_BURST), 0
 
     def audited(self, change: str, answer: Answer) -> Answer:
         """An answer to requests that notes each of them as `change`."""
@@ -44,14 +53,21 @@ class AuditLog:
             try:
                 reply = answer(query)
             except RoundelError as error:
-                self._note(change, query, f"refused: {error}")
+                self._note_refusal(change, query, error)
                 raise
             self._note(change, query, "done")
             return reply
 
         return answer_and_note
 
-    def _note(self, change: str, query: zenoh.Query, outcome: str) -> None:
+    def _note_refusal(self, change: str, query: zenoh.Query, error: RoundelError) -> None:
+        if not self._refused.passes():
+            self._omitted += 1
+            return
+        self._note(change, query, f"refused: {error}", self._omitted)
+        self._omitted = 0
+
+    def _note(self, change: str, query: zenoh.Query, outcome: str, omitted: int = 0) -> None:
         sender, request = sender_of(query), quote(payload_of(query))
         link = next((link for link in self._session.info.links() if str(link.zid) == sender), None)
         source = request.pop("source", None) if isinstance(request, dict) else None
@@ -59,7 +75,10 @@ class AuditLog:
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "change": change,
             "outcome": outcome[:500],
-            "request": request,
+            "refused_before": omitted,
+            "request": request
+            if len(msgspec.json.encode(request)) <= MAX_QUOTED
+            else "too long to be quoted",
             "certificate": link.auth_identifier if link else None,
             "address": str(link.dst) if link else None,
             "claimed_session": sender or None,
@@ -72,15 +91,10 @@ class AuditLog:
 
     def _append(self, line: bytes) -> None:
         """Append a line and force it to the disk. A fault of the disk is logged; the change stays."""
-        if self._path is None:
+        if self._file is None:
             return
         try:
-            handle = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
-            try:
-                os.write(handle, line + b"\n")
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+            self._file.append(line)
         except OSError as error:
             log.warning("the audit file %s can't be written: %s", self._path, error.strerror)
 

@@ -16,7 +16,8 @@ from camera_node.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots
-from fusion.server.storage.audit import quote
+from fusion.server.storage.audit import REFUSED_BURST, quote
+from fusion.server.storage.audit_file import MAX_OLD, AuditFile
 from tests.conftest import ROOT
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import WIDE
@@ -70,6 +71,33 @@ def test_without_certificates_the_address_is_known(tmp_path: Path):
         audit.unlink()
         audit.mkdir()
         assert "b" not in client.change_robots(remove=["b"])
+
+
+def test_refused_requests_do_not_fill_the_file(tmp_path: Path):
+    """They are noted at a bounded rate, and counted; a change among them is noted at once."""
+    audit = tmp_path / "audit.jsonl"
+    settings = msgspec.structs.replace(config(tmp_path), audit=str(audit))
+    with serving(settings) as (_, client):
+        for _ in range(REFUSED_BURST + 5):
+            with pytest.raises(RoundelError):
+                client.change_robots(remove=["unknown"])
+        client.change_robots(remove=["a"])
+        outcomes = [line["outcome"].partition(":")[0] for line in lines(audit)]
+    assert outcomes[-1] == "done"
+    assert REFUSED_BURST <= outcomes.count("refused") < REFUSED_BURST + 5
+
+
+def test_the_files_are_bounded_and_have_the_last_lines(tmp_path: Path):
+    """The oldest lines are removed, no line is lost between two files, and none is split."""
+    file = AuditFile(tmp_path / "audit.jsonl", max_bytes=100)
+    for number in range(100):
+        file.append(b"%030d" % number)
+    paths = [tmp_path / "audit.jsonl", *(tmp_path / f"audit.jsonl.{k + 1}" for k in range(MAX_OLD))]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    assert all(path.stat().st_size <= 100 for path in paths)
+    written = [int(line) for path in reversed(paths) for line in path.read_text().split()]
+    assert written == list(range(100 - len(written), 100))
+    assert len(written) > 3 * MAX_OLD
 
 
 @pytest.mark.parametrize(
