@@ -119,7 +119,7 @@ class Detect:
             say(f"{path}: {len(refused)} ring-like shape{'' if len(refused) == 1 else 's'} refused")
         for ring in refused:
             u, v, size = *ring.uv, ring.axes_px[0]
-            say(f"  at {u:.0f}, {v:.0f}, {size:.0f} px: {ring.text}")
+            say(f"  at u {u:.0f}, v {v:.0f}, {size:.0f} px wide: {ring.text}")
 
 
 def _pictures(paths: tuple[Path, ...]) -> Iterator[Path]:

@@ -62,19 +62,25 @@ def _ring(row: Array, settings: DetectorSettings, prints: tuple[float, ...]) -> 
     wanted = " or ".join(f"{p:.2f}" for p in prints) or "0.26 to 0.74 (from 14 px on), 0.6 or 0.41"
     sizes = f"{settings.min_diameter_px:g} to {settings.max_diameter_px:g}"
     texts = {
-        Reason.NO_FIT: "the model of a roundel does not fit",
+        Reason.NO_FIT: "no roundel fits it: mostly not a ring",
         Reason.RATIO: f"ratio {ratio:.2f}; the prints have {wanted}",
-        Reason.CONTRAST: f"contrast {contrast:.0f}; {settings.min_contrast:g} grey levels are needed",
+        Reason.CONTRAST: _faint(contrast, settings.min_contrast),
         Reason.LEVELS: "levels out of the camera's range: clipped",
         Reason.SIZE: f"{major:.1f} px; {sizes} are allowed",
         Reason.CARD: "no white around the ring",
         Reason.RESIDUALS: f"edges differ from the model by {100 * misfit:.0f} % of the contrast",
         Reason.EDGES: "edges are not elliptic",
-        Reason.INSIDE: "ring or hole have wrong levels",
-        Reason.COVER: "a part is covered or missing",
+        Reason.INSIDE: "ring or hole are not of one level: text, several rings or glare",
+        Reason.COVER: "a part is covered or missing, and the rest does not suffice",
         Reason.BULLSEYE: "further rings around it",
     }
     kind = Reason(int(reason))
     return RefusedRing(
         np.array([u, v]), np.array([major, minor]), angle, ratio, contrast, misfit, kind, texts[kind]
     )
+
+
+def _faint(contrast: float, least: float) -> str:
+    if contrast < least:
+        return f"contrast {contrast:.0f}; {least:g} grey levels are needed"
+    return f"contrast {contrast:.0f} of a thin ring, pale against its paper: it may be a thinner, black one"

@@ -3,13 +3,16 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import msgspec
 import numpy as np
 import pytest
 
+from camera_node.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
+from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.likeness import distances
 from fusion.model.robots import Robot, load_robots, require_distinct
@@ -159,6 +162,18 @@ def test_a_diameter_that_differs_from_the_discs_is_refused():
 
 def command(endpoint: str, *words: str) -> list[str]:
     return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
+
+
+def test_a_robot_is_replaced_on_request_only(tmp_path):
+    """Its name is refused before the measurement, and the declaration stays."""
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client):
+        measure = partial(define, "a", diameter=0.12, connect=(endpoint,), arena="test")
+        before = client.declared_robots().robots["a"]
+        with pytest.raises(ConfigError, match="add --replace"):
+            measure()
+        assert client.declared_robots().robots["a"] == before
+        assert measure(seconds=1.0, replace=True) == 0
+        assert client.declared_robots().robots["a"] != before
 
 
 def test_a_robot_in_a_running_arena_is_defined(tmp_path):
