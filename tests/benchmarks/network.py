@@ -222,7 +222,7 @@ def main(
 ) -> int:
     """Print what each fault costs; exit code 1 if poses take more than 2 s after a link, or 1 s after the server.
 
-    A short run takes 2 minutes: `--cameras 2 --parts cameras --away-s 0.5 1 1.4 2 3`.
+    A short run takes 2 minutes: `--cameras 4 --parts cameras --away-s 0.5 1 1.4 2 3`.
 
     Args:
         cameras: each in a network namespace of its own.

@@ -47,12 +47,11 @@ def test_a_new_roundel_is_found_in_its_first_frame(name: str, dark: float):
 
 def test_unchanged_parts_are_searched_again_after_an_interval():
     """Twelve roundels near the limit: none is found in the first frame, some in later searches of all of the image."""
-    ground, cards = (
-        flat(SIZE, 190.0),
-        [Card((60.3 + 50 * (k % 4), 60.4 + 50 * (k // 4)), 9.0) for k in range(12)],
-    )
+    cards = [Card((60.3 + 50 * (k % 4), 60.4 + 50 * (k // 4)), 9.0) for k in range(12)]
+    light = paste(flat(SIZE, 60.0), cards, dark=36.0, bright=60.0)
     detector = Detector(inner_ratios=(0.6,))  # otherwise the second frame is searched for other prints
-    found = [len(detector.detect(show(ground, cards, 2 + k, dark=166.0))) for k in range(3 * INTERVAL + 1)]
+    frames = [expose(light, 3.0, np.random.default_rng(2 + k)) for k in range(3 * INTERVAL + 1)]
+    found = [len(detector.detect(frame)) for frame in frames]
     assert not any(found[:INTERVAL])
     assert any(found)
 
