@@ -130,8 +130,16 @@ void claim_misfit(RoundelFit& fit, double noise) {
         for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
 }
 
-/// The fit with what the tests of another one found.
+/// Whether a fit shows the same ring as another one that was tested: its outline is within a blur of it.
+bool is_same_ring(const RoundelFit& fit, const RoundelFit& tested) {
+    return std::hypot(fit.outer.x - tested.outer.x, fit.outer.y - tested.outer.y) < tested.blur &&
+           std::abs(fit.outer.major - tested.outer.major) < tested.blur &&
+           std::abs(fit.outer.minor - tested.outer.minor) < tested.blur;
+}
+
+/// The fit with what the tests of another one found. That one knows where the card ends.
 RoundelFit as_tested(RoundelFit fit, const RoundelFit& tested) {
+    fit.p[kCard] = tested.p[kCard], fit.p[kGround] = tested.p[kGround];
     fit.unoccluded = tested.unoccluded, fit.correlation = tested.correlation, fit.uneven = tested.uneven;
     return fit;
 }
@@ -225,7 +233,8 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
         if (const auto even = fit_uneven(image, guess, *first, context);
             even && (known || tested.accepted || is_certain_roundel(image, even->fit, guess, context.noise)))
             tested = *even;
-    if (is_even && fits->weighed) tested.fit = as_tested(*fits->weighed, tested.fit);
+    if (is_even && fits->weighed && is_same_ring(*fits->weighed, *first))
+        tested.fit = as_tested(*fits->weighed, tested.fit);
     auto& [fit, misfit, elliptic, accepted] = tested;
     if (fit.fields.has_light())
         fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));
