@@ -37,7 +37,6 @@ constexpr double kMaxFineMisfit = 0.06;  // before the fine stage: it changes tr
 // Residuals over that limit after so many steps, beyond which no true roundel (1.8 and 1.3) reaches it.
 constexpr std::pair<int, double> kHopeful[] = {{2, 2.25}, {3, 1.5}};
 constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
-constexpr double kPatch = 64;                         // pixels of the ground with correlated levels
 constexpr SanityLimits kLimits{
     .shift = 0.6, .min_size = 0.6, .max_size = 1.6, .blur = 0, .underflow = 100, .overflow = 100};
 

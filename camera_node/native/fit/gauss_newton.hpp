@@ -13,6 +13,7 @@ namespace roundel {
 
 constexpr double kMinBlur = 0.29;       // pixels: standard deviation of the pixel's own width
 constexpr double kShortestFocal = 400;  // pixels: no lens in use has a stronger perspective
+constexpr double kPatch = 64;           // pixels of the ground with correlated levels
 
 /// The parameters of an initial guess, in a frame with its origin at pixel (x, y). A is the symmetric square
 /// root that maps the unit circle to the ellipse.

@@ -30,7 +30,6 @@ constexpr int kEdgeUnknowns = kCount - 3;   // all but the grey levels
 constexpr double kScale = 1.06;      // standard deviation of Gaussian noise over that of weighted residuals
 constexpr double kNoiseFloor = 1;    // grey levels
 constexpr double kGroundChance = 4;  // standard deviations of the ground's residuals, by noise
-constexpr double kPatch = 64;        // pixels of the ground with correlated levels
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations

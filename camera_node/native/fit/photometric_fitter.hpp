@@ -23,6 +23,7 @@ constexpr float kClippedPlateau = 235;  // level that compression leaves of clip
 
 /// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 22,000.
 constexpr double kUnlikelyField = 20;
+
 /// One photometric fit: the state that its stages share. `fit_photometric` calls the stages in order.
 class PhotometricFitter : GaussNewton<kCount> {
   public:

@@ -186,7 +186,10 @@ def test_without_aravis_one_line_says_what_to_install():
     """The library is hidden from a process of its own."""
     code = (
         "import ctypes, ctypes.util, sys\n"
-        "def absent(name, *a, **k): raise OSError(name)\n"
+        "programs_own = ctypes.CDLL\n"
+        "def absent(name, *a, **k):\n"
+        "    if name is None: return programs_own(name)\n"
+        "    raise OSError(name)\n"
         "ctypes.CDLL, ctypes.util.find_library = absent, lambda name: None\n"
         "import camera_node.sources.genicam.aravis as aravis\n"
         "aravis.find_library = lambda name: None\n"
