@@ -88,7 +88,7 @@ class PoseScore:
         errors.t_ns.append(pose.t_ns)
         errors.position_mm.append(1e3 * float(np.linalg.norm(position - T_true[:3, 3])))
         errors.rotation_deg.append(angle_deg(R, T_true[:3, :3]))
-        errors.normalized.append(_normalized(R.T @ (position - T_true[:3, 3]), pose))
+        errors.normalized.append(_normalized(position - T_true[:3, 3], pose))
 
     def all_tracked(self) -> bool:
         """Whether each robot had at least one tracked pose."""
@@ -117,7 +117,7 @@ class PoseScore:
 
 
 def _normalized(error: Array, pose: RobotPose) -> float:
-    """The squared error of the position, in the body's axes as the covariance is, over its claim, per coordinate."""
+    """The squared error of the position over its claim, per coordinate; both in the world, see `RobotPose`."""
     covariance = pose.covariance_matrix[3:6, 3:6]
     return float(error @ np.linalg.lstsq(covariance, error, rcond=None)[0] / 3)
 
