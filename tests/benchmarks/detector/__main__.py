@@ -23,6 +23,7 @@ from tests.benchmarks.detector import (
     recall,
     speed,
 )
+from tests.benchmarks.detector.second import measurement
 from tests.benchmarks.detector.table import Run, print_verdicts
 
 PARTS = {
@@ -36,6 +37,7 @@ PARTS = {
     "cameras": cameras.measure,
     "lighting": lighting.measure,
     "bent": bent.measure,
+    "second": measurement.measure,
 }
 
 
@@ -56,6 +58,7 @@ class Benchmark:
                 "cameras",
                 "lighting",
                 "bent",
+                "second",
                 "all",
             ],
             ...,
