@@ -9,7 +9,7 @@ from web.errors import WebError
 TIMEOUT_S = 1800.0  # a recording of hours is fused in this time
 
 
-def run_command(program: str, *words: object, timeout_s: float = TIMEOUT_S) -> None:
+def run_program(program: str, *words: object, timeout_s: float = TIMEOUT_S) -> None:
     """Run `python -m PROGRAM WORDS`.
 
     Raises:

@@ -17,9 +17,8 @@ log = logging.getLogger("camera_node.device")
 
 DEFAULTS = SourceSettings()
 REOPEN_S = 1.0
-CLOSE_S = (
-    2.0  # longest wait for the thread, which may be waiting for a camera that is away; it releases it later
-)
+# Longest wait for the thread, which may be waiting for a camera that is away; the thread releases it later.
+CLOSE_S = 2.0
 
 
 class Capture(Protocol):

@@ -33,7 +33,6 @@ class PoseQueue:
 
     Args:
         client: connected to the arena.
-        arena: its name.
         robot: of which poses are expected; None for all.
 
     Attributes:
@@ -41,8 +40,8 @@ class PoseQueue:
         faults: skipped poses, by reason.
     """
 
-    def __init__(self, client: Arena, arena: str, robot: str | None = None) -> None:
-        self.client, self._arena, self._robot = client, arena, robot
+    def __init__(self, client: Arena, robot: str | None = None) -> None:
+        self.client, self._robot = client, robot
         self.faults: Counter[str] = Counter()
         self._poses: deque[RobotPose] = deque(maxlen=QUEUE_SIZE)
         self._is_signaled = False
@@ -80,7 +79,7 @@ class PoseQueue:
             self._received_s, self._is_silent = now_s, False
         elif not self._is_silent and now_s - self._received_s >= SILENCE_S:
             self._is_silent = True
-            cause = cause_of_silence(self.client.connection, self._arena, self._robot)
+            cause = cause_of_silence(self.client.connection, self.client.keys.arena, self._robot)
             log.warning("no pose %s within %g s; %s", self.client.origin, SILENCE_S, cause)
 
     def _put(self, poses: Sequence[RobotPose]) -> None:
@@ -106,7 +105,7 @@ class PoseServer(ServerAddress):
             ConfigError: the Zenoh configuration is missing or invalid.
         """
         with Arena(ServerConnection(self.connect, self.zenoh), self.arena, robot or "*") as client:
-            poses = PoseQueue(client, self.arena, robot)
+            poses = PoseQueue(client, robot)
             try:
                 yield poses
             finally:

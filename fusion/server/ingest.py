@@ -20,13 +20,11 @@ MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
 MAX_AHEAD_NS = 2_000_000_000  # as is one so far in the future; `CameraClocks` corrects or refuses the others
 MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a fault of the publisher
 MAX_BYTES = 1 << 19  # of a message; one with the most roundels has 240 kB
-MAX_DETECTIONS = (
-    1024  # used of one frame: all markers of 200 robots; the others come from a texture or a fault
-)
+# Used of one frame: all markers of 200 robots; the others come from a texture or a fault.
+MAX_DETECTIONS = 1024
 HISTORY = 64  # frames of a camera
-MIN_STEPS_BACK = (
-    4  # of sequence numbers in the history, for two unknown publishers: a restarted node makes one
-)
+# Of sequence numbers in the history, for two publishers that do not say who they are: a restarted node makes one.
+MIN_STEPS_BACK = 4
 ANOTHER_NODE = "frames of another node under its name"
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
 

@@ -14,6 +14,7 @@ log = logging.getLogger("fusion")
 WAITING = 16  # pieces of work; further ones are refused
 POLL_S = 1.0
 LONGEST_PAUSE_S = 5.0
+Task = tuple[Callable[[], object], Callable[[], object]]  # the work, and what follows it
 
 
 class Preparation:
@@ -23,9 +24,7 @@ class Preparation:
     """
 
     def __init__(self) -> None:
-        self._waiting: queue.Queue[tuple[Callable[[], object], Callable[[], object]] | None] = queue.Queue(
-            WAITING
-        )
+        self._waiting: queue.Queue[Task | None] = queue.Queue(WAITING)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="preparation", daemon=True)
         self._thread.start()

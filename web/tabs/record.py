@@ -13,7 +13,7 @@ from camera_node.errors import ConfigError, RoundelError
 from fusion.recordings.files import recording_path, remove_recording, rename_recording
 from fusion.recordings.record import ArenaRecorder
 from fusion.recordings.summary import RecordingSummary, list_recordings
-from web.commands import run_command
+from web.commands import run_program
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow
 from web.state.feed import ArenaState
@@ -156,7 +156,7 @@ class RecordingList:
     def export(self) -> str:
         """Write the poses of the selected recording as CSV."""
         out = self._path.with_suffix(".csv")
-        run_command("fusion", "replay", self._path, "--out", out)
+        run_program("fusion", "replay", self._path, "--out", out)
         return f"wrote {out}"
 
     def rename(self) -> str:

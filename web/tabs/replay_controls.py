@@ -6,7 +6,7 @@ from datetime import datetime
 
 import viser
 
-from web.commands import run_command
+from web.commands import run_program
 from web.errors import WebError
 from web.state.feed import ArenaState
 from web.state.replay import RecordingPlayer
@@ -81,7 +81,7 @@ class ReplayControls:
             raise WebError("no recording is played; select one and replay it")
         from_s, to_s = player.part_s
         out = player.path.with_name(f"{player.path.stem}_{from_s:.1f}-{to_s:.1f}s.mcap")
-        run_command("fusion", "trim", player.path, out, "--from-s", from_s, "--to-s", to_s)
+        run_program("fusion", "trim", player.path, out, "--from-s", from_s, "--to-s", to_s)
         return f"wrote {out}"
 
     def _select_part(self, event: viser.GuiEvent) -> None:

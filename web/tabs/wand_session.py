@@ -21,7 +21,7 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand
 from web.colours import PREVIEW
-from web.commands import run_command
+from web.commands import run_program
 from web.condition import next_step
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow
@@ -199,7 +199,7 @@ def _run_calib(recording: Path, files: CalibrationFiles, rest: list[str]) -> Non
     files.candidate.unlink(missing_ok=True)  # of a session without a decision
     options = ["--recording", recording, "--wand", files.wand, "--out", files.candidate, *rest]
     try:
-        run_command("calib", "wand", *options, timeout_s=SOLVE_S)
+        run_program("calib", "wand", *options, timeout_s=SOLVE_S)
     except WebError as error:
         raise WebError(f"{error}; the recording is {recording}") from None
 

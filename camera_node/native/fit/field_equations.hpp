@@ -34,7 +34,8 @@ struct FieldScores {
     double bend, light;
 };
 
-/// The scores of the residuals after a further `step` of the parameters.
+/// The scores of the residuals after a further `step` of the parameters. Pixels of the ground count fully:
+/// uneven light shows in them too.
 FieldScores score_fields(const NormalEquations& equations, const EdgePixels& pixels, const FieldFrame& frame,
                          const Parameters& step, const Weighting& weighting);
 

@@ -42,7 +42,7 @@ class AuditLog:
     """
 
     def __init__(self, path: str | None, session: zenoh.Session) -> None:
-        self._path, self._session = path, session
+        self._session = session
         self._file = AuditFile(Path(path)) if path else None
         self._refused, self._omitted = RateLimit(REFUSED_HZ, REFUSED_BURST), 0
 
@@ -71,14 +71,14 @@ class AuditLog:
         sender, request = sender_of(query), quote(payload_of(query))
         link = next((link for link in self._session.info.links() if str(link.zid) == sender), None)
         source = request.pop("source", None) if isinstance(request, dict) else None
+        if len(msgspec.json.encode(request)) > MAX_QUOTED:
+            request = "too long to be quoted"
         entry = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "change": change,
             "outcome": outcome[:500],
             "refused_before": omitted,
-            "request": request
-            if len(msgspec.json.encode(request)) <= MAX_QUOTED
-            else "too long to be quoted",
+            "request": request,
             "certificate": link.auth_identifier if link else None,
             "address": str(link.dst) if link else None,
             "claimed_session": sender or None,
@@ -96,7 +96,7 @@ class AuditLog:
         try:
             self._file.append(line)
         except OSError as error:
-            log.warning("the audit file %s can't be written: %s", self._path, error.strerror)
+            log.warning("the audit file %s can't be written: %s", self._file.path, error.strerror)
 
 
 def _describe_source(source: Any) -> str:

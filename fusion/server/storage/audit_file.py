@@ -16,19 +16,22 @@ class AuditFile:
         path: of the present file.
         max_bytes: of each file; a longer line has a file of its own.
 
+    Attributes:
+        path: as given.
+
     All methods raise OSError if the disk refuses.
     """
 
     def __init__(self, path: Path, max_bytes: int = MAX_BYTES) -> None:
-        self._path, self._max_bytes = path, max_bytes
+        self.path, self._max_bytes = path, max_bytes
 
     def append(self, line: bytes) -> None:
         """Append a line without its line feed, and force it to the disk."""
         line += b"\n"
         with contextlib.suppress(FileNotFoundError):
-            if self._path.stat().st_size + len(line) > self._max_bytes:
+            if self.path.stat().st_size + len(line) > self._max_bytes:
                 self._rotate()
-        handle = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+        handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
             os.write(handle, line)
             os.fsync(handle)
@@ -42,4 +45,4 @@ class AuditFile:
                 os.replace(self._old(number - 1), self._old(number))
 
     def _old(self, number: int) -> Path:
-        return self._path.with_name(f"{self._path.name}.{number}") if number else self._path
+        return self.path.with_name(f"{self.path.name}.{number}") if number else self.path

@@ -125,9 +125,8 @@ def join_moving(rays: Rays, group: Index, centres: Array) -> tuple[Index, Array]
     if not len(centres) or not len(free):
         return group, centres
     motions, has_ray = fit_motions(rays, group, centres), frames_of(rays, group, len(centres))
-    near = (
-        misses_of_all(rays, free, motions.positions) < 2
-    )  # the velocity that is fitted is not that of the gate
+    # Less strict than the gate of a group, because the velocity that is fitted is not that of this gate.
+    near = misses_of_all(rays, free, motions.positions) < 2
     ray, marker = np.nonzero(near & ~has_ray[:, rays.frame[free]].T)
     size = rays.size[free[ray]] * np.linalg.norm(motions.positions[marker] - rays.o[free[ray]], axis=1)
     of_size = ~(np.abs(size / diameters_of(rays, group, centres)[marker] - 1) > DIAMETER_TOLERANCE / 2)
