@@ -3,6 +3,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 
 
 class RateLimit:
@@ -11,12 +12,14 @@ class RateLimit:
     Args:
         rate_hz: events a second; may be changed later.
         burst: events that may happen at once.
+        clock: a time that is never set, s.
     """
 
-    def __init__(self, rate_hz: float, burst: float) -> None:
+    def __init__(self, rate_hz: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.rate_hz, self.burst = rate_hz, burst
+        self._clock = clock
         self._tokens = burst
-        self._at_s = time.monotonic()
+        self._at_s = clock()
         self._lock = threading.Lock()
 
     def passes(self) -> bool:
@@ -38,12 +41,12 @@ class RateLimit:
             return self._refill()
 
     def due_s(self) -> float:
-        """When the next event may happen, by the monotonic clock."""
+        """When the next event may happen, by the clock."""
         with self._lock:
             return self._at_s + max(0.0, 1.0 - self._tokens) / self.rate_hz
 
     def _refill(self) -> float:
-        now_s = time.monotonic()
+        now_s = self._clock()
         self._tokens = min(self.burst, self._tokens + self.rate_hz * (now_s - self._at_s))
         self._at_s = now_s
         return self._tokens

@@ -117,10 +117,10 @@ class MarkerCloud:
         are none.
         """
 
-def look_up(cells: Array, cell_px: float, uv: Array, /) -> tuple[Array, Array]:
-    """(2, N) undistorted coordinates of pixels (N, 2), and (2, 2, N) Jacobians of pixels by coordinates.
+def look_up(cells: Array, cell_px: float, uv: Array, axes: Array, angle: Array, /) -> tuple[Array, Array]:
+    """(2, N) centres of undistorted ellipses, and (2, 2, N) Jacobians of pixels by undistorted coordinates.
 
-    cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
+    uv and axes (N, 2), angle (N,); axes may be NaN. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
     """
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:

@@ -11,7 +11,8 @@ from calib.live.session_progress import SessionProgress
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
-from calib.wand.result import WandCalibration, WandReport
+from calib.wand.report import WandReport
+from calib.wand.result import WandCalibration
 from camera_node.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed

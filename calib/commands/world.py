@@ -16,8 +16,8 @@ from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
 from calib.world.alignment import align_to_roundels, name_markers
-from calib.world.landmarks import find_still_roundels
 from calib.world.resection import place_by_points
+from calib.world.still_roundels import find_still_roundels
 from calib.world.survey import read_positions
 from calib.world.world_frame import align_cameras, check_above, is_collinear
 from camera_node.arrays import Array

@@ -16,7 +16,7 @@ from calib.rig.camera import Camera, pixel_jacobians, transform
 from camera_node.arrays import Array, Index
 from camera_node.geometry.pose import invert, skew
 
-FLOOR_PX = 0.08  # `sigma_floor_px` of fusion's limits; a test compares them
+FLOOR_PX = 0.05  # `sigma_floor_px` of fusion's limits; a test compares them
 MIN_MARKERS = 3  # from which the orientation of a robot is determined by its markers' positions
 TINY_PX = 1e-3  # keeps covariances regular
 REGULAR_M = (

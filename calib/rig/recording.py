@@ -15,7 +15,7 @@ from typing import cast
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
-from mcap.writer import Writer
+from mcap.writer import IndexType, Writer
 
 from calib.rig.history import History
 from calib.rig.recording_repair import repair_recording
@@ -24,7 +24,7 @@ from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 
 MAGIC = 8  # bytes at the start of every MCAP file
 MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
-MAX_LOST = 1 / 64  # of the file, between these: the writer's index, 2 kB a chunk, grows ever more slowly
+MAX_LOST = 1 / 64  # of the file, between these: the writer remembers each chunk
 
 
 class RecordingWriter:
@@ -56,7 +56,8 @@ class RecordingWriter:
             raise ConfigError(f"{self.path} exists; give another name, or --force to replace it") from None
         except OSError as error:
             raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
-        self._writer = Writer(self._file, chunk_size=MAX_CHUNK)
+        # An index of each channel in each chunk would take up to 0.1 kB of memory for each of them until the end.
+        self._writer = Writer(self._file, chunk_size=MAX_CHUNK, index_types=IndexType.CHUNK)
         self._writer.start(profile="roundel", library="roundel")
         return self
 

@@ -25,7 +25,7 @@ from calib.wand.bundle_adjustment.problem import (
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, add_background, build_problem
 from calib.wand.quality.checks import check_agreement, check_clocks, check_lenses, check_sizes, check_spacing
 from calib.wand.quality.held_out import triangulated_residuals
-from calib.wand.result import Validation
+from calib.wand.report import Validation
 from calib.wand.trajectory import acceleration_density
 from camera_node.arrays import Array, Mask
 
@@ -189,4 +189,4 @@ def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
     """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
     first = adjust(fine.problem, fine.observations, fine.state, rounds=1)
     problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
-    return Solution(adjust(problem, fine.observations, first.state), fine.observations)
+    return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)

@@ -25,7 +25,8 @@ from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO,
 from calib.wand.labeling.labels import WandRecording
 from calib.wand.quality.checks import check_motion
 from calib.wand.quality.exchanges import FoundExchanges, find_exchanges
-from calib.wand.result import NOT_RECORDED, Exchange, WandCalibration
+from calib.wand.report import NOT_RECORDED, Exchange
+from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance
 from calib.wand.synchrony import label_by_timing
 from camera_node.arrays import Index
@@ -61,11 +62,27 @@ def calibrate(
     Raises:
         CalibrationError: the recording or the wand does not place two cameras, or most cameras contradict each other.
     """
+    from threadpoolctl import threadpool_limits
+
     check_recording(rig, messages)
     check_cameras(rig, background, "the background points")
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
+    # The matrices are many and small: a second thread of the linear algebra only waits for the first.
+    with threadpool_limits(1, "blas"):
+        return _calibrate(rig, wand, messages, distance, synchronous, background)
+
+
+def _calibrate(
+    rig: Rig,
+    wand: Body,
+    messages: Sequence[Detections],
+    distance: Distance | None,
+    synchronous: bool,
+    background: Sequence[Detections],
+) -> WandCalibration:
+    """`calibrate` with a checked recording."""
     recording, timing = label_by_timing(rig, wand, messages, synchronous)
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]

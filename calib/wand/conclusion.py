@@ -18,7 +18,8 @@ from calib.wand.bundle_adjustment.problem import State, WandObservations
 from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lenses import find_lens_changes
-from calib.wand.result import BackgroundReport, CameraReport, Exchange, Outlier, WandCalibration, WandReport
+from calib.wand.report import BackgroundReport, CameraReport, Exchange, Outlier, WandReport
+from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
 from calib.world.world_frame import move_rig, upright_frame
 from camera_node.arrays import Array

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib.rig.camera import Camera
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.outline import RawEllipses
 from camera_node.protocol.messages import Detections
 
 MAX_CLOCK_ERROR_S = 1.0  # bound for a timestamp without a clock error: above any difference of camera clocks
@@ -26,17 +27,11 @@ COLUMNS = {
 }
 
 
-class Ellipses(Protocol):
-    """Detections with ellipses, as columns (see `WandDetections`)."""
+class Ellipses(RawEllipses, Protocol):
+    """Detections with ellipses and their cameras, as columns (see `WandDetections`)."""
 
     @property
     def camera(self) -> Index: ...
-    @property
-    def uv(self) -> Array: ...
-    @property
-    def axes_px(self) -> Array: ...
-    @property
-    def angle_rad(self) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True)

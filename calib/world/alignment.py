@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.rig.rig import Rig
-from calib.world.landmarks import find_still_roundels, locate_landmarks
+from calib.world.landmarks import locate_landmarks
+from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.arrays import Array
 from camera_node.geometry.body import Body

@@ -11,30 +11,18 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, transform
 from calib.rig.triangulation import triangulate_point
+from calib.world.still_roundels import StillRoundel, disc_centres
 from calib.world.world_frame import is_collinear
-from camera_node.arrays import Array, Mask
+from camera_node.arrays import Array
 from camera_node.geometry.pose import rigid_motions
-from camera_node.protocol.messages import Detections
 
-STILL_PX = 2.0  # radius within which a stationary roundel is detected
-MIN_PRESENCE = 0.3  # fraction of a camera's frames with the roundel
 FIT_PX = 6.0  # reprojection distance of a match: rig, survey and detection all have errors
 MERGE_M = 0.02  # distance within which triangulated points are one
 DISTANCE_SLACK = (0.02, 0.03)  # of a distance between landmarks: metres, and fraction of the distance
-
-
-@dataclass(frozen=True, slots=True)
-class StillRoundel:
-    """A stationary roundel in the image of one camera: its mean pixel (2,), and its number or -1."""
-
-    camera: str
-    uv: Array
-    id: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,34 +37,6 @@ class _Hypothesis:
     def assignment(self) -> dict[str, frozenset[int]]:
         """Identities of the roundels, of the landmarks that two cameras or more see."""
         return {name: frozenset(map(id, found)) for name, found in self.matches.items() if len(found) >= 2}
-
-
-def find_still_roundels(messages: Sequence[Detections]) -> list[StillRoundel]:
-    """Find the roundels that each camera detects at the same pixel in 30 % of its frames or more."""
-    frames: dict[str, list[tuple[Array, NDArray[np.int32]]]] = {}
-    for message in messages:
-        columns = message.unpack()
-        frames.setdefault(message.camera, []).append((columns.uv, columns.id))
-    roundels = []
-    for camera, columns in frames.items():
-        uv, ids = (np.concatenate(part) for part in zip(*columns, strict=True))
-        remaining = np.ones(len(uv), bool)
-        while remaining.any():
-            cluster = _first_cluster(uv, remaining)
-            remaining &= ~cluster
-            if cluster.sum() >= max(MIN_PRESENCE * len(columns), 1):
-                roundels.append(StillRoundel(camera, uv[cluster].mean(axis=0), int(np.median(ids[cluster]))))
-    return roundels
-
-
-def _first_cluster(uv: Array, remaining: Mask) -> Mask:
-    """(N,) the remaining pixels (N, 2) near the first one, which is always included."""
-    first = int(remaining.argmax())
-    cluster = remaining & (np.linalg.norm(uv - uv[first], axis=1) < STILL_PX)
-    centre = np.median(uv[cluster], axis=0)
-    cluster = remaining & (np.linalg.norm(uv - centre, axis=1) < STILL_PX)
-    cluster[first] = True
-    return cluster
 
 
 def locate_landmarks(
@@ -210,8 +170,9 @@ def _check_unique(hypotheses: Sequence[_Hypothesis]) -> None:
 def _triangulate(
     cameras: Mapping[str, Camera], matches: Mapping[str, Sequence[StillRoundel]]
 ) -> dict[str, Array]:
-    return {
-        name: triangulate_point([cameras[r.camera] for r in found], [r.uv for r in found])
-        for name, found in matches.items()
-        if len({r.camera for r in found}) >= 2
-    }
+    located = {}
+    for name, found in matches.items():
+        seeing = [cameras[r.camera] for r in found]
+        if len({r.camera for r in found}) >= 2:
+            located[name] = triangulate_point(seeing, disc_centres(seeing, found))
+    return located

@@ -16,7 +16,8 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, pixel_jacobians, transform
-from calib.world.landmarks import FIT_PX, StillRoundel
+from calib.world.landmarks import FIT_PX
+from calib.world.still_roundels import StillRoundel
 from calib.world.world_frame import is_collinear
 from camera_node.arrays import Array, Index
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation

@@ -14,7 +14,8 @@ from camera_node.detection.roundels import Roundels
 class Reason(IntEnum):
     """The test that a ring fails; the numbers are those of `Refusal` in native/verify/acceptance.hpp."""
 
-    NO_FIT, RATIO, CONTRAST, LEVELS, SIZE, CARD, RESIDUALS, EDGES, INSIDE, COVER, BULLSEYE = range(11)
+    NO_FIT, RATIO, CONTRAST, LEVELS, SIZE, CARD = range(6)
+    RESIDUALS, EDGES, INSIDE, COVER, BULLSEYE, PALE_INK = range(6, 12)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ def _ring(row: Array, settings: DetectorSettings, prints: tuple[float, ...]) -> 
     texts = {
         Reason.NO_FIT: "no roundel fits it: mostly not a ring",
         Reason.RATIO: f"ratio {ratio:.2f}; the prints have {wanted}",
-        Reason.CONTRAST: _faint(contrast, settings.min_contrast),
+        Reason.CONTRAST: f"contrast {contrast:.0f}; {settings.min_contrast:g} grey levels are needed",
         Reason.LEVELS: "levels out of the camera's range: clipped",
         Reason.SIZE: f"{major:.1f} px; {sizes} are allowed",
         Reason.CARD: "no white around the ring",
@@ -73,14 +74,9 @@ def _ring(row: Array, settings: DetectorSettings, prints: tuple[float, ...]) -> 
         Reason.INSIDE: "ring or hole are not of one level: text, several rings or glare",
         Reason.COVER: "a part is covered or missing, and the rest does not suffice",
         Reason.BULLSEYE: "further rings around it",
+        Reason.PALE_INK: f"thin and pale (contrast {contrast:.0f}): it may be a thinner, black ring",
     }
     kind = Reason(int(reason))
     return RefusedRing(
         np.array([u, v]), np.array([major, minor]), angle, ratio, contrast, misfit, kind, texts[kind]
     )
-
-
-def _faint(contrast: float, least: float) -> str:
-    if contrast < least:
-        return f"contrast {contrast:.0f}; {least:g} grey levels are needed"
-    return f"contrast {contrast:.0f} of a thin ring, pale against its paper: it may be a thinner, black one"

@@ -67,7 +67,8 @@ FrameResult Detector::detect(const ImageView& image) {
     else
         mark_searched(frame);
     learn_prints(frame);
-    learn_response(frame);
+    learn_camera(frame);
+    for (TrackedFit& roundel : frame.found) bend_.claim(roundel.fit);
     return {std::move(frame.found), n_postponed_};
 }
 
@@ -219,13 +220,22 @@ void Detector::use_prints() {
     matcher_.use_prints(limits_.prints);
 }
 
-/// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
-void Detector::learn_response(const FrameState& frame) {
-    std::vector<const RoundelFit*> fits;
+/// Learns what processing, light and bent paper do to the roundels of this camera.
+void Detector::learn_camera(const FrameState& frame) {
+    std::vector<const RoundelFit*> clear;
     for (const TrackedFit& roundel : frame.found)
-        if (shows_camera(roundel.fit)) fits.push_back(&roundel.fit);
-    if (!response_.learn(fits, limits_)) return;
+        if (shows_camera(roundel.fit)) clear.push_back(&roundel.fit);
+    light_.learn(clear, frame.image);
+    learn_response(clear);
+    bend_.learn(clear);
+}
+
+/// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
+void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
+    const double exponent = response_.exponent_in_use();
+    if (!response_.learn(clear, limits_)) return;
     change_mask_.invalidate(), tracks_.forget_models();
+    light_.scale(response_.exponent_in_use() / exponent);
     if (print_ratios_) print_ratios_->forget_measurements();
 }
 
@@ -274,9 +284,9 @@ std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    return explain_refusals(linear,
-                            {limits_, noise_level(linear), response_.edge_noise(), response_.shading_sigma(),
-                             response_.curvature_sigma(), response_.correlation()});
+    return explain_refusals(
+        linear, {limits_, light_, noise_level(linear), response_.edge_noise(), response_.curvature_sigma(),
+                 response_.correlation(), &response_.remainder()});
 }
 
 std::optional<double> Detector::theta() const {
@@ -297,7 +307,7 @@ std::optional<double> Detector::tone_exponent() const {
 void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
-    tracks_ = from.tracks_, response_ = from.response_;
+    tracks_ = from.tracks_, response_ = from.response_, bend_ = from.bend_, light_ = from.light_;
     if (print_ratios_ && from.print_ratios_) print_ratios_ = from.print_ratios_, use_prints();
     if (paper_ && from.paper_) paper_ = from.paper_;
 }

@@ -15,6 +15,8 @@
 #include "search/suppression.hpp"
 #include "tracks.hpp"
 #include "verify/camera_response.hpp"
+#include "verify/light_falloff.hpp"
+#include "verify/paper_bend.hpp"
 #include "verify/print_ratios.hpp"
 
 namespace roundel {
@@ -79,17 +81,19 @@ class Detector {
     bool explore();
     void learn_prints(const FrameState& frame);
     void use_prints();
-    void learn_response(const FrameState& frame);
+    void learn_camera(const FrameState& frame);
+    void learn_response(const std::vector<const RoundelFit*>& clear);
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const {
         return {frame.limits,
+                light_,
                 frame.noise,
                 response_.edge_noise(),
-                response_.shading_sigma(),
                 response_.curvature_sigma(),
-                response_.correlation()};
+                response_.correlation(),
+                &response_.remainder()};
     }
 
     RoundelLimits limits_, any_limits_;
@@ -99,6 +103,8 @@ class Detector {
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
     CameraResponse response_;
+    LightFalloff light_;
+    PaperBend bend_;
     Tracks tracks_;
     ChangeMask change_mask_;
     double searched_to_ = 0;  // share of the height, of the bands searched in turns

@@ -35,10 +35,12 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
                                   const AcceptanceContext& context) {
     const RefusedRing seen{guess.outer, guess.ratio, guess.bright - guess.dark, 0, Refusal::kNoFit};
     InitialGuess start = guess;
-    start.shading_sigma = context.shading_sigma;
+    start.light = context.light.at(guess.outer.x, guess.outer.y), start.tone = context.tone;
     if (const auto accepted = fit_roundel(image, start, context, false)) {
-        if (!is_bullseye(image, *accepted, kRingDepth)) return std::nullopt;
-        return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0, Refusal::kBullseye};
+        const bool bullseye = is_bullseye(image, *accepted, kRingDepth);
+        if (!bullseye && has_black_ink(*accepted)) return std::nullopt;
+        return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0,
+                           bullseye ? Refusal::kBullseye : Refusal::kPaleInk};
     }
     const auto fit = fit_photometric(image, start);  // without a prior on the print
     if (!fit) return seen;

@@ -12,7 +12,7 @@ import time
 
 M_ARENA_MAX = -8  # of mallopt(3)
 MAX_ARENAS = 2
-PERIOD_S = 30.0  # between two returns, each of which takes 0.2 to 2 ms on a thread without the GIL
+PERIOD_S = 10.0  # between two returns, each of which takes 0.2 to 3 ms on a thread without the GIL
 
 
 def return_freed_memory(period_s: float = PERIOD_S) -> None:

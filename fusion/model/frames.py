@@ -4,6 +4,8 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from calib.rig.camera import Camera
 from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
@@ -20,7 +22,7 @@ class CalibratedFrame:
 
     Attributes:
         t_ns: capture time including the calibrated offset of the camera.
-        xy: (2, N) undistorted centres; NaN where the lens has no inverse.
+        xy: (2, N) centres of the undistorted outlines; NaN where the lens has no inverse.
         scale: (2, 2, N) Jacobians of raw pixels with respect to `xy`.
         stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
@@ -64,16 +66,18 @@ class CalibratedFrame:
         cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        return cls(name, t_ns, roundels, *undistort(lens, roundels.uv), **timing)
+        return cls(name, t_ns, roundels, *undistort(lens, roundels), **timing)
 
     def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
         """The frame by another calibration of its camera."""
         shift_ns = round((new.time_offset_ms - old.time_offset_ms) * 1e6)
-        xy, scale = undistort(new, self.roundels.uv)
+        xy, scale = undistort(new, self.roundels)
         return replace(self, t_ns=self.t_ns + shift_ns, xy=xy, scale=scale)
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""
+        if not self.readout_s:
+            return np.zeros(len(self.roundels))
         return self.readout_s * lens.image_row(self.roundels.uv)
 
 

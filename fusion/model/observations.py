@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.arrays import Array, Index
+from camera_node.geometry.outline import half_axes_of
 from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
 from fusion.model.frames import FrameSet
@@ -66,9 +67,7 @@ class DetectionTable:
 
         The lens is taken as affine over an outline.
         """
-        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        axes = np.array([[c, -s], [s, c]]) * self.axes_px / 2  # half axes, pixels
-        half = np.linalg.solve(self.scale.transpose(2, 0, 1), axes.transpose(2, 0, 1))
+        half = np.linalg.solve(self.scale.transpose(2, 0, 1), half_axes_of(self.axes_px.T, self.angle_rad))
         m = np.column_stack([*self.xy, np.ones(len(self))])
         dual = m[:, :, None] * m[:, None]
         dual[:, :2, :2] -= half @ half.transpose(0, 2, 1)

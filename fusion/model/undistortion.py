@@ -14,6 +14,7 @@ import numpy as np
 
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.outline import RawEllipses, centre_shifts, half_axes_of
 from fusion import _core
 
 CELL_PX, FINE_CELL_PX = 32, 16
@@ -37,21 +38,35 @@ NODES = np.cos(np.pi * (np.arange(4) + 0.5) / 4)  # Chebyshev nodes of the four 
 CHECKED = np.array([-1.0, 0.0, 1.0])  # where a cubic fitted at the nodes has its largest errors
 
 
-def undistort(lens: Lens, uv: Array) -> tuple[Array, Array]:
-    """Undistort raw pixels.
+def undistort(lens: Lens, ellipses: RawEllipses) -> tuple[Array, Array]:
+    """Undistort N detected ellipses.
 
     Args:
         lens: lens model of the camera.
-        uv: (N, 2) raw pixels.
+        ellipses: in raw pixels.
 
     Returns:
-        xy: (2, N), within `TOLERANCE_PX` of `Lens.normalise`; NaN where the lens has no inverse.
-        scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
+        xy: (2, N) centres of the undistorted ellipses (`camera_node.geometry.outline`), within `TOLERANCE_PX` of those
+            by `Lens.normalise`; the undistorted centres where axes are unknown, NaN where the lens has no inverse.
+        scale: (2, 2, N) Jacobians of raw pixels with respect to undistorted coordinates at the detected centres.
     """
-    xy, scale = table_of(lens).look_up(uv)
-    left = np.isnan(xy[0])
-    if left.any():
-        xy[:, left], scale[..., left] = _undistort_exactly(lens, uv[left])
+    xy, scale = table_of(lens).look_up(ellipses)
+    left = np.flatnonzero(np.isnan(xy[0]))
+    if len(left):
+        half_axes = half_axes_of(ellipses.axes_px[left], ellipses.angle_rad[left])
+        xy[:, left], scale[..., left] = undistort_exactly(lens, ellipses.uv[left], half_axes)
+    return xy, scale
+
+
+@np.errstate(all="ignore")  # as in `centre_shifts`
+def undistort_exactly(lens: Lens, uv: Array, half_axes: Array) -> tuple[Array, Array]:
+    """As `undistort`, from the lens model, for ellipses with centres (N, 2) and half axes (N, 2, 2), pixels."""
+    xy, scale = _undistort_points(lens, uv)
+    known = np.flatnonzero(np.isfinite(xy[0]))
+    if len(known):
+        inverse = np.linalg.inv(scale.transpose(2, 0, 1)[known])
+        shifts = centre_shifts(lens, xy.T[known], inverse @ half_axes[known])
+        xy[:, known] -= np.einsum("nij,nj->in", inverse, shifts)  # to second order, the inverse lens's
     return xy, scale
 
 
@@ -90,9 +105,10 @@ class UndistortionTable:
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
 
-    def look_up(self, uv: Array) -> tuple[Array, Array]:
-        """(2, N) undistorted coordinates of pixels (N, 2) and their (2, 2, N) Jacobians; NaN in empty cells."""
-        return _core.look_up(self.coefficients, self.cell_px, np.ascontiguousarray(uv))
+    def look_up(self, ellipses: RawEllipses) -> tuple[Array, Array]:
+        """See `undistort`; NaN in empty cells."""
+        columns = ellipses.uv, ellipses.axes_px, ellipses.angle_rad
+        return _core.look_up(self.coefficients, self.cell_px, *map(np.ascontiguousarray, columns))
 
 
 def _monomials(st: Array) -> Array:
@@ -141,7 +157,7 @@ def _samples(lens: Lens, cell_px: int, side: Array) -> tuple[Array, Mask]:
     u = ((np.arange(columns)[:, None] + (s + 1) / 2) * cell_px - 0.5)[None]
     v = ((np.arange(rows)[:, None] + (t + 1) / 2) * cell_px - 0.5)[:, None]
     uv = np.stack(np.broadcast_arrays(u, v), -1)
-    xy, scale = _undistort_exactly(lens, uv.reshape(-1, 2))
+    xy, scale = _undistort_points(lens, uv.reshape(-1, 2))
     values = np.concatenate([xy, scale.reshape(4, -1)]).T.reshape(*uv.shape[:3], 6)
     return values, np.isfinite(values.sum((2, 3)))
 
@@ -158,7 +174,7 @@ def _is_accurate(fitted: Array, lens: Lens, cell_px: int) -> Mask:
     return known & near & (np.abs(off_scale).max((2, 3, 4)) < TOLERANCE_SCALE)
 
 
-def _undistort_exactly(lens: Lens, uv: Array) -> tuple[Array, Array]:
+def _undistort_points(lens: Lens, uv: Array) -> tuple[Array, Array]:
     """(2, N) coordinates and (2, 2, N) Jacobians of pixels (N, 2), from the lens model."""
     xy = lens.normalise(uv)
     scale = lens.project_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))[1][:, :, :2]

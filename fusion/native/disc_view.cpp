@@ -19,11 +19,11 @@ DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc) {
 }
 
 FramePoses::FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures)
-    : n_bodies_(bodies.size()), bodies_(bodies), exposures_(exposures) {
-    poses_.reserve(exposures_.size() * n_bodies_);
-    for (const Exposure& exposure : exposures_)
-        for (const Body& body : bodies) poses_.push_back(transform(body, exposure));
-}
+    : n_bodies_(bodies.size()),
+      bodies_(bodies),
+      exposures_(exposures),
+      poses_(std::make_unique_for_overwrite<BodyInCamera[]>(bodies.size() * exposures.size())),
+      is_known_(bodies.size() * exposures.size()) {}
 
 Exposure FramePoses::exposure(const Discs& discs, size_t k) const {
     Exposure row = exposures_[discs.frame[k]];

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <limits>
+#include <memory>
 #include <vector>
 
 #include "columns.hpp"
@@ -54,14 +55,19 @@ struct DiscView {
 };
 DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc);
 
-/// The poses of all bodies at the capture times of all exposures.
+/// The poses of all bodies at the capture times of all exposures, each computed when it is first needed: by
+/// one thread at a time.
 class FramePoses {
   public:
     FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures);
 
     size_t n_bodies() const { return n_bodies_; }
     const std::vector<Exposure>& exposures() const { return exposures_; }
-    const BodyInCamera& at(size_t frame, size_t body) const { return poses_[frame * n_bodies_ + body]; }
+    const BodyInCamera& at(size_t frame, size_t body) const {
+        const size_t k = frame * n_bodies_ + body;
+        if (!is_known_[k]) poses_[k] = transform(bodies_[body], exposures_[frame]), is_known_[k] = true;
+        return poses_[k];
+    }
     /// The pose of the body of disc `k` when its image was captured.
     BodyInCamera at(const struct Discs& discs, size_t k) const;
     /// The exposure of the row of disc `k`.
@@ -71,7 +77,8 @@ class FramePoses {
     size_t n_bodies_;
     std::vector<Body> bodies_;
     std::vector<Exposure> exposures_;
-    std::vector<BodyInCamera> poses_;
+    std::unique_ptr<BodyInCamera[]> poses_;  // not initialized, unlike those of a vector
+    mutable std::vector<char> is_known_;
 };
 
 /// N discs, each in one frame and on one body. `position` and the unit `normal` are in the frame of the body;

@@ -17,8 +17,16 @@ struct InverseLens {
     const double* cell(double column, double row) const;
 };
 
-/// Undistorts N pixels (pairs u, v): writes 2 x N coordinates, and 4 x N Jacobians of raw pixels with respect
-/// to them.
-void look_up(const InverseLens& lens, const double* uv, size_t n, double* xy, double* scale);
+/// Detected ellipses, raw pixels: centres (pairs u, v), full axes (pairs) and directions of the first axis;
+/// NaN where the axes are unknown.
+struct Outlines {
+    const double *uv, *axes, *angle;
+    size_t count;
+};
+
+/// Undistorts N ellipses: writes 2 x N centres of the undistorted ellipses (the undistorted centres where the
+/// axes are unknown), and 4 x N Jacobians of raw pixels with respect to undistorted coordinates at the
+/// detected centres.
+void look_up(const InverseLens& lens, const Outlines& seen, double* xy, double* scale);
 
 }  // namespace roundel::fusion

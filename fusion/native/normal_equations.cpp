@@ -2,6 +2,8 @@
 #include "normal_equations.hpp"
 
 #include <algorithm>
+#include <numeric>
+#include <span>
 #include <stdexcept>
 
 #include "../../camera_node/native/numeric/cholesky.hpp"
@@ -10,8 +12,8 @@
 namespace roundel::fusion {
 namespace {
 
-constexpr int kMaxReweightings = 4;  // for one linearization; two are usual
-constexpr double kConverged = 0.1;   // largest change of a weight at convergence
+constexpr int kMaxReweightings = 4;  // for one linearization; one is usual
+constexpr double kConverged = 0.1;   // changes of weights below this are not applied
 
 /// The equations of one body with their weights, and the sums of its prior and its equations.
 struct BodySums {
@@ -54,15 +56,14 @@ double residual(const double* row, const double* step) {
     return row[kErrors] - ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3]));
 }
 
-/// Computes the weights at a step; returns the largest change.
-double update_weights(BodySums& sums, const ErrorVector& step) {
+/// Computes the weights at a step; returns their largest change.
+double reconsider(const BodySums& sums, const ErrorVector& step, std::vector<double>& weights) {
     double change = 0;
     for (size_t k = 0; k < sums.equations.size(); ++k) {
         const auto& A = sums.equations[k].A;
         const double x = residual(A[0], step.data()), y = residual(A[1], step.data());
-        const double weight = 1 / (kNominalWeight * (1 + (x * x + y * y) / (kCauchy * kCauchy)));
-        change = std::max(change, std::abs(weight - sums.weights[k]));
-        sums.weights[k] = weight;
+        weights[k] = 1 / (kNominalWeight * (1 + (x * x + y * y) / (kCauchy * kCauchy)));
+        change = std::max(change, std::abs(weights[k] - sums.weights[k]));
     }
     return change;
 }
@@ -71,28 +72,39 @@ double update_weights(BodySums& sums, const ErrorVector& step) {
 void reweigh_body(BodySums& sums) {
     const ErrorMatrix H = sums.H;
     const ErrorVector g = sums.g;
-    double change = 1;
-    for (int round = 0; round <= kMaxReweightings; ++round) {
+    std::vector<double> weights(sums.weights.size());
+    add(sums);
+    for (int round = 0; round < kMaxReweightings; ++round) {
+        const double change = reconsider(sums, solve(sums.H, sums.g), weights);
+        if (round > 0 && change < kConverged) break;  // the next linearization continues, if there is one
+        std::swap(sums.weights, weights);
         sums.H = H, sums.g = g;
         add(sums);
-        if (round == kMaxReweightings || change < kConverged) break;
-        change = update_weights(sums, solve(sums.H, sums.g));
     }
     for (int i = 0; i < kErrors; ++i)
         for (int j = 0; j < i; ++j) sums.H[j][i] = sums.H[i][j];
 }
 
-std::vector<std::vector<size_t>> indices_by_body(const EquationSystem& system) {
-    std::vector<std::vector<size_t>> of_body(system.n_bodies);
-    for (size_t k = 0; k < system.n_equations; ++k) of_body[system.body[k]].push_back(k);
-    return of_body;
-}
+/// The indices of the equations in the order of their bodies: those of body b are from `first[b]` to `first[b
+/// + 1]`.
+struct ByBody {
+    std::vector<size_t> first, indices;
+
+    explicit ByBody(const EquationSystem& system) : first(system.n_bodies + 1), indices(system.n_equations) {
+        for (size_t k = 0; k < system.n_equations; ++k) ++first[system.body[k] + 1];
+        std::partial_sum(first.begin(), first.end(), first.begin());
+        std::vector<size_t> next = first;
+        for (size_t k = 0; k < system.n_equations; ++k) indices[next[system.body[k]]++] = k;
+    }
+};
 
 }  // namespace
 
 void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, double* weights) {
     BodySums sums;
-    for (const auto& indices : indices_by_body(system)) {
+    const ByBody of(system);
+    for (size_t b = 0; b < system.n_bodies; ++b) {
+        const std::span indices(of.indices.data() + of.first[b], of.first[b + 1] - of.first[b]);
         sums.equations.clear(), sums.weights.clear();
         for (const size_t k : indices)
             sums.equations.push_back(system.equations[k]), sums.weights.push_back(weights[k]);

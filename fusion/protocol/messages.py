@@ -264,7 +264,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     unassigned: int  # the other ones
     late: int  # frames dropped since the start because they arrived too late
     calibrated: bool
-    excluded: bool = False  # the camera was moved: its detections are excluded until it is recalibrated
+    excluded: bool = False  # the camera was moved: in the last second its detections were not used
     frozen: bool = False  # the camera repeats an old image: excluded until it delivers new ones
     duplicate_publisher: bool = False  # two nodes publish under its name
     faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason

@@ -31,7 +31,7 @@ Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
 MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
 MAX_QUEUED_BYTES = 1 << 28
-MAX_KEYS = 4096
+MAX_KEYS, MAX_KEY = 1024, 200  # the channels of a recording; characters of a key
 WAIT_S = 0.1
 REQUEST_S = (
     1.0  # the timeout of a request for the rig or the robots, and the longest pause until the next one
@@ -141,8 +141,11 @@ class ArenaRecorder:
 
     def _enqueue(self, sample: zenoh.Sample) -> None:
         """Queue a message; called from Zenoh's threads."""
-        size = len(sample.payload)
+        size, key = len(sample.payload), str(sample.key_expr)
         with self._lock:
+            if len(key) > MAX_KEY:
+                self.lost[f"messages on keys of more than {MAX_KEY} characters"] += 1
+                return
             if size > MAX_MESSAGE_BYTES:
                 self.lost[f"messages of more than {MAX_MESSAGE_BYTES} bytes"] += 1
                 return
@@ -150,7 +153,7 @@ class ArenaRecorder:
                 self.lost["messages that the disk was too slow for"] += 1
                 return
             self._queued_bytes += size
-            self._received.put_nowait((str(sample.key_expr), sample.payload.to_bytes(), time.time_ns()))
+            self._received.put_nowait((key, sample.payload.to_bytes(), time.time_ns()))
 
     def _write_next(self, timeout_s: float) -> None:
         try:

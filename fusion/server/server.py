@@ -192,18 +192,16 @@ class Server:
     def _report_correction(self, correction: ExtrinsicsCorrection) -> None:
         """Log a moved camera; publish the rig once the camera is recalibrated, by the leading shard."""
         if correction.camera is None:
-            moved = "camera %s was moved: excluded until robots show its new pose"
-            log.warning(moved, correction.name, extra=about(correction.name))
+            self.statistics.note_moved(correction.name)
             return
         self.pipeline.correct_rig(correction, self.clock.now_ns())
         if self.pipeline.active_rig.message is not None:
             self._publisher.publish_rig(self.pipeline.active_rig.message)
         if correction.has_returned:
-            log.warning("camera %s is back at an earlier pose, and used again", correction.name)
+            change = "camera %s is back at an earlier pose, and used again"
         else:
-            log.warning(
-                "camera %s is recalibrated and used again; roundel undo reverts that", correction.name
-            )
+            change = "camera %s is recalibrated and used again; roundel undo reverts that"
+        log.warning(change, correction.name, extra=about(correction.name))
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""

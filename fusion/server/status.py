@@ -63,6 +63,7 @@ class _CameraCounts:
     )
     is_late: bool = False
     has_two_publishers: bool = False
+    was_excluded: bool = False  # at some time since the last status
     lateness_ms: list[float] = field(default_factory=list)
     assigned: int = 0
     unassigned: int = 0
@@ -117,6 +118,13 @@ class ServerStatistics:
         """List a camera no more, once it is silent: it has another name, or was forgotten."""
         if name in self._cameras:
             self._cameras[name].is_retired = True
+
+    def note_moved(self, name: str) -> None:
+        """Log that a camera was moved and is excluded; the next status shows it, however soon it is used again."""
+        moved = "camera %s was moved: excluded until robots show its new pose"
+        log.warning(moved, name, extra=self._about(name))
+        if name in self._cameras:
+            self._cameras[name].was_excluded = True
 
     def note_publishers(self, name: str, has_two_publishers: bool) -> None:
         """Log once that two nodes publish under a camera's name."""
@@ -195,6 +203,7 @@ class ServerStatistics:
             camera.lateness_ms.clear()
             camera.assigned = camera.unassigned = 0
             camera.squared_px = 0.0
+            camera.was_excluded = False
 
     def _find_silent_cameras(self, now_ns: int) -> None:
         silent = {n: c for n, c in self._cameras.items() if now_ns - c.last_ns > SILENT_S * 1e9}
@@ -238,7 +247,7 @@ def _camera_health(
         unassigned=camera.unassigned,
         late=camera.late,
         calibrated=name in pipeline.calibrated,
-        excluded=name in pipeline.excluded,
+        excluded=camera.was_excluded or name in pipeline.excluded,
         frozen=name in pipeline.frozen,
         duplicate_publisher=camera.has_two_publishers,
         faults=dict(camera.faults),

@@ -114,11 +114,12 @@ class Association:
         """All detections of the frame set, and its assignments in the order of the detections."""
         detections = DetectionTable.of(frame_set, self.cameras, self.floor_px)
         first = dict(zip(map(id, frame_set.frames), _first_rows(frame_set.frames).tolist(), strict=True))
-        rows = [part.rows(first) for part in self.parts]
-        detection = np.concatenate([np.empty(0, np.intp), *rows])
-        marker = np.concatenate([np.empty(0, np.intp), *(part.marker for part in self.parts)])
-        order = np.argsort(detection)[np.count_nonzero(detection < 0) :]
-        return detections, Assignments.of(detection[order], marker[order])
+        marker_of = np.full(len(detections), -1)
+        for part in self.parts:
+            rows = part.rows(first)
+            marker_of[rows[rows >= 0]] = part.marker[rows >= 0]
+        detection = np.flatnonzero(marker_of >= 0)
+        return detections, Assignments.of(detection, marker_of[detection])
 
     def _assign(self, detections: DetectionTable) -> tuple[Index, Index]:
         """Rows of the detections and of the marker table."""

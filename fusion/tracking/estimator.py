@@ -9,6 +9,7 @@ them (Cauchy). See docs/fusion_filter.md.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -62,6 +63,21 @@ class _Problem:
     bodies: Index
     prior: Array
 
+    def select(self, rows: Mask) -> tuple["_Problem", Mask]:
+        """The problem of some of the K bodies, and which of the equations belong to it."""
+        is_chosen = np.zeros(int(self.bodies[-1]) + 1, bool)
+        is_chosen[self.bodies[rows]] = True
+        mine = is_chosen[self.observations.discs.body]
+        is_shaped = np.zeros(len(mine), bool)
+        is_shaped[self.shaped] = True
+        part = _Problem(
+            self.observations.select(mine),
+            np.flatnonzero(is_shaped[mine]),
+            self.bodies[rows],
+            self.prior[rows],
+        )
+        return part, np.concatenate([mine, mine[self.shaped]])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
@@ -80,6 +96,14 @@ class _Solution:
     information: Array
     weights: Array
     residuals: Array
+
+    def updated(self, bodies: Mask, equations: Mask, part: "_Solution") -> "_Solution":
+        """With another iteration of some of the K bodies, which have these equations; the others have no step."""
+        step, information = np.zeros_like(self.step), self.information.copy()
+        weights, residuals = self.weights.copy(), self.residuals.copy()
+        step[bodies], information[bodies] = part.step, part.information
+        weights[equations], residuals[:, equations] = part.weights, part.residuals
+        return _Solution(part.delta, step, information, weights, residuals)
 
 
 class Estimator:
@@ -111,7 +135,7 @@ class Estimator:
         Args:
             prediction: the bodies before the update.
             observations: of this frame set.
-            small: rad and m; a larger correction is followed by another linearization.
+            small: rad and m; a body with a larger correction is linearized again.
 
         Returns:
             the states, and the residuals (2, N) in pixels, NaN where the disc is not visible.
@@ -127,10 +151,13 @@ class Estimator:
         problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
         solution = self._solve(problem, states, np.zeros((n, 12)))
         for _ in range(MAX_ITERATIONS - 1):
-            if np.max(np.abs(solution.step[:, :6])) < small:
+            moved = np.abs(solution.step[:, :6]).max(1) >= small
+            if not moved.any():
                 break
+            part, equations = problem.select(moved)
             at = states.retract(solution.delta)
-            solution = self._solve(problem, at, solution.delta, solution.weights)
+            again = self._solve(part, at, solution.delta, solution.weights[equations])
+            solution = solution.updated(moved, equations, again)
         P = states.P.copy()
         P[bodies] = _core.inverses(solution.information)
         if self.single.any():
@@ -159,13 +186,18 @@ class Estimator:
     def _solve(
         self, problem: _Problem, at: States, delta: Array, weights: Array | None = None
     ) -> "_Solution":
-        """Linearize once about `at`, which is displaced from the prediction by `delta`; weigh and eliminate."""
+        """Linearize once about `at`, which is displaced from the prediction by `delta`; weigh and eliminate.
+
+        Without `weights` it is the first iteration, which is about the prediction.
+        """
         row = np.cumsum(np.bincount(problem.bodies, minlength=len(at))) - 1
         of_disc = problem.observations.discs.body
         body = row[np.concatenate([of_disc, of_disc[problem.shaped]])]
         equations = self._linearize(at, problem)
-        right = -(problem.prior @ delta[problem.bodies, :, None])[:, :, 0]
-        weights = np.ones(len(equations)) if weights is None else weights
+        if weights is None:
+            right, weights = np.zeros((len(problem.bodies), 12)), np.ones(len(equations))
+        else:
+            right = -(problem.prior @ delta[problem.bodies, :, None])[:, :, 0]
         information, right, weights = _core.reweigh(equations, body, problem.prior, right, weights)
         step = _eliminate(information, right)
         delta = delta.copy()
@@ -256,11 +288,19 @@ def _sheared(axes_px: Array, angle_rad: Array, B: Array) -> tuple[Array, Array]:
 
 def _eliminate(information: Array, right: Array) -> Array:
     """(K, 12) corrections of K bodies by one elimination."""
-    graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    graph = gtsam.GaussianFactorGraph()
     for k, (H, g) in enumerate(zip(information, right, strict=True)):
         graph.push_back(gtsam.HessianFactor(k, H, g, 0.0))
+    return graph.eliminateSequential(_ordering(len(right))).optimize().vector().reshape(-1, 12)
+
+
+@lru_cache(maxsize=64)
+def _ordering(n: int) -> gtsam.Ordering:
+    """The keys 0 to n - 1."""
+    ordering = gtsam.Ordering()
+    for k in range(n):
         ordering.push_back(k)
-    return graph.eliminateSequential(ordering).optimize().vector().reshape(-1, 12)
+    return ordering
 
 
 def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:

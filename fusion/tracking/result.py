@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
-from fusion.model.states import States
+from fusion.model.states import POSITION, States
 from fusion.protocol.messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.grouping.multiview import Marker
@@ -43,6 +44,8 @@ class ObservationSummary:
         n_markers: (R,) observed markers.
         mean_px2: (R, C) mean squared residual by robot and camera; NaN without observations.
         residual_px: (R,) RMS over all cameras; NaN without observations.
+        common_error: (R,) standard deviation of a position, where the calibration's error is common to the markers in a
+            view, over the filter's, to which it is independent; see `claimed_covariances`.
     """
 
     robot_cameras: Mask
@@ -50,6 +53,7 @@ class ObservationSummary:
     n_markers: Index
     mean_px2: Array
     residual_px: Array
+    common_error: Array
 
     @classmethod
     def of(
@@ -59,8 +63,9 @@ class ObservationSummary:
         n_robots: int,
         detections: DetectionTable,
         assignments: Assignments,
+        floor_px: float,
     ) -> "ObservationSummary":
-        """Summarize the assignments of a frame set."""
+        """Summarize the assignments of a frame set; `floor_px` is the part of the noise that calibration causes."""
         n_cameras = len(cameras.names)
         robot, camera = marker_table.robot[assignments.marker], detections.camera[assignments.detection]
         marker_cameras = np.zeros((len(marker_table), n_cameras), bool)
@@ -70,7 +75,10 @@ class ObservationSummary:
         squared_px2 = np.bincount(view, assignments.squared_px, n_robots * n_cameras).reshape(shape)
         mean_px2, mean = _ratio(squared_px2, count), _ratio(squared_px2.sum(1), count.sum(1))
         n_markers = np.bincount(marker_table.robot[marker_cameras.any(1)], minlength=n_robots)
-        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean))
+        cov = detections.cov[:, :, assignments.detection]
+        share = 2 * floor_px**2 / (cov[0, 0] + cov[1, 1])
+        added = np.bincount(robot, (count.ravel()[view] - 1) * share, n_robots) / np.maximum(count.sum(1), 1)
+        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean), np.sqrt(1 + added))
 
 
 def _ratio(sums: NDArray, count: Index) -> Array:
@@ -134,6 +142,17 @@ def latency_of(frame_set: FrameSet, begun_ns: int, done_ns: int) -> Latency | No
     )
 
 
+def claimed_covariances(states: States, summary: ObservationSummary) -> Array:
+    """(R, 12, 12) the filter's covariances with the calibration's error in the positions.
+
+    That error is the same for all markers of a robot in a view, but the filter averages it over them: of n markers it
+    counts an nth.
+    """
+    size = np.ones((len(states), 12))
+    size[:, POSITION] = summary.common_error[:, None]
+    return states.P * size[:, :, None] * size[:, None]
+
+
 def robot_poses(
     table: TrackTable, cameras: CameraArray, t_ns: int, summary: ObservationSummary, rows: list[int]
 ) -> dict[int, RobotPose]:
@@ -141,19 +160,19 @@ def robot_poses(
     if not rows:
         return {}
     states, names, status = table.states, cameras.names, table.status
-    p, v, omega = states.p.tolist(), states.v.tolist(), states.omega.tolist()
-    wxyz, residual = wxyz_from_rotation(states.R).tolist(), summary.residual_px.tolist()
-    P, markers = states.P.astype("<f4").tobytes(), summary.n_markers.tolist()
+    p, v, omega = _tuples(states.p), _tuples(states.v), _tuples(states.omega)
+    wxyz, residual = _tuples(wxyz_from_rotation(states.R)), summary.residual_px.tolist()
+    P, markers = claimed_covariances(states, summary).astype("<f4").tobytes(), summary.n_markers.tolist()
     owned, seen_by = table.owned.tolist(), summary.robot_cameras.tolist()
     return {
         k: RobotPose(
             robot=table.names[k],
             t_ns=t_ns,
             state=state,
-            position=tuple(p[k]),
-            quaternion_wxyz=tuple(wxyz[k]),
-            velocity=tuple(v[k]),
-            angular_velocity=tuple(omega[k]),
+            position=p[k],
+            quaternion_wxyz=wxyz[k],
+            velocity=v[k],
+            angular_velocity=omega[k],
             covariance=P[576 * k : 576 * (k + 1)],
             n_markers=markers[k],
             cameras=tuple(compress(names, seen_by[k])),
@@ -162,6 +181,11 @@ def robot_poses(
         for k in rows
         if owned[k] and (state := status[k]) is not None
     }
+
+
+def _tuples(rows: Array) -> list[tuple[Any, ...]]:
+    """The rows of an array (N, M)."""
+    return list(map(tuple, rows.tolist()))
 
 
 def markers_message(

@@ -17,7 +17,7 @@ from camera_node.arrays import Array, Mask
 from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
-from fusion.tracking.result import TrackingResult
+from fusion.tracking.result import TrackingResult, claimed_covariances
 
 
 class Smoother:
@@ -51,7 +51,7 @@ class Smoother:
         ]
 
     def _with_states(self, result: TrackingResult, states: States) -> TrackingResult:
-        wxyz = wxyz_from_rotation(states.R)
+        wxyz, P = wxyz_from_rotation(states.R), claimed_covariances(states, result.summary)
         poses = tuple(
             msgspec.structs.replace(
                 pose,
@@ -59,7 +59,7 @@ class Smoother:
                 quaternion_wxyz=tuple(wxyz[k].tolist()),
                 velocity=tuple(states.v[k].tolist()),
                 angular_velocity=tuple(states.omega[k].tolist()),
-                covariance=states.P[k].astype("<f4").tobytes(),
+                covariance=P[k].astype("<f4").tobytes(),
             )
             for pose in result.poses
             for k in (self._row[pose.robot],)

@@ -236,7 +236,14 @@ class Tracker:
 
     def _summarize(self, detections: DetectionTable, assignments: Assignments) -> ObservationSummary:
         table = self.table
-        return ObservationSummary.of(self.cameras, table.markers, len(table.robots), detections, assignments)
+        return ObservationSummary.of(
+            self.cameras,
+            table.markers,
+            len(table.robots),
+            detections,
+            assignments,
+            self.limits.sigma_floor_px,
+        )
 
     def _update_states(
         self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments

@@ -166,7 +166,7 @@ ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "lenses-2-%": lambda: simulated(
         WandScenario(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, SHEET)
     ),
-    "simulated-numbered": lambda: simulated(WandScenario(cameras=8, numbered=True, sized=False, seed=1), 5),
+    "simulated-numbered": lambda: simulated(WandScenario(cameras=8, numbered=True, sized=False, seed=1), 3),
     "simulated-16-numbered": lambda: simulated(WandScenario(cameras=16, numbered=True, sized=False), 5),
     "waved-led": waved_led,
     "webcams-wand": webcams_wand,

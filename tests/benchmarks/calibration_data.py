@@ -5,14 +5,17 @@ The plain adjustment is SciPy's least squares over poses and lenses of all camer
 weights, no priors, and no motion model; tracks are interpolated in time with the clocks of the rig from which it
 starts. Recordings are those of ../shared/data.
 
-- `waved-led`: root mean square residual of all images, their points triangulated by either rig, and without outliers,
-  which plain least squares fits and ours rejects.
+- `waved-led`: residuals of all images, their points triangulated by either rig: root mean square of all, and without
+  the outliers that plain least squares fits and ours rejects; and their mean, which MultiCamSelfCal reports.
+- `arena-small`: errors of the cameras' positions. Its frames are 0.3 s apart, so few points are in two cameras at once
+  and the plain adjustment has 70 of them: its residual says nothing.
 - `webcams`: two corners of the board are the wand; errors of the distances between all corners, of which most were in
   neither adjustment. `--pairs N` (6) pairs of corners at least 120 mm apart, by `--seed S` (0).
 """
 
 import argparse
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -27,12 +30,16 @@ from calib.errors import CalibrationError
 from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections
+from camera_node.sources.observations import detect_frames
 from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors, recording
 from tests.calib.mishaps import repack
+from tests.calib.synthetic import WAND, camera_errors
+from tests.truth import true_camera
 
 LENGTH_SIGMA_M = 2e-4
 MIN_WAND_M = 0.12
@@ -51,26 +58,31 @@ class Comparison:
     plain: float
 
 
+# Of one camera, by marker: true times (n,) and pixels (n, 2).
+Tracks = Mapping[int, tuple[Array, Array]]
+
+
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Images of points: (n,) camera and point, (n, 2) pixels; (l, 2) pairs of points with a known distance, metres."""
+    """Images of points: (n,) camera and point, (n, 2) pixels; (l, 2) pairs of points and (l,) their known distances,
+    metres."""
 
     camera: Index
     point: Index
     uv: Array
     pairs: Index
-    length_m: float
+    lengths: Array
 
 
-def gather_points(rig: Rig, messages: Sequence[Detections], gap_s: float, length_m: float = 0.0) -> Points:
-    """All images at the times of each frame of the camera with most frames, those of others interpolated in time."""
-    tracks = [_track(camera, name, messages) for name, camera in rig.placed().items()]
-    most = max(range(len(tracks)), key=lambda c: sum(len(t) for t, _ in tracks[c].values()))
-    times = np.unique(np.concatenate([t for t, _ in tracks[most].values()]))
-    rows, pairs, count = [], [], 0
-    for t_s in times:
+def gather_points(tracks: Sequence[Tracks], gap_s: float, wand: Body | None = None) -> Points:
+    """All images at the times of each frame of the camera with most frames, those of others interpolated in time; with
+    the distances of a `wand`, if one is given."""
+    most = max(tracks, key=lambda track: sum(len(t) for t, _ in track.values()))
+    labels = sorted({label for track in tracks for label in track})
+    rows, pairs, lengths, count = [], [], [], 0
+    for t_s in np.unique(np.concatenate([t for t, _ in most.values()])):
         found = {}
-        for label in sorted({label for track in tracks for label in track}):
+        for label in labels:
             images = [
                 (c, uv) for c, track in enumerate(tracks) if (uv := _at(track, label, t_s, gap_s)) is not None
             ]
@@ -78,15 +90,21 @@ def gather_points(rig: Rig, messages: Sequence[Detections], gap_s: float, length
                 found[label] = count
                 rows += [(c, count, *uv) for c, uv in images]
                 count += 1
-        if length_m and len(found) == 2:
-            pairs.append(tuple(found.values()))
+        if wand is not None:
+            for a, b in combinations(found, 2):
+                pairs.append((found[a], found[b]))
+                lengths.append(np.linalg.norm(wand.points[a] - wand.points[b]))
     table = np.array(rows)
     camera, point = table[:, :2].astype(np.intp).T
-    return Points(camera, point, table[:, 2:], np.array(pairs, np.intp).reshape(-1, 2), length_m)
+    return Points(camera, point, table[:, 2:], np.array(pairs, np.intp).reshape(-1, 2), np.array(lengths))
 
 
-def _track(camera: Camera, name: str, messages: Sequence[Detections]) -> dict[int, tuple[Array, Array]]:
-    """True times (n,) and pixels (n, 2) by marker."""
+def tracks_of_messages(rig: Rig, messages: Sequence[Detections]) -> list[Tracks]:
+    """The numbered detections of the placed cameras."""
+    return [_track(camera, name, messages) for name, camera in rig.placed().items()]
+
+
+def _track(camera: Camera, name: str, messages: Sequence[Detections]) -> Tracks:
     rows: dict[int, list[tuple[float, ...]]] = {}
     for message in messages:
         if message.camera == name:
@@ -94,11 +112,29 @@ def _track(camera: Camera, name: str, messages: Sequence[Detections]) -> dict[in
             t_s = message.t_ns * 1e-9 + camera.time_offset_ms * 1e-3
             for label, uv in zip(seen.id.tolist(), seen.uv.tolist(), strict=True):
                 rows.setdefault(label, []).append((t_s, *uv))
-    tables = {label: np.array(sorted(table)) for label, table in rows.items()}
-    return {label: (table[:, 0], table[:, 1:]) for label, table in tables.items()}
+    return {label: _sorted_track(np.array(table)) for label, table in rows.items()}
 
 
-def _at(track: dict[int, tuple[Array, Array]], label: int, t_s: float, gap_s: float) -> Array | None:
+def tracks_of_result(result: WandCalibration) -> list[Tracks]:
+    """The detections that a calibration labeled, at the discs' own centres, whether it rejected them or not."""
+    seen, state = result.observations, result.adjusted.state
+    t_s = state.true_times(seen, result.adjusted.problem.middle_s)
+    table = np.column_stack([t_s, seen.uv])
+    return [
+        {
+            label: _sorted_track(table[(seen.camera == camera) & (seen.label == label)])
+            for label in np.unique(seen.label).tolist()
+        }
+        for camera in range(len(result.names))
+    ]
+
+
+def _sorted_track(table: Array) -> tuple[Array, Array]:
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return table[:, 0], table[:, 1:]
+
+
+def _at(track: Tracks, label: int, t_s: float, gap_s: float) -> Array | None:
     if label not in track:
         return None
     t, uv = track[label]
@@ -145,7 +181,7 @@ def _residuals(cameras: Sequence[Camera], points: Points, x: Array) -> Array:
     there = x[size:].reshape(-1, 3)
     pixels = np.nan_to_num(project(moved, points, there) - points.uv, nan=1e3)
     ends = there[points.pairs]
-    length = (np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - points.length_m) / LENGTH_SIGMA_M
+    length = (np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - points.lengths) / LENGTH_SIGMA_M
     return np.concatenate([pixels.ravel(), length]).astype(float)
 
 
@@ -202,15 +238,30 @@ def waved_led() -> list[Comparison]:
     """Residuals of all images, and of those that neither rig takes for outliers."""
     rig, messages = recording(DATA / "waved_led" / "observations.csv")
     found = calibrate(rig, Body(diameter_m=0.1), messages).rig
-    points = gather_points(found, messages, gap_s=0.0)
+    points = gather_points(tracks_of_messages(found, messages), gap_s=0.0)
     both = [residuals_px(r, points) for r in (found, adjust_plainly(found, points))]
     usual = np.all([off < OUTLIER * np.median(off) / 1.1774 for off in both], axis=0)
     placed, every = len(found.placed()), [_rms(off) for off in both]
     without = f"waved-led without {(~usual).sum()} outliers, px"
     return [
-        Comparison("waved-led, px", placed, *every),
+        Comparison("waved-led, RMS, px", placed, *every),
         Comparison(without, placed, *(_rms(off[usual]) for off in both)),
+        Comparison("waved-led, mean, px", placed, *(float(off.mean()) for off in both)),
     ]
+
+
+def arena_small() -> Comparison:
+    """Errors of the cameras' positions, from a rendered wand."""
+    folder = DATA / "arena_small"
+    entries = json.loads((folder / "truth.json").read_text())["cameras"]
+    rig, truth = (
+        Rig(cameras={n: true_camera(e, placed) for n, e in entries.items()}) for placed in (False, True)
+    )
+    result = calibrate(rig, WAND, detect_frames(folder / "wand", inner_ratios=(WAND.inner_ratio,)))
+    points = gather_points(tracks_of_result(result), result.adjusted.problem.gap_s, WAND)
+    both = (result.rig, adjust_plainly(result.rig, points))
+    errors = (1e3 * _rms(camera_errors(r, truth)[0]) for r in both)
+    return Comparison("arena-small, camera positions, mm", len(result.names), *errors)
 
 
 def _rms(values: Array) -> float:
@@ -230,7 +281,7 @@ def webcams(a: int, b: int) -> Comparison:
     except CalibrationError as error:
         Console().print(f"{name}: {error}")
         return Comparison(name, 0, np.inf, np.nan)
-    plain = adjust_plainly(found, gather_points(found, messages, 0.34, length))
+    plain = adjust_plainly(found, gather_points(tracks_of_messages(found, messages), 0.34, wand))
     ours, theirs = (1e3 * _rms(corner_errors(r, every)) for r in (found, plain))
     return Comparison(name, len(found.placed()), ours, theirs)
 
@@ -255,7 +306,7 @@ def run(arguments: Sequence[str]) -> None:
     chosen = np.random.default_rng(options.seed).permutation(len(far))[: options.pairs]
     console, table = Console(), Table("recording", "cameras", "ours", "plain", "ratio", "goal")
     try:
-        rows = [*waved_led(), *(webcams(*far[k]) for k in sorted(chosen))]
+        rows = [*waved_led(), arena_small(), *(webcams(*far[k]) for k in sorted(chosen))]
     except FileNotFoundError as missing:
         console.print(f"{missing} is absent")
         return

@@ -60,7 +60,7 @@ def main(thorough: bool = False, live: bool = True, jitter_ms: float = 1e3 * JIT
     Args:
         thorough: all motions with all steps, and drifts of several minutes; takes an hour.
         live: the rows between programs too, a minute.
-        jitter_ms: mean of the varying part of the time from exposure to arrival; above 20 ms it hides steps of 25 ms.
+        jitter_ms: mean of the varying part of the time from exposure to arrival.
         only: rows whose names contain this.
     """
     cases = [_with_jitter(case, jitter_ms * 1e-3) for case in _cases(thorough) if only in case.what]

@@ -17,7 +17,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.model.states import States
-from tests.fusion.equations import outlines
+from tests.calib.synthetic import outlines
 
 START_NS = 1_000_000_000_000
 LENS = {"width": 1280, "height": 800, "fx": 840.0, "fy": 841.0, "cx": 642.0, "cy": 397.0}
@@ -168,29 +168,23 @@ class Scene:
         R, at = self.cameras.R_cam_world[camera], self.cameras.centres[camera]
         c = np.column_stack([views.centre, R @ (self.clutter - at).T])
         normal = np.column_stack([views.normal, np.tile(R[:, 2:], len(self.clutter))])
-        q = np.column_stack([views.q, c[:, n:]])
         row = np.concatenate([np.arange(n), np.full(len(self.clutter), -1)])
-        seen = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (q[2] > 0.1)
+        seen = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (c[2] > 0.1)
         seen &= rng.random(len(seen)) >= self.load.missing
         seen[:n] &= ~np.isin(self.marker_table.robot, list(hidden))
         lens = self.load.rig[self.cameras.names[camera]]
-        return self._noisy(lens, c[:, seen], normal[:, seen], q[:, seen], row[seen], rng)
+        return self._noisy(lens, c[:, seen], normal[:, seen], row[seen], rng)
 
-    def _noisy(self, lens: Camera, c, normal, q, row, rng: np.random.Generator) -> Roundels:
+    def _noisy(self, lens: Camera, c, normal, row, rng: np.random.Generator) -> Roundels:
         sigma = self.load.sigma_px
-        uv, J = lens.project_with_jacobian(q.T)
+        uv, axes, angle = outlines(lens, c.T, normal.T, DIAMETER_M / 2)
         inside = ((uv > 10) & (uv < [lens.width - 10, lens.height - 10])).all(1)
-        scale = (J[:, :, :2] * q[2, :, None, None]).transpose(1, 2, 0)
-        values, vectors = np.linalg.eigh(
-            outlines(c, normal, np.full(len(row), DIAMETER_M / 2), scale)[inside]
-        )
-        axes, angle = 2 * np.sqrt(values[:, ::-1]), np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
         extra = rng.poisson(self.load.false)
-        uv = np.concatenate([uv[inside], rng.uniform([10, 10], [lens.width, lens.height], (extra, 2))])
-        axes = np.concatenate([axes, np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])
+        uv = np.concatenate([uv[inside], rng.uniform(10, [lens.width - 10, lens.height - 10], (extra, 2))])
+        axes = np.concatenate([axes[inside], np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])
         uv, axes = uv + sigma * rng.normal(size=uv.shape), axes + sigma * rng.normal(size=axes.shape)
         n = len(uv)
-        angle = np.concatenate([angle, rng.uniform(-1.5, 1.5, extra)])
+        angle = np.concatenate([angle[inside], rng.uniform(-1.5, 1.5, extra)])
         number = np.concatenate([row[inside], np.full(extra, -1)]).astype(np.int32)
         cov, level = np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.6)
         roundels = Roundels(uv, cov, axes, angle, level, 200 * level, number, number)

@@ -27,6 +27,7 @@ MAX_LINES = 100  # of all logs
 FILL_MB = (
     60.0  # by which a program may grow until its caches are full, in a run that is too short for its growth
 )
+MAX_COMBINATIONS = 8  # of cameras, in the report
 CLOSE_S = 2.0  # after the last message, until its effects are over
 
 
@@ -36,6 +37,7 @@ class FuzzResult:
 
     Attributes:
         errors_m: largest error of a tracked pose without faults, and with them.
+        by_cameras_m: the largest errors with faults by the cameras that contributed.
         wrong: poses whose error is above the largest without faults by more than `MAX_OFFSET_M`, and above 5 sigma.
         gap_s: the longest gap in the poses of a robot.
         lines: of all logs during the run.
@@ -46,6 +48,7 @@ class FuzzResult:
 
     errors_m: tuple[float, float] = (0.0, 0.0)
     rms_m: tuple[float, float] = (0.0, 0.0)
+    by_cameras_m: dict[tuple[str, ...], float] = field(default_factory=dict)
     wrong: int = 0
     gap_s: float = 0.0
     lines: list[tuple[str, str]] = field(default_factory=list)
@@ -100,6 +103,7 @@ def fuzz(
         arena.judge.close_gaps()
         result.crashes += [f"fuzzer: exit code {code}"] if code else []
         result.errors_m, result.rms_m = (before[0], arena.judge.largest_m), (before[1], arena.judge.rms_m)
+        result.by_cameras_m = dict(arena.judge.largest_by_cameras_m)
         result.wrong = len(arena.judge.wrong)
         result.gap_s = max((gap.seconds for gap in arena.judge.gaps), default=0.0)
         result.lines += arena.programs.new_lines()
@@ -151,6 +155,8 @@ def report(result: FuzzResult) -> None:
     say(
         f"error before: {errors[0]:.2f} mm (RMS {rms[0]:.2f}), with faults: {errors[1]:.2f} mm (RMS {rms[1]:.2f})"
     )
+    for cameras, error_m in sorted(result.by_cameras_m.items(), key=lambda pair: -pair[1])[:MAX_COMBINATIONS]:
+        say(f"largest error with {' '.join(cameras) or 'no camera'}: {1e3 * error_m:.2f} mm")
     say(
         f"longest gap: {result.gap_s:.2f} s; {len(result.lines)} log lines; counted by the server: {result.faults}"
     )

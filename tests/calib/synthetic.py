@@ -14,11 +14,13 @@ from calib.wand.result import WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body, thickness_of
+from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector, vector_from_rotation
 from camera_node.protocol.messages import Detections
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
+RIM = 16  # points of a disc's rim
 # Standard deviations of lens errors: relative focal length, principal point in pixels, k1.
 EXACT, CAREFUL, OLD, SHEET = (0.0, 0.0, 0.0), (6e-4, 0.5, 5e-4), (4e-3, 2.0, 5e-3), (0.02, 10.0, 0.03)
 
@@ -65,24 +67,43 @@ class Arena:
         return uv, axes, angles, inside & (axes[:, 1] > 5)
 
 
-def outlines(camera: Camera, points: Array, normals: Array, radius: float) -> tuple[Array, Array, Array]:
+def outlines(camera: Lens, points: Array, normals: Array, radius: float) -> tuple[Array, Array, Array]:
     """Return ellipses of discs: centres (n, 2), full axes (n, 2) and angles (n,), raw pixels.
 
-    The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane; its
-    last column is the centre of the ellipse (Hartley and Zisserman, section 8.3). The lens is linear across the disc.
+    They are fitted to the images of points of the rims, as a detector fits them: independent of the models under test.
+    NaN where a rim is not in front of the camera.
     """
-    dual = points[:, :, None] * points[:, None] - radius**2 * (
-        np.eye(3) - normals[:, :, None] * normals[:, None]
-    )
-    centre = dual[:, :2, 2] / dual[:, 2:, 2]
-    at = np.column_stack([centre, np.ones(len(centre))])
-    uv, J = camera.project_with_jacobian(at)
-    shape = centre[:, :, None] * centre[:, None] - dual[:, :2, :2] / dual[:, 2, 2, None, None]
-    shape = J[:, :, :2] @ shape @ np.swapaxes(J[:, :, :2], 1, 2)
-    squares, along = np.linalg.eigh(np.nan_to_num(shape, nan=1.0))
+    turn = 2 * np.pi * np.arange(RIM) / RIM
+    beside = np.where(np.abs(normals[:, :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(normals, beside)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    around = np.stack([np.cos(turn), np.sin(turn)])
+    rim = np.einsum("kni,km->nmi", np.stack([first, np.cross(normals, first)]), radius * around)
+    uv = camera.project((points[:, None] + rim).reshape(-1, 3)).reshape(-1, RIM, 2)
+    seen = np.isfinite(uv).all(axis=(1, 2))
+    centre, axes, angle = np.full((len(uv), 2), np.nan), np.full((len(uv), 2), np.nan), np.zeros(len(uv))
+    centre[seen], shape = fit_ellipses(uv[seen])
+    squares, along = np.linalg.eigh(shape)
     major = along[:, :, 1]
-    angle = np.arctan(major[:, 1] / np.where(major[:, 0] == 0, 1e-12, major[:, 0]))
-    return uv, 2 * np.sqrt(np.maximum(squares[:, ::-1], 0)), angle
+    angle[seen] = np.arctan(major[:, 1] / np.where(major[:, 0] == 0, 1e-12, major[:, 0]))
+    axes[seen] = 2 * np.sqrt(np.maximum(squares[:, ::-1], 0))
+    return centre, axes, angle
+
+
+def fit_ellipses(curves: Array) -> tuple[Array, Array]:
+    """Fit ellipses to closed curves (n, m, 2): centres (n, 2) and shapes (n, 2, 2), of which a circle of radius r has
+    r^2 I; by algebraic least squares where the curves are nearly unit circles."""
+    middle = curves.mean(axis=1)
+    L = np.linalg.cholesky(
+        2 * np.einsum("nmi,nmj->nij", off := curves - middle[:, None], off) / curves.shape[1]
+    )
+    x, y = np.moveaxis(np.einsum("nij,nmj->nmi", np.linalg.inv(L), off), 2, 0)
+    rows = np.stack([x * x, x * y, y * y, x, y], axis=2)
+    a, b, c, d, e = np.linalg.solve(rows.mT @ rows, rows.sum(axis=1)[:, :, None])[:, :, 0].T
+    form = np.stack([a, b / 2, b / 2, c], axis=1).reshape(-1, 2, 2)
+    at = -np.linalg.solve(form, np.stack([d, e], axis=1)[:, :, None] / 2)
+    level = 1 + (at.mT @ form @ at)
+    return middle + (L @ at)[:, :, 0], L @ np.linalg.inv(form / level) @ L.mT
 
 
 def ring(cameras: int = 4, **options) -> Arena:

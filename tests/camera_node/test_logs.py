@@ -3,18 +3,23 @@
 
 import io
 import logging
+import math
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from camera_node.logs import MAX_KINDS, LimitedHandler, LineFormatter, LogLimits, about
-from tests.waiting import repeating, wait_for
+from camera_node.line_limits import MAX_KINDS, LineLimiter, LogLimits
+from camera_node.logs import LimitedHandler, LineFormatter, about
+from tests.waiting import wait_for
 
-FAST = LogLimits(spacing_s=0.05)
+FUZZED_S = 1020.0  # of a million fuzzed messages
+FAST = LogLimits(pause_s=0.05)
 RECORD = {"name": "tested", "levelno": logging.WARNING, "levelname": "WARNING"}
 FLOOD = """
 import logging, sys
@@ -90,40 +95,119 @@ def lines_counted(text: str) -> int:
     return count
 
 
-def attacked(limits: LogLimits, kinds: int, seconds: float) -> tuple[str, int]:
-    """What a handler writes while lines of so many kinds arrive all the time, and how many arrived."""
-    stream = io.StringIO()
-    handler, sent = LimitedHandler(stream, limits), [0]
-    handler.setFormatter(LineFormatter("%(message)s"))
+class VirtualLog:
+    """Lines in virtual time, as `LimitedHandler` would write them: (time s, lines that it stands for, text)."""
 
-    def send() -> None:
-        for k in range(kinds):
-            handler.handle(logging.makeLogRecord(RECORD | {"msg": "camera %s", "args": (k,), "subject": k}))
-            sent[0] += 1
+    def __init__(self, limits: LogLimits | None = None) -> None:
+        self.now_s = 0.0
+        self.lines: list[tuple[float, int, str]] = []
+        self._limiter = LineLimiter(limits, lambda: self.now_s)
+        self._due_s: float | None = None
 
-    with repeating(send, 0.001):
-        end_s = time.monotonic() + seconds
-        wait_for(lambda: time.monotonic() > end_s)
-    handler.close()
-    return stream.getvalue(), sent[0]
+    def log(self, at_s: float, subject: object = None, text: str = "refused: %s") -> None:
+        self.advance(at_s)
+        record = RECORD | {"msg": text, "args": (len(self.lines),), "subject": subject}
+        if self._limiter.hold(logging.makeLogRecord(record)):
+            self._write(self._limiter.release())
+
+    def advance(self, until_s: float) -> None:
+        while self._due_s is not None and self._due_s <= until_s:
+            self.now_s = max(self.now_s, self._due_s)
+            self._write(self._limiter.release())
+        self.now_s = until_s
+
+    def close(self) -> list[tuple[float, int, str]]:
+        """The lines before the end; then what was held back is among them."""
+        lines = list(self.lines)
+        self._write(self._limiter.release_all())
+        return lines
+
+    def _write(self, released: list) -> None:
+        for held, record in released:
+            self._limiter.charge(held, 1)
+            self.lines.append((self.now_s, held, record.getMessage()))
+        self._due_s = self._limiter.due_s()
 
 
-@pytest.mark.parametrize("kinds", [1, 5, 60])
+def flooded(kinds: int, hz: float, seconds: float, limits: LogLimits | None = None) -> VirtualLog:
+    """Lines of so many kinds, all the time."""
+    log = VirtualLog(limits)
+    for k in range(round(seconds * hz)):
+        log.log(k / hz, k % kinds)
+    log.advance(seconds)
+    return log
+
+
+@pytest.mark.parametrize("seconds", [10.0, 100.0, FUZZED_S])
+def test_a_flood_of_one_kind_writes_as_many_lines_as_the_logarithm_of_its_duration(seconds: float):
+    """Six at once and one a minute before: 23 in the time of a million fuzzed messages."""
+    log = flooded(1, 20.0, seconds, LogLimits(most_lines=1))
+    times = [at_s for at_s, _, _ in log.close()]
+    assert times[0] == 0.0
+    assert len(times) <= 1 + math.log2(1 + seconds)
+    assert np.diff(times) == pytest.approx(2.0 ** np.arange(len(times) - 1), abs=0.1)  # 0.05 s between two
+    assert sum(held for _, held, _ in log.lines) == round(20.0 * seconds)
+
+
+@given(st.lists(st.sampled_from([0.0, 0.01, 0.3, 2.0, 7.0, 30.0, 59.0, 61.0, 130.0]), max_size=300))
+@settings(max_examples=50, deadline=None)
+def test_no_pattern_of_one_kind_writes_more_than_a_flood_and_a_line_a_minute(gaps_s: list[float]):
+    """Each quiet minute halves the pause, and so permits one more line. None is held back for longer than a minute."""
+    log, limits = VirtualLog(), LogLimits()
+    times = np.cumsum(gaps_s).tolist()
+    for at_s in times:
+        log.log(at_s)
+    seconds = times[-1] if times else 0.0
+    log.advance(seconds + limits.quiet_s)
+    written = log.close()
+    assert sum(held for _, held, _ in written) == len(times)
+    assert len(written) <= 3 + math.log2(1 + seconds / limits.pause_s) + seconds / limits.quiet_s
+
+
+def test_a_kind_that_was_quiet_for_long_is_written_at_once_again():
+    log = flooded(1, 1.0, 1000.0)
+    log.advance(3000.0)
+    before = len(log.lines)
+    log.log(3000.0)
+    assert [at_s for at_s, _, _ in log.lines[before:]] == [3000.0]
+
+
+@pytest.mark.parametrize("kinds", [1, 5, 15, 60])
 def test_lines_under_attack_are_bounded_and_none_is_uncounted(kinds: int):
-    """However many kinds and messages: those at once, one each time of the refill, and one at the end."""
-    limits, seconds = LogLimits(0.001, kind_lines=4, kind_s=0.1, lines=12, line_s=0.005, most_lines=10), 0.5
-    text, sent = attacked(limits, kinds, seconds)
-    of_kinds = kinds * (limits.kind_lines + seconds / limits.kind_s)
-    of_process = limits.lines + seconds / (limits.line_s * limits.most_lines)
-    assert (
-        len(text.splitlines()) <= min(of_kinds, of_process) * 1.3 + 1
-    )  # a busy machine takes longer than `seconds`
-    assert lines_counted(text) == sent
+    """However many kinds: the first line of each, and digests as often as the logarithm of the duration."""
+    log, limits = flooded(kinds, 30.0, FUZZED_S), LogLimits()
+    first = min(kinds, limits.lines + kinds / 30.0 / limits.line_s)
+    assert len(log.close()) <= first + math.log2(1 + FUZZED_S / limits.pause_s) + 2
+    assert sum(held for _, held, _ in log.lines) == round(30.0 * FUZZED_S)
 
 
-def test_the_real_limits_leave_an_hour_of_attack_below_a_hundred_lines():
-    limits = LogLimits()
-    assert limits.lines + 3600 / (limits.line_s * limits.most_lines) < 100
+def test_an_arena_under_a_million_fuzzed_messages_writes_fewer_than_a_hundred_lines():
+    """A server that counts fifteen kinds of faults, and five nodes whose settings are changed; 140 before."""
+    assert len(flooded(15, 30.0, FUZZED_S).close()) + 5 * len(flooded(1, 10.0, FUZZED_S).close()) < 100
+
+
+def test_an_hour_of_attack_writes_fewer_than_a_hundred_lines():
+    assert len(flooded(20, 4.0, 3600.0).close()) < 100
+
+
+def test_a_rare_kind_does_not_write_the_others_of_a_flood():
+    """Eight kinds all the time, and eight that recur every half minute: as of a fuzzed camera; 17 digests before."""
+    log = VirtualLog()
+    for k in range(round(FUZZED_S * 10)):
+        log.log(k / 10, k % 8)
+        if k % 37 == 0:
+            log.log(k / 10, 8 + k // 37 % 8)
+    assert len(log.close()) <= 16 + math.log2(1 + FUZZED_S) + LogLimits().separate + 2
+    assert sum(held for _, held, _ in log.lines) == round(FUZZED_S * 10) + math.ceil(FUZZED_S * 10 / 37)
+
+
+def test_an_event_during_a_flood_of_many_kinds_is_written_within_ten_seconds():
+    log = VirtualLog()
+    for k in range(6000):
+        log.log(k / 20, k % 40)
+        if k == 4000:
+            log.log(200.0, "north", "camera moved %s")
+    assert min(at_s for at_s, _, text in log.lines if "camera moved" in text) <= 210.0
 
 
 def test_events_of_an_arena_are_written_within_a_second(stream: io.StringIO):
@@ -140,7 +224,7 @@ def test_events_of_an_arena_are_written_within_a_second(stream: io.StringIO):
 def test_a_rare_line_is_quoted_in_the_digest_of_a_flood(stream: io.StringIO):
     """A camera that fails during an attack is in the next line that may be written."""
     log.handlers[0].close()
-    handler = LimitedHandler(stream, LogLimits(0.0, kind_lines=1000, lines=3, line_s=0.01, most_lines=10))
+    handler = LimitedHandler(stream, LogLimits(0.0, lines=3, line_s=0.01, most_lines=10))
     handler.setFormatter(LineFormatter("%(levelname)s %(message)s"))
     log.handlers[:] = [handler]
     for k in range(4000):
@@ -158,11 +242,11 @@ def test_a_rare_line_is_quoted_in_the_digest_of_a_flood(stream: io.StringIO):
 
 def test_ever_new_kinds_are_limited_together():
     """As of a library that formats its messages itself: no memory for each of them."""
-    handler = LimitedHandler(io.StringIO(), LogLimits(spacing_s=60.0))
+    limiter = LineLimiter(LogLimits(pause_s=60.0))
     for k in range(10 * MAX_KINDS):
-        handler.handle(logging.makeLogRecord(RECORD | {"msg": f"message {k}"}))
-    assert len(handler._kinds) <= MAX_KINDS + 1
-    handler.close()
+        limiter.hold(logging.makeLogRecord(RECORD | {"msg": f"message {k}"}))
+    assert len(limiter.release_all()) == 1
+    assert len(limiter._kinds) <= MAX_KINDS + 1
 
 
 def test_a_process_that_ends_in_a_flood_tells_the_count():

@@ -205,11 +205,12 @@ def _sums(A: Array, b: Array, H: Array, g: Array, weights: Array) -> tuple[Array
 
 
 def _converge(A: Array, b: Array, sums: Callable[[Array], tuple[Array, Array]], weights: Array) -> Array:
-    for _ in range(4 if len(A) else 0):
+    for iteration in range(4 if len(A) else 0):
         rest = b - A @ np.linalg.solve(*sums(weights))
-        before, weights = weights, 1 / (NOMINAL_WEIGHT * (1 + np.sum(rest**2, 1) / CAUCHY**2))
-        if np.abs(weights - before).max() < CONVERGED:
+        updated = 1 / (NOMINAL_WEIGHT * (1 + np.sum(rest**2, 1) / CAUCHY**2))
+        if iteration > 0 and np.abs(updated - weights).max() < CONVERGED:
             break
+        weights = updated
     return weights
 
 

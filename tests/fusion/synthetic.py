@@ -13,6 +13,7 @@ from camera_node.protocol.messages import Detections
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot
+from tests.calib.synthetic import fit_ellipses
 from tests.fusion.equations import outlines
 
 PERIOD_NS = 33_333_333
@@ -211,15 +212,9 @@ class Arena:
 
 
 def outline_centre(camera: Camera, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
-    """The centre of a disc's outline: that of a conic through projected points of the rim, undistorted."""
+    """The centre of the ellipse through the image of a disc's rim, as a detector fits it, raw pixels."""
     u = np.linalg.svd(normal[None])[2][1:]
     phi = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     rim = centre + radius * (np.cos(phi)[:, None] * u[0] + np.sin(phi)[:, None] * u[1])
-    T = np.linalg.inv(camera.matrix())
-    P = rim @ T[:3, :3].T + T[:3, 3]
-    xy = P[:, :2] / P[:, 2:]
-    middle, scale = xy.mean(0), np.ptp(xy)
-    x, y = ((xy - middle) / scale).T
-    a, b, c, d, e, _ = np.linalg.svd(np.column_stack([x * x, x * y, y * y, x, y, np.ones(16)]))[2][-1]
-    point = np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e]) * scale + middle
-    return camera.project([[*point, 1.0]])[0]
+    uv = camera.project_world(rim)
+    return fit_ellipses(uv[None])[0][0] if np.isfinite(uv).all() else np.full(2, np.nan)

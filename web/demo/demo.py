@@ -13,8 +13,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+from msgspec.structs import replace
+
 from calib.live.rig_requests import set_rig
-from calib.rig.camera import Camera
+from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
 from camera_node.errors import NetworkError
@@ -49,6 +52,8 @@ CALIBRATION_S = 90.0  # limit for the calibration after the wand session
 SETTLE_S = 0.5  # after a new calibration, until no pose of the previous one arrives
 ACQUISITION_S = 5.0  # for all robots to be acquired; a robot that is not tracked then counts as lost
 TICK_S = 0.05
+# Errors of carefully calibrated lenses: relative focal length, principal point in pixels, k1.
+LENS_SIGMA = 6e-4, 0.5, 5e-4
 
 
 def run_demo(
@@ -80,7 +85,7 @@ def run_demo(
 
 
 def create_folder(path: Path, scene_path: Path, scene: Scene) -> ArenaFolder:
-    """The folder of the demo's arena: the files beside the scene, and a rig of the cameras' lenses.
+    """The folder of the demo's arena: the files beside the scene, and a rig of the cameras' calibrated lenses.
 
     Raises:
         WebError: one of the files is missing.
@@ -92,9 +97,22 @@ def create_folder(path: Path, scene_path: Path, scene: Scene) -> ArenaFolder:
             raise WebError(f"{scene_path.parent / name} can't be read: {error.strerror}") from None
     folder = ArenaFolder(path)
     folder.create(ARENA, None, is_local=True)
-    lenses = {name: Camera(**entry) for name, entry in scene.rig_entries().items()}
-    save_rig(Rig(cameras=lenses), folder.rig)
+    save_rig(Rig(cameras=calibrated_lenses(scene)), folder.rig)
     return folder
+
+
+def calibrated_lenses(scene: Scene) -> dict[str, Camera]:
+    """The lenses of a scene as careful calibrations know them: with errors, and the standard deviations of these."""
+    rng, focal, centre_px, k1 = np.random.default_rng(scene.seed), *LENS_SIGMA
+    cameras = {}
+    for name, entry in scene.rig_entries().items():
+        camera = with_distortion(Camera(**entry))
+        errors, parameters = rng.standard_normal(4), camera.parameters
+        parameters[:2] *= 1 + focal * errors[0]
+        parameters[2:5] += errors[1:] * [centre_px, centre_px, k1]
+        sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1)
+        cameras[name] = replace(camera.with_parameters(parameters), lens_sigma=sigma)
+    return cameras
 
 
 def conclude(faults: list[str], is_test: bool) -> tuple[str, int]:

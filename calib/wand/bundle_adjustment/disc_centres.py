@@ -2,9 +2,10 @@
 """Corrects ellipse centres to the projections of the discs' own centres.
 
 Perspective displaces the centre of a disc's image from the projection of the disc's centre, by about
-D^2/(4f) sin t cos t pixels for a disc of D pixels that is tilted by t: always to the same side, so the error does not
-average out. All markers of the wand face the same way, or the opposite one, so the ellipses of one frame set together
-give their normal. A camera that sees one side of a thick wand sees its discs half the thickness from the markers.
+D^2/(4f) sin t cos t pixels for a disc of D pixels that is tilted by t, and the lens's distortion by about a tenth of
+that: always to the same side, so the errors do not average out. All markers of the wand face the same way, or the
+opposite one, so the ellipses of one frame set together give their normal. A camera that sees one side of a thick wand
+sees its discs half the thickness from the markers.
 """
 
 from dataclasses import replace
@@ -16,6 +17,7 @@ from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_mark
 from camera_node.arrays import Array, Index
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.outline import centre_shifts, half_axes_of
 from camera_node.geometry.sphere import fibonacci_sphere
 
 DIRECTIONS = 160  # on a sphere, tried before refinement: 9 degrees apart
@@ -71,15 +73,30 @@ def displacement(lens: Lens, points: Array, normals: Array, radius: float) -> Ar
     """(n, 2) pixels from the projections of discs' centres to their ellipses' centres.
 
     The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane, whose
-    last column is the ellipse's centre (Hartley and Zisserman, sections 2.2.3 and 8.3).
+    last column is the ellipse's centre (Hartley and Zisserman, sections 2.2.3 and 8.3). Divided by its last element it
+    is m m' - S, where S is the shape of an ellipse with centre m, which the lens maps to another one (`centre_shifts`).
 
     Args:
         points, normals: (n, 3) centres, metres, and unit normals, camera frame.
         radius: metres.
     """
-    x, z, n = points[:, :2], points[:, 2:], normals
-    centre = (x * z + radius**2 * n[:, :2] * n[:, 2:]) / (z**2 - radius**2 * (1 - n[:, 2:] ** 2))
-    return lens.project(np.column_stack([centre, np.ones(len(centre))])) - lens.project(points)
+    across = np.eye(3) - normals[:, :, None] * normals[:, None]
+    dual = points[:, :, None] * points[:, None] - radius**2 * across
+    dual = dual / dual[:, 2:, 2:]
+    centre = dual[:, :2, 2]
+    shape = centre[:, :, None] * centre[:, None] - dual[:, :2, :2]
+    uv = lens.project(np.column_stack([centre, np.ones(len(centre))]))
+    return uv + centre_shifts(lens, centre, _root(shape)) - lens.project(points)
+
+
+def _root(S: Array) -> Array:
+    """(n, 2, 2) lower triangular L with L L' = S; NaN where S is not positive definite."""
+    L = np.zeros_like(S)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        L[:, 0, 0] = np.sqrt(S[:, 0, 0])
+        L[:, 1, 0] = S[:, 0, 1] / L[:, 0, 0]
+        L[:, 1, 1] = np.sqrt(S[:, 1, 1] - L[:, 1, 0] ** 2)
+    return L
 
 
 def _find_normals(
@@ -90,14 +107,10 @@ def _find_normals(
     A small disc's ellipse is r^2 P (I - n n') P', so its difference to r^2 P P' is r^2 (P n)(P n)', for either sign of
     n.
     """
-    turn = np.stack([np.cos(observations.angle_rad), np.sin(observations.angle_rad)], axis=1)
-    across = np.stack([-turn[:, 1], turn[:, 0]], axis=1)
-    a, b = (observations.axes_px.T / 2) ** 2
-    shape = a[:, None, None] * turn[:, :, None] * turn[:, None]
-    shape += b[:, None, None] * across[:, :, None] * across[:, None]
+    half_axes = half_axes_of(observations.axes_px, observations.angle_rad)
     full = P @ np.swapaxes(P, 1, 2)
     unit = np.trace(full, axis1=1, axis2=2)
-    deficit = (full - shape / (wand.diameter_m / 2) ** 2) / unit[:, None, None]
+    deficit = (full - half_axes @ half_axes.mT / (wand.diameter_m / 2) ** 2) / unit[:, None, None]
     P = P / np.sqrt(unit)[:, None, None]
     toward = np.zeros_like(points) if thickness_of(wand) else cameras[observations.camera, :3, 3] - points
     count = int(observations.knot.max()) + 1

@@ -110,8 +110,8 @@ def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
     information, gradient = _lens_likelihood(adjusted)
     sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
     prior, wider = problem.lens_sigma.copy(), problem.lens_sigma.copy()
-    prior[estimated] = sigma * _shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
-    uniform = sigma * _shares(information, gradient, sigma, unknown, UNIFORM)
+    prior[estimated] = sigma * estimate_shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
+    uniform = sigma * estimate_shares(information, gradient, sigma, unknown, UNIFORM)
     wider[estimated] = np.maximum(uniform, prior[estimated])
     return replace(problem, lens_sigma=prior, covariance_lens_sigma=wider)
 
@@ -154,7 +154,7 @@ def _plausible(correction: Array, covariance: Array) -> bool:
     return bool(chdtrc(len(correction), squared) > CONTRADICTED)
 
 
-def _shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:
+def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:
     """(S, 9) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
     root of the posterior mean of its square under `prior`, one kind after the other; 1 for other lenses."""
     shares = np.ones(len(KINDS))

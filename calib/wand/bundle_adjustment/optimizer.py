@@ -70,19 +70,23 @@ class Adjusted:
 
 def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
     """Optimize from a rough start with Cauchy's kernel."""
-    weights = find_weights(problem, observations, start)
-    return _levenberg_marquardt(problem, observations, weights, start, robust=True)[0]
+    objective = _Objective(problem, observations, find_weights(problem, observations, start))
+    return _levenberg_marquardt(objective, start, robust=True)[0]
 
 
 def adjust(
-    problem: Problem, observations: WandObservations, start: State, rounds: int = MAX_ROUNDS
+    problem: Problem,
+    observations: WandObservations,
+    start: State,
+    rounds: int = MAX_ROUNDS,
+    profiled: bool = False,
 ) -> Adjusted:
     """Optimize from a start that is nearly right, without outliers, and prepare the covariance.
 
     Each round rejects observations, and interrupts the motion prior, by the statistics of the residuals, and optimizes;
-    rounds end where these do not change.
+    rounds end where these do not change. A `profiled` start is the optimum of another adjustment of the same motion.
     """
-    optimum = _optimize_exactly(problem, observations, start, rounds)
+    optimum = _optimize_exactly(problem, observations, start, rounds, profiled)
     state, inliers, weights = optimum.state, observations.select(optimum.used), optimum.weights
     cameras = profile_motion(linearize(problem, inliers, state, weights))
     return Adjusted(
@@ -110,8 +114,8 @@ def with_information(adjusted: Adjusted, problem: Problem, observations: WandObs
 
 
 def optimize(problem: Problem, observations: WandObservations, start: State) -> State:
-    """Optimize from a start that is nearly right, without the observations that it rejects."""
-    return _optimize_exactly(problem, observations, start, rounds=1).state
+    """Optimize from the optimum for more observations of the same motion, without those that it rejects."""
+    return _optimize_exactly(problem, observations, start, rounds=1, profiled=True).state
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +129,11 @@ class _Optimum:
 
 
 def _optimize_exactly(
-    problem: Problem, observations: WandObservations, state: State, rounds: int
+    problem: Problem, observations: WandObservations, state: State, rounds: int, profiled: bool
 ) -> _Optimum:
-    iterations, none, profiled = 0, np.zeros(len(observations), bool), None
+    """Optimize in rounds; where the cameras of the start are not `profiled`, the first begins with the common optimum
+    of cameras and motion, which is reached from farther away."""
+    iterations, none = 0, np.zeros(len(observations), bool)
     choice = Choice(none, np.zeros(len(problem.knot_s) - 1, bool), np.zeros(len(problem.background.uv), bool))
     for _ in range(rounds):
         weights = find_weights(problem, observations, state)
@@ -135,15 +141,13 @@ def _optimize_exactly(
         if better.equals(choice):
             break
         choice = better
-        inliers, their_weights = observations.select(choice.observations), weights.select(choice)
+        objective = _Objective(problem, observations.select(choice.observations), weights.select(choice))
         state = locate(problem, state, choice.background)
-        objective = _Objective(problem, inliers, their_weights)
-        if profiled is not None:
-            profiled = _profile(objective, state)
-        if profiled is None:
-            state, more = _levenberg_marquardt(problem, inliers, their_weights, state, robust=False)
-            iterations, profiled = iterations + more, _profile(objective, state)
-        state = state if profiled is None else profiled
+        found = _profile(objective, state) if profiled else None
+        if found is None:
+            state, more = _levenberg_marquardt(objective, state, robust=False)
+            iterations, found = iterations + more, _profile(objective, state)
+        profiled, state = found is not None, state if found is None else found
     else:
         weights = find_weights(problem, observations, state)
     return _Optimum(state, choice.observations, weights.select(choice), iterations)
@@ -217,16 +221,13 @@ class _Step:
     damping: float
 
 
-def _levenberg_marquardt(
-    problem: Problem, observations: WandObservations, weights: Weights, state: State, robust: bool
-) -> tuple[State, int]:
+def _levenberg_marquardt(objective: _Objective, state: State, robust: bool) -> tuple[State, int]:
     """The optimum, and the number of iterations; where `robust`, Cauchy's scale follows the residuals."""
-    objective, damping = _Objective(problem, observations, weights), 1e-4 if robust else 1e-6
-    norms = objective.norms(state)
+    norms, damping = objective.norms(state), 1e-4 if robust else 1e-6
     for iteration in range(1, MAX_ITERATIONS + 1):
         if robust:
             scale = CAUCHY_SCALE * max(_spread(norms.observation), 1.0)
-            objective = _Objective(problem, observations, weights, scale, CAUCHY_SCALE)
+            objective = replace(objective, observation_scale=scale, interval_scale=CAUCHY_SCALE)
         before = _Step(state, norms, objective.cost(norms), damping)
         step = _descend(objective, before)
         if step is None:

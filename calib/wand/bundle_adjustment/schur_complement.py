@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Eliminates the wand's motion from a linear system (Schur complement), which leaves the cameras' step and information.
 
-The motion is a chain, so its Hessian is banded, and one Cholesky factorization eliminates it for all cameras at once.
+The motion is a chain, so its Hessian is block tridiagonal, and one factorization eliminates it for all cameras at once.
 """
 
 from collections.abc import Iterator
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig.camera import PER_CAMERA
+from calib.wand.block_tridiagonal import BlockTridiagonal
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem, State, gauge_directions
 from camera_node.arrays import Array, Index
@@ -27,8 +28,8 @@ class ProfiledMotion:
         information: (S d, S d) on the free parameters of the S estimated cameras, with their priors.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without the cameras' priors.
         gradient: (S d,) their sum, with the cameras' priors.
-        response: (K h, S d) minus the derivative of the optimal motion by the cameras.
-        motion_step: (K h,) from the motion to the optimal one, with the cameras as they are.
+        response: (K, h, S d) minus the derivative of the optimal motion by the cameras.
+        motion_step: (K, h) from the motion to the optimal one, with the cameras as they are.
     """
 
     information: Array
@@ -45,7 +46,7 @@ class ProfiledMotion:
         estimated = list(problem.estimated_cameras())
         camera_step[np.ix_(estimated, problem.free)] = of_cameras.reshape(len(estimated), -1)
         motion_step = self.motion_step - self.response @ of_cameras
-        return camera_step, motion_step.reshape(len(problem.knot_s), -1), float(of_cameras @ self.gradient)
+        return camera_step, motion_step, float(of_cameras @ self.gradient)
 
 
 def invert_information(problem: Problem, state: State, information: Array) -> Array:
@@ -62,23 +63,27 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
 
     With H the Hessian, g the gradient and P the Hessian of the motion prior, the response of the motion is
     G = H_mm^-1 H_mc, and the derivatives of the observations by the cameras, along the optimal motion, are J_c - J_m G.
-    Their information is H_cc - H_cm G - G^T P G, and their score J_c^T r - G^T J_m^T r.
+    Their information is H_cc - G^T (H_mc + P G), and their score J_c^T r - G^T J_m^T r.
+
+    Raises:
+        LinAlgError: the motion's Hessian is not positive definite.
     """
-    local = 12 * len(system.problem.wand.basis)
-    sums = _Sums.of(system)
-    joined = _join(np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2))
-    solved = _solve_chain(sums.hessian, joined)
-    G = np.ascontiguousarray(solved[:, :-1])
-    pairs = _pair(G, local)
-    by_prior = _join(system.motion_prior[:, :local, :local] @ pairs)
-    information = sums.of_cameras - joined[:, :-1].T @ G - G.T @ by_prior
-    observed = sums.gradient - system.motion_prior[:, :local, -1]
-    of_motion = sums.scores - (observed[:, None] @ pairs)[:, 0]
+    sums, prior = _Sums.of(system), system.motion_prior[:, :-1, :-1]
+    h, size = sums.gradient.shape[1], len(sums.of_cameras)
+    motion = BlockTridiagonal.of_chain(sums.hessian).factorize()
+    G = motion.solve(sums.crossed)
+    along = (sums.crossed + BlockTridiagonal.of_chain(prior).multiply(G)).reshape(-1, size)
+    observed = sums.observed
+    scores = sums.scores - (observed[:, None, :h] @ G[:-1] + observed[:, None, h:] @ G[1:])[:, 0]
     estimated = list(system.problem.estimated_cameras())
-    of_points = system.background.scores[:, estimated].reshape(-1, of_motion.shape[1])
-    scores = np.concatenate([of_motion, of_points])
-    total = scores.sum(axis=0) + _prior_gradient(system)
-    return ProfiledMotion(information, scores, total, G, solved[:, -1])
+    scores = np.concatenate([scores, system.background.scores[:, estimated].reshape(-1, size)])
+    return ProfiledMotion(
+        information=sums.of_cameras - G.reshape(-1, size).T @ along,
+        scores=scores,
+        gradient=scores.sum(axis=0) + _prior_gradient(system),
+        response=G,
+        motion_step=motion.solve(sums.gradient[:, :, None])[:, :, 0],
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,47 +91,80 @@ class _Sums:
     """The normal equations of all residuals.
 
     Attributes:
-        hessian, gradient: (L, 2 h, 2 h) and (L, 2 h) of the motion, by interval.
-        crossed: (L, 2 h, S d) products of the derivatives by the motion and by the cameras.
+        hessian: (L, 2 h, 2 h) of the motion, by interval.
+        gradient: (K, h) of the motion, by knot.
+        observed: (L, 2 h) of the motion, by interval, without the motion prior.
+        crossed: (K, h, S d) products of the derivatives by the motion and by the cameras.
         scores: (L, S d) gradients of the cameras, without priors.
         of_cameras: (S d, S d) Hessian of the cameras, with background points and priors.
     """
 
     hessian: Array
     gradient: Array
+    observed: Array
     crossed: Array
     scores: Array
     of_cameras: Array
 
     @classmethod
     def of(cls, system: LinearSystem) -> "_Sums":
-        local, intervals = 12 * len(system.problem.wand.basis), len(system.chain)
-        estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
-        slot = np.full(len(system.problem.lenses), -1)
-        slot[estimated] = np.arange(len(estimated))
-        hessian, gradient = system.chain[:, :local, :local].copy(), system.chain[:, :local, -1].copy()
-        crossed = np.zeros((intervals, local, len(estimated), d))
-        scores = np.zeros((intervals, len(estimated), d))
-        own = prior_information(system)
-        own += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
-        for interval, camera, N in _normal_equations(system):
-            first = np.flatnonzero(np.diff(interval, prepend=-1))
-            hessian[interval[first]] += np.add.reduceat(N[:, :local, :local], first)
-            gradient[interval[first]] += np.add.reduceat(N[:, :local, -1], first)
-            mine = slot[camera] >= 0
-            interval, camera, N = interval[mine], slot[camera[mine]], N[mine, :, local:]
-            crossed[interval, :, camera] = N[:, :local, :-1]
-            scores[interval, camera] = N[:, local:-1, -1]
-            for k in range(len(estimated)):
-                own[k, :, k] += N[camera == k, local:-1, :-1].sum(axis=0)
-        size = len(estimated) * d
+        local, d = 12 * len(system.problem.wand.basis), len(system.problem.free)
+        h, (knots, size) = local // 2, (len(system.chain) + 1, len(system.problem.estimated_cameras()) * d)
+        motion = _sum_motion(system, local)
+        gradient = np.zeros((knots, h))
+        gradient[:-1] += motion[:, :h, -1]
+        gradient[1:] += motion[:, h:, -1]
+        crossed, scores = _sum_cameras(system, local)
         return cls(
-            hessian,
-            gradient,
-            crossed.reshape(intervals, local, size),
-            scores.reshape(intervals, size),
-            own.reshape(size, size),
+            hessian=motion[:, :, :-1],
+            gradient=gradient,
+            observed=motion[:, :, -1] - system.motion_prior[:, :-1, -1],
+            crossed=crossed.reshape(knots, h, size),
+            scores=scores.reshape(knots - 1, size),
+            of_cameras=_sum_camera_hessians(system, local).reshape(size, size),
         )
+
+
+def _sum_motion(system: LinearSystem, local: int) -> Array:
+    """(L, 2 h, 2 h + 1) Hessians and gradients of the motion, by interval."""
+    motion = system.chain[:, :local].copy()
+    interval = system.views // len(system.problem.lenses)
+    first = np.flatnonzero(np.diff(interval, prepend=-1))
+    for part, rows in _equal_blocks(system.rows, np.append(system.bounds[first], system.bounds[-1])):
+        at, J = interval[first[part]], rows[:, :, :local]
+        motion[at, :, :local] += J.mT @ J
+        motion[at, :, local:] += J.mT @ rows[:, :, -1:]
+    return motion
+
+
+def _sum_cameras(system: LinearSystem, local: int) -> tuple[Array, Array]:
+    """(K, h, S, d) products of the derivatives by the motion and by the estimated cameras, and (L, S, d) scores."""
+    estimated, h, L = list(system.problem.estimated_cameras()), local // 2, len(system.chain)
+    crossed = np.zeros((L + 1, h, len(estimated), len(system.problem.free)))
+    scores = np.zeros((L, *crossed.shape[2:]))
+    slot = np.full(len(system.problem.lenses), -1)
+    slot[estimated] = np.arange(len(estimated))
+    interval, camera = np.divmod(system.views, len(slot))
+    for part, rows in _equal_blocks(system.rows, system.bounds):
+        mine = slot[camera[part]] >= 0
+        at, of, J = interval[part[mine]], slot[camera[part[mine]]], rows[mine]
+        by_both = J[:, :, :local].mT @ J[:, :, local:-1]
+        crossed[at, :, of] += by_both[:, :h]
+        crossed[at + 1, :, of] += by_both[:, h:]
+        scores[at, of] = (J[:, :, -1:].mT @ J[:, :, local:-1])[:, 0]
+    return crossed, scores
+
+
+def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
+    """(S, d, S, d) Hessian of the cameras, with background points and priors."""
+    estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
+    of_row = np.repeat(system.views % len(system.problem.lenses), np.diff(system.bounds))
+    own = prior_information(system)
+    own += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
+    for k, camera in enumerate(estimated):
+        J = system.rows[of_row == camera, local:-1]
+        own[k, :, k] += J.T @ J
+    return own
 
 
 def _prior_gradient(system: LinearSystem) -> Array:
@@ -152,38 +190,9 @@ def prior_information(system: LinearSystem) -> Array:
     return H
 
 
-def _normal_equations(system: LinearSystem) -> Iterator[tuple[Index, Index, Array]]:
-    """Intervals, ascending, cameras, and augmented Hessians (v, m, m), of all views with the same number of rows."""
-    interval, camera = np.divmod(system.views, len(system.problem.lenses))
-    size = np.diff(system.bounds)
+def _equal_blocks(rows: Array, bounds: Index) -> Iterator[tuple[Index, Array]]:
+    """Indices (v,) of blocks of rows with the same size, and the blocks (v, n, m), for each size."""
+    size = np.diff(bounds)
     for n in np.unique(size).tolist():
-        views = np.flatnonzero(size == n)
-        rows = system.rows[system.bounds[views, None] + np.arange(n)]
-        yield interval[views], camera[views], np.swapaxes(rows, 1, 2) @ rows
-
-
-def _pair(columns: Array, local: int) -> Array:
-    """(L, 2 h, n) the rows (K h, n) of a chain by interval: those of its two knots."""
-    by_knot = columns.reshape(-1, local // 2, columns.shape[1])
-    return np.concatenate([by_knot[:-1], by_knot[1:]], axis=1)
-
-
-def _join(parts: Array) -> Array:
-    """(K h, n) sum of the parts (L, 2 h, n) of a chain, each of which shares its last h rows with the next."""
-    intervals, local, columns = parts.shape
-    joined = np.zeros((intervals + 1, local // 2, columns))
-    joined[:-1] += parts[:, : local // 2]
-    joined[1:] += parts[:, local // 2 :]
-    return joined.reshape(-1, columns)
-
-
-def _solve_chain(hessian: Array, right: Array) -> Array:
-    """(K h, n) solution of a chain of overlapping Hessians (L, 2 h, 2 h) for right-hand sides (K h, n)."""
-    from scipy.linalg import solveh_banded
-
-    intervals, local = hessian.shape[:2]
-    half, banded = local // 2, np.zeros((local, len(right)))
-    for a in range(local):
-        for b in range(a + 1):
-            banded[a - b, b : b + intervals * half : half] += hessian[:, a, b]
-    return np.asarray(solveh_banded(banded, right, lower=True), float)
+        part = np.flatnonzero(size == n)
+        yield part, rows[bounds[part, None] + np.arange(n)]

@@ -9,7 +9,8 @@ from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_preci
 from calib.rig.triangulation import JointCovariance, camera_jacobians
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
 from calib.wand.quality.grade import CameraQuality, RigQuality
-from calib.wand.result import NOT_RECORDED, WandCalibration
+from calib.wand.report import NOT_RECORDED
+from calib.wand.result import WandCalibration
 from camera_node.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert

@@ -24,7 +24,7 @@ from calib.wand.bundle_adjustment.problem import (
     WandObservations,
 )
 from calib.wand.bundle_adjustment.residuals import find_weights, whitened_errors
-from calib.wand.result import ClockJump
+from calib.wand.report import ClockJump
 from camera_node.arrays import Array
 
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,

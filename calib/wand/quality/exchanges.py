@@ -17,7 +17,7 @@ from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import State, WandObservations
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.bundle_adjustment.residuals import predict_markers
-from calib.wand.result import Exchange
+from calib.wand.report import Exchange
 from calib.wand.tracks import intersect
 from camera_node.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.precision_map import SIGMA_PX, PrecisionMap
-from calib.wand.result import Validation
+from calib.wand.report import Validation
 from camera_node.arrays import Mask
 
 GRADES = "ABCD"

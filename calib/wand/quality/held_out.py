@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.wand.bundle_adjustment.problem import State
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
-from calib.wand.result import Validation
+from calib.wand.report import Validation
 from calib.wand.tracks import interpolate, intersect
 from camera_node.arrays import Array, Index
 from camera_node.geometry.lens import Lens

@@ -28,7 +28,7 @@ struct FieldBasis {
                                 Lanes* to) const {
         Lanes X = x, Y = y, f[kLightFields];
         plane.map(X, Y);
-        FieldPlane::functions_of_light(X, Y, f);
+        functions_of_light(X, Y, f);
         for (int i = 0; i < kLightFields; ++i) to[kLight + i] = level * f[i], to[kGloss + i] = f[i];
         const Lanes by = -2.0f * ring * X * plane.stretch(X, Y);
         to[kBend] = by * f[2], to[kBend + 1] = by * f[3];
@@ -130,7 +130,7 @@ void add_sums(const FurtherSums<N>& sums, const LinearPart& part, FurtherProduct
 }
 
 struct ScoreSums {
-    Lanes cos3, sin3, bend, cos2, sin2, light;
+    Lanes cos3, sin3, bend, cos4, sin4, processing, cos2, sin2, light;
 };
 
 /// `delta` is a step of the parameters of the part's gradient.
@@ -148,7 +148,9 @@ ROUNDEL_CLONES void add_scores(const LinearPart& part, PartPixels at, const Fiel
                 const Lanes xx = X * X, yy = Y * Y, xy = X * Y, rr = xx + yy;
                 const Lanes by = -chunks->ring[k] * plane.stretch(X, Y), by_r = wr * by;
                 sums.cos3 += by_r * X * (xx - 3.0f * yy), sums.sin3 += by_r * Y * (3.0f * xx - yy);
-                sums.bend += w * by * by * rr * rr * rr;
+                const Lanes information = w * by * by * rr * rr * rr;
+                sums.bend += information, sums.processing += information * rr;
+                sums.cos4 += by_r * (rr * rr - 8.0f * xx * yy), sums.sin4 += by_r * 4.0f * xy * (xx - yy);
                 const Bits card = plane.is_card(rr);
                 const Lanes on_card = card ? wr : all(0), w_card = card ? w : all(0);
                 sums.cos2 += on_card * (xx - yy), sums.sin2 += on_card * xy;
@@ -193,7 +195,8 @@ FieldScores score_fields(const NormalEquations& equations, const EdgePixels& pix
     for (const LinearPart& part : equations.parts())
         add_scores(part, {pixels, part}, plane, step_of(step, part.edge, part.jacobian).data(), weighting,
                    sums);
-    return {score(sums.cos3, sums.sin3, sums.bend), score(sums.cos2, 2 * sums.sin2, sums.light)};
+    return {score(sums.cos3, sums.sin3, sums.bend), score(sums.cos2, 2 * sums.sin2, sums.light),
+            score(sums.cos4, sums.sin4, sums.processing), double(sum(sums.bend)) / 2};
 }
 
 }  // namespace roundel

@@ -12,13 +12,16 @@ namespace {
 constexpr int kFieldSteps = 8;
 constexpr double kFirstScale = 0.1;   // of the contrast: residuals of the first step
 constexpr double kFieldChange = 0.1;  // of a standard deviation: a smaller step ends the iteration
-// Standard deviations of the fields: light over its mean, gloss over the contrast, and the height of bent
-// paper over its width, as displacement with three periods at a tilt of 45 degrees.
-constexpr double kLightSigma = 0.3, kGlossSigma = 0.3, kBendSigma = 0.02, kLeastTilt = 0.05;
+// Standard deviations of the fields: light over its mean, and gloss over the contrast, both up to second
+// order and of third order, and the height of bent paper over its width, as displacement with three periods
+// at a tilt of 45 degrees.
+constexpr double kLightSigma = 0.3, kCubicSigma = 0.05, kBendSigma = 0.02, kLeastTilt = 0.05;
 // Residuals from which a fit is no roundel on bent paper, over the contrast: a bend of 2 % leaves 0.14 at 160
 // px.
 constexpr double kMaxBentResidual = 0.2;
-constexpr double kMeanBend = 2, kOtherBend = 0.3;  // of the bend that shows: its mean part, and deviations
+// Standard deviation of the level around a card in uneven light, over the contrast: no function of light is
+// as good there as on the print.
+constexpr double kUnevenGround = 0.04;
 
 }  // namespace
 
@@ -27,7 +30,7 @@ bool PhotometricFitter::shows_bend() {
     Parameters step = p_;
     for (int i = 0; i < kCount; ++i) step[i] -= linearized_at_[i];
     scores_ = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
-    scores_.bend /= square(noise_), scores_.light /= square(noise_);
+    for (double* score : {&scores_.bend, &scores_.light, &scores_.processing}) *score /= square(noise_);
     return allowed_ == AllowedFields::kBend && scores_.bend > kUnlikelyField &&
            scale_ < kMaxBentResidual * contrast();
 }
@@ -39,8 +42,9 @@ Vector<kFields> PhotometricFitter::field_prior() const {
     constexpr double kNever = 1e-9;
     Vector<kFields> prior;
     for (int i = 0; i < kLightFields; ++i) {
-        prior[size_t(kLight + i)] = from_sigma(light ? kLightSigma : kNever);
-        prior[size_t(kGloss + i)] = from_sigma(light ? kGlossSigma * contrast() : kNever);
+        const double sigma = !light ? kNever : i < kCubic ? kLightSigma : kCubicSigma;
+        prior[size_t(kLight + i)] = from_sigma(sigma);
+        prior[size_t(kGloss + i)] = from_sigma(sigma * contrast());
     }
     prior[kBend] = prior[kBend + 1] = from_sigma(kBendSigma * std::max(kLeastTilt, fields_.frame.tilt()));
     return prior;
@@ -52,6 +56,7 @@ bool PhotometricFitter::fit_fields() {
     fields_ = {FieldFrame(p_), {}}, has_fields_ = true;
     fields_.frame.x += pixels_.origin_x, fields_.frame.y += pixels_.origin_y;
     const Vector<kFields> prior = field_prior();
+    const double ground = spread_;  // that the fit in even light shows
     for (int k = 0; k < kFieldSteps; ++k) {
         if (!select(whole_band(), EdgePixels::kMax)) return false;
         equations_.linearize(pixels_, p_), linearized_at_ = p_;
@@ -59,6 +64,8 @@ bool PhotometricFitter::fit_fields() {
         // The first step weights all pixels: what the fields explain shall not count as outliers.
         scale_ = k ? std::clamp(scale_, kStrictScale * seen, kSlackScale * seen)
                    : std::max(seen, kFirstScale * contrast());
+        if (allowed_ == AllowedFields::kAll)
+            spread_ = std::max(ground, kPatch * square(kUnevenGround * contrast() / scale_));
         if (!solve(scale_)) return false;
         double moved = 0;
         if (!step_with_fields(prior, moved) || !is_sane(kFitLimits)) return false;
@@ -105,47 +112,47 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
     return true;
 }
 
-/// Adds what the errors of the fields contribute to the covariance, in units of the noise, and the bend that
-/// the picture does not show: paper bends to a cylinder, so its mean curvature is as large as the part that
-/// shows, but of unknown sign. It changes the perspective by twice the bend along the minor axis.
+/// Adds what the errors of the fields contribute to the covariance, in units of the noise.
 void PhotometricFitter::add_fields(PoseCovariance& inverse) const {
     for (size_t a = 0; a < kFields; ++a)
         for (size_t b = 0; b < kFields; ++b)
             for (size_t i = 0; i < kPoseCount; ++i)
                 for (size_t j = 0; j < kPoseCount; ++j)
                     inverse[i][j] += by_field_[a][kX + i] * field_cov_[a][b] * by_field_[b][kX + j];
-    const double bend = fields_.bend() / noise_, mean = kMeanBend * bend, other = kOtherBend * bend;
-    const double w[] = {fields_.frame.cos, fields_.frame.sin};
-    for (size_t i = 0; i < 2; ++i)
-        for (size_t j = 0; j < 2; ++j)
-            inverse[kGx - kX + i][kGx - kX + j] += square(mean) * w[i] * w[j] + (i == j ? square(other) : 0);
-    // The mean height moves the disc towards the camera.
-    const double height = mean / std::max(kLeastTilt, fields_.frame.tilt()) * fields_.frame.major;
-    const Parameter shape[] = {kAxx, kAxy, kAyy};
-    for (const int i : shape)
-        for (const int j : shape) inverse[i - kX][j - kX] += p_[i] * p_[j] * square(height / kShortestFocal);
+}
+
+/// The bend that the fit contains, or what the residuals show of one that it does not.
+Bend PhotometricFitter::bend() const {
+    if (has_fields_)
+        return {square(fields_.bend()),
+                square(noise_) * (field_cov_[kBend][kBend] + field_cov_[kBend + 1][kBend + 1]) / 2,
+                scores_.processing};
+    if (!(scores_.bend_information > 0)) return {};
+    const double variance = square(noise_) / scores_.bend_information;
+    return {scores_.bend * variance, variance, scores_.processing};
 }
 
 /// Includes the two unknowns of a linear shading in the pose, after convergence: with C the products of their
-/// columns with those of the parameters, D their own and e their residuals,
-///   S = D + prior - C^T H^-1 C,  shading = S^-1 (e - C^T step),  pose <- pose - (H^-1 C shading)_pose.
+/// columns with those of the parameters, D their own, e their residuals, and L and m the information and the
+/// mean of the prior,
+///   S = D + L - C^T H^-1 C,  shading = S^-1 (e - C^T step + L m),  pose <- pose - (H^-1 C shading)_pose.
 /// The covariance grows by H^-1 C S^-1 C^T H^-1. The shading is relative to the level at the pixels' origin.
 void PhotometricFitter::allow_shading() {
     const auto products = shading_products(equations_, pixels_, {scale_, spread_});
     const auto& [Cx, Cy] = products.parameters;
     const Parameters yx = factor_->halfway(Cx), yy = factor_->halfway(Cy);
     Symmetric S{products.own[0][0], products.own[1][0], products.own[1][1]};
-    auto [ex, ey] = products.residuals;
+    double ex = products.residuals[0] / slope_, ey = products.residuals[1] / slope_;
     for (int i = 0; i < kCount; ++i) {
         const double step = p_[i] - linearized_at_[i];
         ex -= Cx[i] * step, ey -= Cy[i] * step;
         S.xx -= yx[i] * yx[i], S.xy -= yx[i] * yy[i], S.yy -= yy[i] * yy[i];
     }
     if (!(S.det() > 0 && S.xx > 0)) return;
-    shading_ = {(square(S.yy * ex - S.xy * ey) + square(S.xx * ey - S.xy * ex)) / square(S.det()),
+    shading_ = {(S.yy * ex - S.xy * ey) / S.det(), (S.xx * ey - S.xy * ex) / S.det(),
                 square(noise_) * (S.xx + S.yy) / (2 * S.det())};
-    const double prior = square(noise_ / shading_sigma_);
-    S.xx += prior, S.yy += prior;
+    const double prior = square(noise_ / light_.sigma);
+    S.xx += prior, S.yy += prior, ex += prior * light_.x, ey += prior * light_.y;
     const double det = S.det();
     const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
     const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);

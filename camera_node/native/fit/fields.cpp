@@ -20,7 +20,7 @@ ROUNDEL_CLONES void remove(const FieldPlane& plane, const float* of, float along
         const Lanes x = load(pixels.x + k), y = load(pixels.y + k), level = load(pixels.level + k);
         Lanes X = x, Y = y, f[kLightFields], light = all(1), gloss{};
         plane.map(X, Y);
-        FieldPlane::functions_of_light(X, Y, f);
+        functions_of_light(X, Y, f);
         for (int i = 0; i < kLightFields; ++i) light += of[kLight + i] * f[i], gloss += of[kGloss + i] * f[i];
         const Lanes least = light > kLeastLight ? light : all(kLeastLight);
         const Lanes even = clamped((level - gloss) / least, all(kDarkest), all(kBrightest));
@@ -57,8 +57,8 @@ double Fields::even_level(double x, double y, double level) const {
     const double dx = x - frame.x, dy = y - frame.y;
     const double X = (frame.cos * dx + frame.sin * dy) / frame.minor,
                  Y = (frame.cos * dy - frame.sin * dx) / frame.major;
-    const double f[] = {X, Y, X * X - Y * Y, 2 * X * Y, X * X + Y * Y};
-    double light = 1, gloss = 0;
+    double f[kLightFields], light = 1, gloss = 0;
+    functions_of_light(X, Y, f);
     for (size_t i = 0; i < kLightFields; ++i) light += of[kLight + i] * f[i], gloss += of[kGloss + i] * f[i];
     return (level - gloss) / std::max(light, double(kLeastLight));
 }

@@ -7,12 +7,22 @@ namespace roundel {
 
 /// What changes the picture of a roundel beside its model, as coefficients of functions of the place in the
 /// disc's plane (docs/detector_model.md, section 3b). In coordinates X, Y in outer radii, with X along the
-/// minor axis of the image, the functions of light are X, Y, X^2 - Y^2, 2 X Y and X^2 + Y^2.
+/// minor axis of the image, the functions of light are X, Y, X^2 - Y^2, 2 X Y, X^2 + Y^2 and the four of
+/// third order, X^3 - 3 X Y^2, 3 X^2 Y - Y^3, X (X^2 + Y^2) and Y (X^2 + Y^2).
 ///
 /// Light on the print multiplies the levels, gloss is added to them. Paper that is bent out of its plane
 /// moves along the minor axis; X^2 - Y^2 and 2 X Y are the parts of a curvature that its picture shows.
-enum Field { kLight = 0, kGloss = 5, kBend = 10 };
+enum Field { kLight = 0, kGloss = 9, kBend = 18 };
 constexpr int kLightFields = kGloss - kLight, kFields = kBend + 2;
+constexpr int kCubic = 5;  // the first function of light of third order
+
+/// The functions of light at (X, Y): numbers or lanes of them.
+template <typename T>
+ROUNDEL_INLINE void functions_of_light(const T& X, const T& Y, T (&f)[kLightFields]) {
+    const T xx = X * X, yy = Y * Y, rr = xx + yy;
+    f[0] = X, f[1] = Y, f[2] = xx - yy, f[3] = X * Y + X * Y, f[4] = rr;
+    f[5] = X * (rr - 4 * yy), f[6] = Y * (4 * xx - rr), f[7] = X * rr, f[8] = Y * rr;
+}
 
 /// The coordinates X and Y of pixels, for the pose in `p`.
 struct FieldFrame {
@@ -52,10 +62,6 @@ class FieldPlane {
     }
     /// Whether the light of the ground beyond the card does not show; -1 where it is true.
     ROUNDEL_INLINE Bits is_card(const Lanes& squared) const { return squared < reach_; }
-    ROUNDEL_INLINE static void functions_of_light(const Lanes& X, const Lanes& Y, Lanes (&f)[kLightFields]) {
-        const Lanes xx = X * X, yy = Y * Y;
-        f[0] = X, f[1] = Y, f[2] = xx - yy, f[3] = 2.0f * X * Y, f[4] = xx + yy;
-    }
 
   private:
     float x_, y_, xx_, xy_, yx_, yy_, per_minor_, per_major_, reach_;

@@ -31,6 +31,7 @@ constexpr double kScale = 1.06;      // standard deviation of Gaussian noise ove
 constexpr double kNoiseFloor = 1;    // grey levels
 constexpr double kGroundChance = 4;  // standard deviations of the ground's residuals, by noise
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
+constexpr double kReweighed = 0.1;   // of a step that changes the weights of residuals: what is left of it
 constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
@@ -51,8 +52,8 @@ PhotometricFitter::PhotometricFitter(const ImageView& image, const InitialGuess&
     : image_(image),
       occlusion_(guess.occlusion),
       resumed_(guess.model.has_value()),
-      shading_sigma_(guess.shading_sigma),
-      curvature_sigma_(guess.curvature_sigma),
+      light_(guess.light),
+      tone_(guess.tone),
       allowed_(guess.occlusion.any() ? AllowedFields::kNone : guess.fields) {
     pixels_.origin_x = int(std::lround(guess.outer.x));
     pixels_.origin_y = int(std::lround(guess.outer.y));
@@ -139,7 +140,7 @@ bool PhotometricFitter::weigh_ground() {
     posterior_ratio_ = 0, print_effect_ = curvature_effect_ = {}, shading_effect_ = {};
     const double scale = scale_;
     if (!solve(scale)) return false;
-    const double left = square(advance(scale)) / p_[kBlur];
+    const double left = kReweighed * advance(scale);
     return is_sane(kFitLimits) && (is_converged(left) || iterate(pixels_, 1));
 }
 
@@ -202,13 +203,19 @@ PoseCovariance PhotometricFitter::pose_covariance() const {
 }
 
 RoundelFit PhotometricFitter::fit() const {
-    RoundelFit fit = make_fit(p_, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
+    Parameters print = p_;
+    const Parameters effect = effect_of_curvature(curvature_);
+    for (int i = 0; i < kCount; ++i) print[i] -= effect[i];
+    RoundelFit fit = make_fit(print, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
+    for (const int i : {kAxx, kAyy, kRatio}) fit.p[i] = p_[i];
     if (posterior_ratio_ > 0) fit.p[kRatio] = posterior_ratio_;
+    fit.ratio = ratio(), fit.curvature = expected_curvature_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = scale_, fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;
     fit.shading = shading_, fit.clipped = clipped_;
     fit.uneven = scores_.light > kUnlikelyField, fit.fields = fields_;
+    fit.bend = bend();
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;
 }
@@ -223,8 +230,9 @@ static bool converges(PhotometricFitter& fitter, const InitialGuess& guess) {
 /// The fit at a solution, with what is known of levels, prints and light.
 static RoundelFit conclude(PhotometricFitter& fitter, const InitialGuess& guess) {
     fitter.use_plateaus();
+    fitter.expect_curvature(guess.curvature_sigma);
     if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
-    if (guess.shading_sigma > 0 && !fitter.knows_light()) fitter.allow_shading();
+    if (guess.light.sigma > 0 && !fitter.knows_light()) fitter.allow_shading();
     return fitter.fit();
 }
 

@@ -8,6 +8,7 @@
 #include "fit/fields.hpp"
 #include "fit/occlusion.hpp"
 #include "fit/roundel_limits.hpp"
+#include "fit/tone_remainder.hpp"
 #include "numeric/ellipse.hpp"
 #include "numeric/image.hpp"
 
@@ -22,6 +23,12 @@ constexpr double kEdgeShift = 0.5908179503;
 /// The fields that a fit may contain if the residuals show them.
 enum class AllowedFields { kNone, kBend, kAll };
 
+/// The linear change of the light that is expected across a roundel: relative, per pixel, and the standard
+/// deviation of each component; none if that is 0.
+struct LightGradient {
+    double x = 0, y = 0, sigma = 0;
+};
+
 /// The initial guess of a fit: an ellipse within a pixel, the ratio of the diameters, and the grey levels.
 struct InitialGuess {
     Ellipse outer;
@@ -31,8 +38,9 @@ struct InitialGuess {
     std::optional<Parameters> model{};  // in the image's frame, within a third of a pixel, if known
     double noise = 0;                   // noise that the fit of `model` estimated,
     double ground = 0;                  // and `RoundelFit::ground`
-    double shading_sigma = 0;           // of the relative change of the light, per pixel; 0 for none
-    double curvature_sigma = 0;         // of the curvature that is left in the tone curve; 0 for none
+    LightGradient light{};
+    const ToneRemainder* tone = nullptr;  // expected to be left of the tone curve
+    double curvature_sigma = 0;           // of the curvature that is left beside it; 0 for none
     AllowedFields fields = AllowedFields::kNone;
 };
 
@@ -46,10 +54,17 @@ inline PoseCovariance scaled(PoseCovariance covariance, double factor) {
     return covariance;
 }
 
-/// The linear change of the light across a roundel that the pixels alone show: the squared length of the
-/// relative gradient and the variance of each of its components, per square pixel.
+/// The linear change of the light across a roundel that the pixels alone show: relative, per pixel, and the
+/// variance of each component; 0 if it was not measured.
 struct Shading {
-    double squared = 0, variance = 0;
+    double x = 0, y = 0, variance = 0;
+};
+
+/// The bend of the paper that the residuals show (docs/detector_model.md, section 3b): the squared length of
+/// its two components and the variance of each, square minor half axes; 0 and 0 if it was not measured.
+/// `processing` is the score of displacements that no bend makes (`FieldScores`).
+struct Bend {
+    double squared = 0, variance = 0, processing = 0;
 };
 
 /// A roundel fitted to the grey levels around its edges.
@@ -57,14 +72,17 @@ struct RoundelFit {
     Ellipse outer;
     double offset_x, offset_y;  // from the ellipse's centre to the image of the disc's centre, pixels
     PoseCovariance pose_cov;
-    double ratio;             // inner over outer diameter, measured without the prior of the print
-    double ratio_sigma;       // its standard deviation
-    double dark, bright;      // grey levels
-    double blur;              // standard deviation of the edges' spread including the pixel's width, pixels
-    double edge_residual;     // RMS over the ring's edges, each pixel weighted by its squared slope
-    double support;           // share of the ring's edges that is in the image and agrees with the model
-    Parameters p;             // of the model, in the image's frame; the ratio is that given a known print
-    bool unoccluded = false;  // the fit uses the unmodified image, all around
+    double ratio;          // inner over outer diameter, measured without the prior of the print
+    double ratio_sigma;    // its standard deviation
+    double curvature = 0;  // of the tone curve, whose effect was removed from ratio and outline
+    double dark, bright;   // grey levels
+    double blur;           // standard deviation of the edges' spread including the pixel's width, pixels
+    double edge_residual;  // RMS over the ring's edges, each pixel weighted by its squared slope
+    double support;        // share of the ring's edges that is in the image and agrees with the model
+    /// Parameters of the model that describes the image, in its frame: with the effect of the tone curve, and
+    /// the ratio given a known print.
+    Parameters p;
+    bool unoccluded = false;            // the fit uses the unmodified image, all around
     double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
     double noise = 0;                   // standard deviation of the residuals, grey levels
     /// How much less pixels count that see the ground: its variance over that of the noise, times the pixels
@@ -75,6 +93,7 @@ struct RoundelFit {
     bool uneven = false;     // the residuals show light that changes by more than the fit contains
     double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
     Fields fields{};         // that the fit contains, in the image's frame
+    Bend bend{};
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {

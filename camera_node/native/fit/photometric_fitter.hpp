@@ -38,7 +38,8 @@ class PhotometricFitter : GaussNewton<kCount> {
     bool sees_clutter() const;
     /// Weights the pixels that see the ground as these residuals require, and solves again.
     bool weigh_ground();
-    double ratio() const { return p_[kRatio]; }
+    /// Measured, without the expected effect of the tone curve.
+    double ratio() const { return p_[kRatio] - effect_of_curvature(expected_curvature_)[kRatio]; }
     RoundelFit fit() const;
 
     // field_fit.cpp
@@ -56,6 +57,8 @@ class PhotometricFitter : GaussNewton<kCount> {
     void use_plateaus();
 
     // print_prior.cpp
+    /// Looks up the curvature between the levels of ink and paper; `sigma` is that of what remains.
+    void expect_curvature(double sigma);
     /// Conditions the estimate on a print.
     void use_print(const Print& print);
 
@@ -76,9 +79,10 @@ class PhotometricFitter : GaussNewton<kCount> {
     bool condition_on_plateau(Parameter level, const Plateau& plateau, Parameters& g);
     bool condition_on_print(const Print& print);
     Parameters covariance_with_ratio() const;
-    Parameters effect_of_curvature() const;
+    Parameters effect_of_curvature(double curvature) const;
     PoseCovariance pose_covariance() const;
     void add_fields(PoseCovariance& inverse) const;
+    Bend bend() const;
 
     bool step_with_fields(const Vector<kFields>& prior, double& moved);
     Vector<kFields> field_prior() const;
@@ -96,7 +100,10 @@ class PhotometricFitter : GaussNewton<kCount> {
     double scale_ = 255, noise_ = 0, slope_ = 1;
     double spread_ = 0, ground_ = 0;  // of the ground: in the last solution, and as its residuals show
     bool resumed_, clipped_ = false;
-    double shading_sigma_, curvature_sigma_;
+    LightGradient light_;
+    double curvature_sigma_ = 0;
+    const ToneRemainder* tone_;
+    double expected_curvature_ = 0, curvature_ = 0;  // of the tone curve: before and after the print is used
     Vector<kPoseCount>
         curvature_effect_{};  // its outer product is what the tone curve adds to the covariance
     Shading shading_;

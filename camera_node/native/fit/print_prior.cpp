@@ -9,6 +9,7 @@ namespace roundel {
 namespace {
 
 constexpr double kMaxPrintError = 3;  // standard deviations
+constexpr double kFirstOrder = 0.5;   // share of an expected curvature's effect that the first order may miss
 
 }  // namespace
 
@@ -24,29 +25,41 @@ Parameters PhotometricFitter::covariance_with_ratio() const {
     return with;
 }
 
-/// The displacement of the estimate by one standard deviation of the curvature that is left in the camera's
-/// tone curve: both edges move into the ring.
-Parameters PhotometricFitter::effect_of_curvature() const {
-    const double shift = curvature_sigma_ * kEdgeShift * p_[kBlur];
+/// The displacement of the estimate in the image by a curvature of the tone curve: both edges move into the
+/// ring.
+Parameters PhotometricFitter::effect_of_curvature(double curvature) const {
+    const double shift = curvature * kEdgeShift * p_[kBlur];
     const double radius = std::sqrt(p_[kAxx] * p_[kAyy] - square(p_[kAxy]));
     Parameters effect{};
     effect[kAxx] = effect[kAyy] = -shift, effect[kRatio] = shift * (1 + p_[kRatio]) / radius;
     return effect;
 }
 
+void PhotometricFitter::expect_curvature(double sigma) {
+    expected_curvature_ = curvature_ = tone_ ? tone_->curvature(p_[kDark], p_[kBright]) : 0;
+    curvature_sigma_ = std::hypot(sigma, kFirstOrder * expected_curvature_);
+    const Parameters bent = effect_of_curvature(curvature_sigma_);
+    for (int i = 0; i < kPoseCount; ++i) curvature_effect_[i] = bent[kX + i] / noise_;
+}
+
 /// Conditions the Gaussian posterior on the print's ratio; false if that ratio is unlikely. What is left of
-/// the tone curve is one more unknown, with a prior: the difference of the ratios shows it.
+/// the tone curve is one more unknown, with a prior: the difference of the ratios shows it. The estimate
+/// remains that of the image, which contains the effect of the tone curve.
 bool PhotometricFitter::condition_on_print(const Print& print) {
-    Parameters with = covariance_with_ratio();
-    const Parameters bent = effect_of_curvature();
-    for (int i = 0; i < kCount; ++i) with[i] += bent[i] * bent[kRatio];
-    const double off = print.ratio - p_[kRatio], variance = with[kRatio] + square(print.sigma);
+    const Parameters with = covariance_with_ratio(), bent = effect_of_curvature(curvature_sigma_);
+    const double seen = print.ratio + effect_of_curvature(expected_curvature_)[kRatio];
+    const double off = seen - p_[kRatio];
+    const double variance = with[kRatio] + square(bent[kRatio]) + square(print.sigma);
     if (square(off) > square(kMaxPrintError) * variance) return false;
+    for (int i = 0; i < kPoseCount; ++i) {
+        const double both = with[kX + i] + bent[kX + i] * bent[kRatio];
+        curvature_effect_[i] = bent[kX + i] / noise_;
+        print_effect_[i] = both / (noise_ * std::sqrt(variance));
+    }
+    posterior_ratio_ = p_[kRatio] + with[kRatio] * off / variance;
+    curvature_ = expected_curvature_ - curvature_sigma_ * bent[kRatio] * off / variance;
     for (int i = 0; i < kCount; ++i)
         if (i != kRatio) p_[i] += with[i] * off / variance;  // the tests need the measured ratio
-    for (int i = 0; i < kPoseCount; ++i) curvature_effect_[i] = bent[kX + i] / noise_;
-    for (int i = 0; i < kPoseCount; ++i) print_effect_[i] = with[kX + i] / (noise_ * std::sqrt(variance));
-    posterior_ratio_ = p_[kRatio] + with[kRatio] * off / variance;
     return true;
 }
 
@@ -57,7 +70,7 @@ void PhotometricFitter::use_print(const Print& print) {
     if (condition_on_print(print) || has_fields_) return;
     const auto saved = std::tuple(p_, factor_, sums_, noise_, scale_);
     const Parameters with = covariance_with_ratio();
-    const double off = print.ratio - p_[kRatio];
+    const double off = print.ratio + effect_of_curvature(expected_curvature_)[kRatio] - p_[kRatio];
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kFitLimits)) {
         equations_.linearize(pixels_, p_), linearized_at_ = p_;

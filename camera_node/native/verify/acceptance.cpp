@@ -106,7 +106,7 @@ std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess&
                                      const AcceptanceContext& context) {
     const auto fit = fit_smoothed(image, guess);
     const Tolerance tolerance{guess.outer.major < kMinRagged ? kMisfit : kRaggedMisfit, kMaxRaggedGrowth};
-    const AcceptanceContext smoothed{context.limits, context.noise * 6 / 16};
+    const AcceptanceContext smoothed{context.limits, context.light, context.noise * 6 / 16};
     return fit && passes(image, *fit, smoothed, tolerance) ? fit : std::nullopt;
 }
 
@@ -154,7 +154,8 @@ struct TestedFit {
 /// Applies the tests of a fit to the unmodified image, all around.
 TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceContext& context) {
     TestedFit tested{fit, std::nullopt, true, false};
-    if (!is_explained_by_noise(fit, context.noise)) tested.misfit.emplace(image, fit.p, fit.fields);
+    if (fit.fields.has_light() || !is_explained_by_noise(fit, context.noise))
+        tested.misfit.emplace(image, fit.p, fit.fields);
     const auto& misfit = tested.misfit;
     if (misfit) tested.fit.correlation = misfit->correlation(fit.noise, {});
     tested.elliptic = !misfit || has_elliptic_edges(*misfit, fit, context.noise);
@@ -168,9 +169,9 @@ TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceCo
 /// The fit with all fields, if it shows the whole roundel: highlights and shadows change the residuals as an
 /// occlusion does, but smoothly.
 std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, const RoundelFit& fit,
-                                    const AcceptanceContext& context) {
+                                    double ground, const AcceptanceContext& context) {
     guess.outer = fit.outer, guess.model = fit.p, guess.noise = fit.noise, guess.fields = AllowedFields::kAll;
-    guess.ground = 0;
+    guess.ground = ground;
     const auto even = fit_photometric(image, guess);
     if (!even) return std::nullopt;
     // Residuals that processing leaves around all of the ring remain.
@@ -214,14 +215,15 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
     // A cover biases ratio, card, residuals and levels, but neither contrast nor size.
     if (failure == Refusal::kContrast || failure == Refusal::kSize || (failure && !covered)) return failure;
     if (covered) return Refusal::kCover;
-    if (!has_black_ink(fit)) return Refusal::kContrast;
+    if (!has_black_ink(fit)) return Refusal::kPaleInk;
     return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt : std::optional(Refusal::kEdges);
 }
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.prints = context.limits.prints, guess.shading_sigma = context.shading_sigma;
-    guess.curvature_sigma = context.curvature_sigma, guess.fields = AllowedFields::kBend;
+    guess.prints = context.limits.prints, guess.light = context.light.at(guess.outer.x, guess.outer.y);
+    guess.curvature_sigma = context.curvature_sigma, guess.tone = context.tone;
+    guess.fields = AllowedFields::kBend;
     const auto fits = fit_on_ground(image, guess);
     if (!fits) return std::nullopt;
     const RoundelFit* const first = &fits->even;
@@ -230,11 +232,18 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     // Before the camera is known, its tone curve and its processing look like uneven light.
     if (context.edge_noise > 0 && (first->uneven || !tested.fit.unoccluded) &&
         is_within_limits(*first, context.limits))
-        if (const auto even = fit_uneven(image, guess, *first, context);
+        if (const auto even =
+                fit_uneven(image, guess, *first, fits->weighed ? fits->weighed->ground : 0, context);
             even && (known || tested.accepted || is_certain_roundel(image, even->fit, guess, context.noise)))
             tested = *even;
-    if (is_even && fits->weighed && is_same_ring(*fits->weighed, *first))
-        tested.fit = as_tested(*fits->weighed, tested.fit);
+    if (fits->weighed && is_same_ring(*fits->weighed, *first)) {
+        const RoundelFit weighed = as_tested(*fits->weighed, tested.fit);
+        // The ground displaces a small fit, whose residuals then look like those of an occlusion.
+        if (is_even)
+            tested.fit = weighed;
+        else if (context.edge_noise > 0 && !first->uneven && !tested.fit.unoccluded)
+            if (const TestedFit again = test(image, weighed, context); again.accepted) tested = again;
+    }
     auto& [fit, misfit, elliptic, accepted] = tested;
     if (fit.fields.has_light())
         fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));

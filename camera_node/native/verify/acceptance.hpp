@@ -5,6 +5,7 @@
 #include "fit/photometric_fit.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
+#include "verify/light_falloff.hpp"
 
 namespace roundel {
 
@@ -28,7 +29,8 @@ enum class Refusal {
     kEdges,      // not elliptic
     kInside,     // ring or hole have places with a wrong level
     kCover,      // a part is covered, and the rest does not suffice
-    kBullseye    // further rings around it
+    kBullseye,   // further rings around it
+    kPaleInk     // a ring so thin that a thinner, black one may look the same
 };
 
 /// The limit that a fit exceeds, if any.
@@ -40,11 +42,12 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 /// What the acceptance tests of a frame depend on, beside the fit.
 struct AcceptanceContext {
     const RoundelLimits& limits;
+    const LightFalloff& light;   // of this camera
     double noise;                // of the image, grey levels
     double edge_noise = 0;       // residual at the edges of this camera's roundels, grey levels; 0 if unknown
-    double shading_sigma = 0;    // of this camera's light, relative, per pixel
     double curvature_sigma = 0;  // of what is left of this camera's tone curve
     double correlation = 1;      // of residuals that its processing makes (`EdgeMisfit::correlation`)
+    const ToneRemainder* tone = nullptr;  // expected to be left of its tone curve
 };
 
 /// Fits a roundel and applies the acceptance tests that reject false positives. If the fit to the unmodified

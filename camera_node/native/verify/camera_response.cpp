@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
 
 #include "verify/print_ratios.hpp"
 
@@ -13,22 +12,22 @@ namespace {
 
 constexpr double kMinDiameter = 12;               // pixels: ratio and blur of smaller roundels are correlated
 constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
-constexpr double kMaxCurvature = 1.4;             // of a tone curve between ink and paper
-constexpr double kMaxLogExponent = 1.2;           // 3.3
+constexpr double kMaxLogExponent = 0.9;           // 2.5: steeper ones enlarge what compression leaves
 constexpr int kHalvings = 16;                     // of the interval of exponents
 // A print that is only assumed or estimated: smaller roundels and more negative curvatures may be those of
 // another print.
 constexpr double kMaxByCurvature = 0.06, kMinAssumed = -0.3;
-constexpr double kMinTone = 0.1;        // logarithm of an exponent: smaller ones count as linear
-constexpr double kMaxLinear = 0.1;      // logarithm, up to which a measurement is exact to a hundredth
-constexpr double kMinChange = 0.02;     // of the logarithm
-constexpr double kMaxSigma = 0.15;      // of the logarithm, from which it is used
-constexpr double kFirstShading = 2e-4;  // per pixel: a tenth across half of a picture
-constexpr double kLeastShading = 2e-5;
-constexpr double kMaxShadingSigma = 2e-3;  // of one measurement
-constexpr size_t kMaxMeasured = 8;         // roundels of a frame
-constexpr double kMedianSquare = 0.455;    // of a normal variable of variance 1
-constexpr double kMemory = 0.2;            // weight of a new frame
+constexpr double kSecondOrder = 0.15;  // error of a measured curvature, over its square
+constexpr double kMinTone = 0.1;       // logarithm of an exponent: smaller ones count as linear
+constexpr double kMaxLinear = 0.1;     // logarithm, up to which a measurement is exact to a hundredth
+constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
+constexpr double kMinChange = 0.02;  // of the logarithm
+constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used
+constexpr size_t kMaxMeasured = 8;   // roundels of a frame
+constexpr unsigned kFirstFits = 16;  // frames after which the tone curve is fitted in one of
+constexpr unsigned kFitInterval = 8;     // so many
+constexpr double kMedianSquare = 0.455;  // of a normal variable of variance 1
+constexpr double kMemory = 0.2;          // weight of a new frame
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255.
@@ -54,7 +53,7 @@ T& median_by(std::vector<T>& values, const Key& key) {
 
 }  // namespace
 
-CameraResponse::CameraResponse() : shading_(square(kFirstShading)) { set_exponent(0); }
+CameraResponse::CameraResponse() { set_exponent(0); }
 
 std::optional<double> CameraResponse::exponent() const {
     return knows_tone_ ? std::optional(std::exp(log_exponent_)) : std::nullopt;
@@ -71,29 +70,61 @@ ImageView CameraResponse::linearize(const ImageView& image) {
 }
 
 bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits) {
-    learn_edge_noise(fits), learn_shading(fits);
+    learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
     const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
     for (size_t k = 0; k < fits.size(); k += step)
-        if (const auto estimate = measure(*fits[k], limits)) measured.push_back(*estimate);
+        if (const auto estimate = measure(*fits[k], limits)) {
+            measured.push_back(estimate->power);
+            tone_.include(estimate->sample);
+        }
     if (knows_tone_) learn_curvature(fits, limits);
-    return !measured.empty() && learn_tone(std::move(measured));
+    if (measured.empty()) return false;
+    const bool changed = learn_tone(std::move(measured));
+    learn_remainder(changed);
+    return changed;
 }
 
 /// What the difference between the measured ratio and the print's says about the tone curve. A curve that
 /// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
-std::optional<CameraResponse::ToneEstimate> CameraResponse::measure(const RoundelFit& fit,
-                                                                    const RoundelLimits& limits) const {
+std::optional<CameraResponse::ToneMeasurement> CameraResponse::measure(const RoundelFit& fit,
+                                                                       const RoundelLimits& limits) const {
     if (fit.outer.major < kMinDiameter || fit.dark < kDarkest || fit.bright > kBrightest) return std::nullopt;
     const Print& print = nearest_print(limits.prints, fit.ratio);
     const double by_curvature = ratio_by_curvature(fit, print.ratio);
-    const double curvature = (fit.ratio - print.ratio) / by_curvature;
+    const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
     if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
-    if (!print.is_exact() && (by_curvature > kMaxByCurvature || curvature < kMinAssumed)) return std::nullopt;
+    if (!print.is_exact() && (by_curvature > kMaxByCurvature || left < kMinAssumed)) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
-    return ToneEstimate{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)};
+    const double middle = fit.dark + (0.5 + curvature / 4) * fit.contrast();
+    const double exact = std::hypot(sigma, kSecondOrder * square(curvature));
+    return ToneMeasurement{{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)},
+                           {encoded(fit.dark), encoded(middle), encoded(fit.bright), exact}};
+}
+
+/// A level of the linearized image, as the camera encoded it.
+EncodedLevel CameraResponse::encoded(double level) const {
+    return EncodedLevel(std::pow(std::max(level, 0.0) / 255, std::exp(-log_exponent_)));
+}
+
+/// What the tone curve leaves beside the power, if the power does not describe it.
+void CameraResponse::learn_remainder(bool linearization_changed) {
+    if (n_learned_++ % kFitInterval && n_learned_ > kFirstFits && !linearization_changed) return;
+    tone_.fit();
+    const double exponent = std::exp(log_exponent_);
+    const bool differs = tone_.has_shoulder() || std::abs(std::log(tone_.exponent() / exponent)) > kMinTone;
+    const bool is_power = !differs || tone_.left_by(exponent) < kMinLeft;
+    if (is_power == remainder_.any() || sigma_ == 0) knows_curvature_ = false;
+    if (is_power) {
+        remainder_ = {};
+        return;
+    }
+    std::array<double, 256> light;
+    for (int level = 0; level < 256; ++level)
+        light[size_t(level)] = tone_.light(std::pow(level / 255.0, 1 / exponent));
+    remainder_ = ToneRemainder(light);
 }
 
 void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
@@ -107,19 +138,6 @@ void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits
     const double gain = edge_noise_ > 0 ? kMemory : 1;
     edge_noise_ += gain * (residual - edge_noise_);
     correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
-}
-
-/// The measured gradients contain the noise of their measurement. The squared length of a gradient with
-/// independent components has the median 2 ln 2 variances.
-void CameraResponse::learn_shading(const std::vector<const RoundelFit*>& fits) {
-    std::vector<double> excess;
-    for (const RoundelFit* fit : fits)
-        if (fit->shading.variance > 0 && fit->shading.variance < square(kMaxShadingSigma))
-            excess.push_back(fit->shading.squared / (2 * std::numbers::ln2) - fit->shading.variance);
-    if (excess.empty()) return;
-    const double variance = median_by(excess, [](double value) { return value; });
-    const double gain = knows_shading_ ? kMemory : 1;
-    shading_ += gain * (std::max(variance, square(kLeastShading)) - shading_), knows_shading_ = true;
 }
 
 /// The excess of the differences from the prints' ratios over their uncertainty, which counts twice so that

@@ -9,6 +9,7 @@
 #include "fit/photometric_fit.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
+#include "verify/tone_curve.hpp"
 
 namespace roundel {
 
@@ -26,35 +27,43 @@ class CameraResponse {
     bool learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
     /// 1 for a linear camera, 2.2 for a usual tone curve; nothing before the roundels have determined it.
     std::optional<double> exponent() const;
+    /// That of `linearize`; 1 before it is known.
+    double exponent_in_use() const { return std::exp(log_exponent_); }
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
     double edge_noise() const { return edge_noise_; }
     /// Correlation of these residuals along the edges, as `EdgeMisfit::correlation`; 1 if unknown.
     double correlation() const { return correlation_; }
-    /// Standard deviation of the relative change of the light across roundels, in one direction, per pixel.
-    double shading_sigma() const { return std::sqrt(shading_); }
-    /// Standard deviation of the curvature, between ink and paper, that linearization leaves: no power law
-    /// describes an S-shaped tone curve, and uneven light changes the levels of ink and paper.
+    /// Standard deviation of the curvature, between ink and paper, that `remainder` does not contain.
     double curvature_sigma() const { return std::sqrt(curvature_); }
+    /// What linearization is known to leave.
+    const ToneRemainder& remainder() const { return remainder_; }
 
   private:
     /// The logarithm of an exponent and its standard deviation.
     struct ToneEstimate {
         double log_exponent, sigma;
     };
-    std::optional<ToneEstimate> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
+    struct ToneMeasurement {
+        ToneEstimate power;
+        ToneSample sample;
+    };
+    EncodedLevel encoded(double level) const;
+    void learn_remainder(bool linearization_changed);
+    std::optional<ToneMeasurement> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
-    void learn_shading(const std::vector<const RoundelFit*>& fits);
     void learn_curvature(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
     bool learn_tone(std::vector<ToneEstimate> measured);
     void set_exponent(double log_exponent);
 
+    ToneCurve tone_;
+    ToneRemainder remainder_;
+    unsigned n_learned_ = 0;   // frames
     double log_exponent_ = 0;  // in use
     double mean_ = 0;          // of the measured ones
     double sigma_ = 0;         // of the mean; 0 before the first measurement
     double edge_noise_ = 0, correlation_ = 1;
-    double shading_;        // variance
     double curvature_ = 0;  // variance
-    bool knows_shading_ = false, knows_tone_ = false, knows_curvature_ = false;
+    bool knows_tone_ = false, knows_curvature_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;
 };

@@ -155,7 +155,8 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
                  .bright = fit.bright,
                  .prints = guess.prints,
                  .occlusion = mask,
-                 .shading_sigma = guess.shading_sigma,
+                 .light = guess.light,
+                 .tone = guess.tone,
                  .curvature_sigma = guess.curvature_sigma};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;

@@ -29,12 +29,14 @@ class _Arrivals:
         received_ns: of the last frame.
         has_changed: whether its stamps jumped, by its own lags, since the last settlement.
         earlier_ns: the sum of its jumps before the last one.
+        has_paused: whether more than half of the cameras had an irregular interval with it.
     """
 
     check: StampCheck
     received_ns: int = 0
     has_changed: bool = False
     earlier_ns: float = 0.0
+    has_paused: bool = False
 
     @property
     def change_ns(self) -> float:
@@ -53,17 +55,21 @@ class ArrivalMonitor:
         self._cameras = {name: _Arrivals(StampCheck()) for name in names}
         self._shared: set[str] = set()  # cameras of the change that more than half of the cameras share
         self.jumped: frozenset[str] = frozenset()
+        self.undecided: frozenset[str] = frozenset()  # cameras that may have jumped, unlike most others
         self.impossible_ns = 0.0  # a change that all cameras shared with the last frame, into the future
 
     def observe(self, name: str, t_ns: int, received_ns: int) -> None:
-        """Take the stamp and the arrival of the next frame of a camera; `jumped` and `impossible_ns` are valid
-        after it."""
+        """Take the stamp and the arrival of the next frame of a camera; `jumped`, `undecided` and `impossible_ns`
+        are valid after it."""
         camera = self._cameras[name]
         camera.received_ns, self.impossible_ns = received_ns, 0.0
         change_ns = camera.change_ns
         if camera.check.has_jumped(t_ns, received_ns):
             camera.earlier_ns, camera.has_changed = change_ns, True
-        elif not any(camera.has_changed for camera in self._cameras.values()):
+        elif (
+            not any(c.has_changed or c.check.is_undecided for c in self._cameras.values())
+            and not self.undecided
+        ):
             return
         self._compare(received_ns)
 
@@ -75,9 +81,16 @@ class ArrivalMonitor:
             return None
         return camera.change_ns - self._shared_ns()
 
+    def least_jump_ns(self, name: str) -> float | None:
+        """The smallest jump of a camera that agrees with arrivals; None if they show none."""
+        jump_ns = self.jump_ns(name)
+        return self._cameras[name].check.least_change_ns() if jump_ns is None else abs(jump_ns)
+
     def settle(self, name: str) -> None:
         """The stamps of a camera agree with those of the others now, corrected or not."""
         camera, shared_ns = self._cameras[name], self._shared_ns()
+        camera.check.accept()
+        self.undecided -= {name}
         camera.has_changed = bool(self._shared)
         camera.earlier_ns = shared_ns - camera.check.change_ns()
         self.jumped -= {name}
@@ -89,6 +102,7 @@ class ArrivalMonitor:
         self._cameras[name] = _Arrivals(StampCheck())
         self.jumped -= {name}
         self._shared -= {name}
+        self.undecided -= {name}
 
     def _shared_ns(self) -> float:
         changes = [self._cameras[name].change_ns for name in self._shared]
@@ -108,6 +122,15 @@ class ArrivalMonitor:
         self.jumped = frozenset(active - self._shared if self._shared else changed)
         if self._shared and not self.jumped:
             self._settle_all()
+        self.undecided = self._undecided_of(active)
+
+    def _undecided_of(self, active: set[str]) -> frozenset[str]:
+        """The active cameras that may have jumped; a pause that more than half of them share is none of theirs."""
+        undecided = {name for name in active if self._cameras[name].check.is_undecided}
+        is_shared = 2 * len(undecided) > len(active)
+        for name, camera in self._cameras.items():
+            camera.has_paused = name in undecided and (camera.has_paused or is_shared)
+        return frozenset(name for name in undecided if not self._cameras[name].has_paused)
 
     def _alike(self, name: str, others: set[str]) -> set[str]:
         """The cameras whose stamps changed by as much as those of one of them."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
 
-    arrival of a frame   -> `ArrivalMonitor`: its stamp jumped?         -> excluded from this frame on
+    arrival of a frame   -> `ArrivalMonitor`: its stamp jumped, or may?  -> excluded from this frame on
     every frame set      -> `ClockComparison.jump`: one camera off?     -> excluded
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
     slow information     -> `ClockComparison.drifts`                    -> corrected while in use
@@ -193,8 +193,8 @@ class CameraClocks:
         self._comparison.forget_jumps()
 
     def _exclude_jumped(self, now_ns: int) -> None:
-        """Exclude the cameras whose stamps jumped relative to those of the others, and use those whose did not."""
-        jumped = self._arrivals.jumped
+        """Exclude the cameras whose stamps jumped relative to the others, or may have, and use those whose did not."""
+        jumped = self._arrivals.jumped | self._arrivals.undecided
         for name, clock in self._clocks.items():
             if clock.state == "excluded":
                 if clock.by_arrival and name not in jumped:
@@ -231,11 +231,11 @@ class CameraClocks:
             return
         clock.searched_ns = now_ns
         shift, waited_ns = self._shift(name, clock), now_ns - clock.since_ns
-        jump_ns = self._arrivals.jump_ns(name)
+        jump_ns, least_ns = self._arrivals.jump_ns(name), self._arrivals.least_jump_ns(name)
         if (
             shift is not None
             and shift.explains(MIN_EXPECTED)
-            and (jump_ns is None or shift.resolves(jump_ns * 1e-9))
+            and (least_ns is None or shift.resolves(least_ns * 1e-9))
         ):
             if shift.is_zero:
                 self._readmit(name, now_ns)

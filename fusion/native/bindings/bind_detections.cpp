@@ -70,13 +70,16 @@ auto candidates(const Markers& markers, const FramePoses& poses, const Detection
     return std::make_tuple(pairs, costs);
 }
 
-auto look_up_pixels(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv) {
+auto look_up_outlines(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv,
+                      const In<double, -1, 2>& axes, const Numbers& angle) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
     const size_t n = uv.shape(0);
+    require_equal(n, {axes.shape(0), angle.size()});
+    const Outlines seen{uv.data(), axes.data(), angle.data(), n};
     auto [xy, to_xy] = make({2, n});
     auto [scale, to_scale] = make({2, 2, n});
-    unlocked([&, a = to_xy, b = to_scale] { look_up(lens, uv.data(), n, a, b); });
+    unlocked([&, a = to_xy, b = to_scale] { look_up(lens, seen, a, b); });
     return std::make_tuple(xy, scale);
 }
 
@@ -91,7 +94,7 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
-    m.def("look_up", &look_up_pixels);
+    m.def("look_up", &look_up_outlines);
 }
 
 }  // namespace roundel::fusion

@@ -13,6 +13,8 @@ probability that something hides them from a camera. A camera that did not see t
 probability that it does now.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from camera_node.arrays import Array, Index, Mask
@@ -26,6 +28,38 @@ MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
 LOG_2PI = np.log(2 * np.pi)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Changes:
+    """Robots of which much is missing (R,), their views (R, C) that were empty before, and what is missing (R,)."""
+
+    fallen: Mask
+    unseen: Mask
+    cost: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """Linearized assignments: whitened derivatives A (N, 2, 12), innovations nu (N, 2), and the logarithm of the
+    density `other` (N,) of other roundels, in units of whitened centres."""
+
+    A: Array
+    nu: Array
+    other: Array
+
+    def log_ratio(self, new: Mask, beside: Mask, P: Array) -> float:
+        """Log-likelihood of assignments `new` as those of their robot, minus that as any roundels of their images.
+
+        The likelihood is conditional on the robot's assignments `beside`; `P` (12, 12) is the robot's prediction.
+        """
+        order = np.concatenate([np.flatnonzero(beside), np.flatnonzero(new)])
+        A, nu = self.A[order].reshape(-1, 12), self.nu[order].ravel()
+        L = np.linalg.cholesky(A @ P @ A.T + np.eye(len(nu)))
+        n = 2 * int(new.sum())
+        z, pivots = np.linalg.solve(L, nu)[-n:], np.diag(L)[-n:]
+        likelihood = -0.5 * (z @ z + n * LOG_2PI) - np.log(pivots).sum()
+        return float(likelihood - self.other[new].sum())
 
 
 class OwnDetections:
@@ -46,7 +80,8 @@ class OwnDetections:
     def are_own(self, given: AssignedFrames) -> Mask:
         """(N,) assignments of a frame set that are more probable than detections of something else."""
         robot = self._markers.robot[given.assignments.marker]
-        view = robot * self._shape[1] + given.detections.camera[given.assignments.detection]
+        frame = given.detections.frame[given.assignments.detection]
+        view = robot * self._shape[1] + given.detections.exposures.camera[frame]
         frames = np.bincount(given.detections.exposures.camera, minlength=self._shape[1])
         count = self._count(view)
         missing = np.maximum(self._usual * frames - count, 0)
@@ -54,31 +89,42 @@ class OwnDetections:
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
         own = ~(fallen[robot] | unseen.ravel()[view])
-        groups = [(robot == row, cost[row] - CHANGED) for row in np.flatnonzero(fallen).tolist()]
-        groups += [(view == at, CHANGED) for at in np.flatnonzero(unseen).tolist()]
-        beyond_question = own.copy()
-        density = self._density(given.detections) if groups else np.empty(0)
-        for rows, prior in groups:
-            beside = beyond_question & (robot == robot[rows][0])
-            own[rows] = prior + self._log_ratio(given, rows, beside, density) > 0
+        if fallen.any() or unseen.any():
+            own[self._accepted(given, view, own, _Changes(fallen, unseen, cost))] = True
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
-    def _log_ratio(self, given: AssignedFrames, rows: Mask, beside: Mask, density: Array) -> float:
-        """Log-likelihood of assignments `rows` as those of their robot, minus that as any roundels of their images.
+    def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, changes: _Changes) -> Index:
+        """The uncertain assignments that are more probable as those of their robot.
 
-        The likelihood is conditional on the robot's assignments `beside`. `density` (F,) is that of all roundels in the
-        frames, per pixel^2.
+        Args:
+            given: N assignments of a frame set.
+            view: (N,) of the assignments, robot and camera.
+            certain: (N,) assignments that are not to be judged.
+            changes: the robots and views whose assignments are uncertain.
         """
-        both = np.flatnonzero(rows | beside)
-        observations = MatchedObservations.of(given.assignments.select(both), given.detections, self._markers)
+        n_cameras = self._shape[1]
+        rows = np.flatnonzero((changes.fallen | changes.unseen.any(1))[view // n_cameras])
+        robot, camera = np.divmod(view[rows], n_cameras)
+        evidence = self._evidence(given, rows)
+        groups = [(robot == k, changes.cost[k] - CHANGED) for k in np.flatnonzero(changes.fallen).tolist()]
+        groups += [((robot == k) & (camera == c), CHANGED) for k, c in np.argwhere(changes.unseen).tolist()]
+        accepted = np.zeros(len(rows), bool)
+        for new, prior in groups:
+            k = robot[np.argmax(new)]
+            accepted[new] = (
+                prior + evidence.log_ratio(new, certain[rows] & (robot == k), given.states.P[k]) > 0
+            )
+        return rows[accepted]
+
+    def _evidence(self, given: AssignedFrames, rows: Index) -> _Evidence:
+        observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
-        S = A @ given.states.P[observations.discs.body[0]] @ A.T + np.eye(len(nu))
-        known, new = np.repeat(beside[both], 2), rows[both]
-        cov = observations.detections.cov[:, :, new].transpose(2, 0, 1)
-        likelihood = _log_normal(nu, S) - _log_normal(nu[known], S[np.ix_(known, known)])
-        likelihood -= 0.5 * np.log(np.linalg.det(cov)).sum()  # of pixels instead of whitened centres
-        return float(likelihood - np.log(density[observations.detections.frame[new]]).sum())
+        cov, frame = observations.detections.cov, observations.detections.frame
+        # Of pixels instead of whitened centres.
+        log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
+        log_any = np.log(self._density(given.detections)[frame])
+        return _Evidence(A.reshape(-1, 2, 12), nu.reshape(-1, 2), log_area + log_any)
 
     def _density(self, detections: DetectionTable) -> Array:
         """(F,) detections per pixel^2 in the frames up to the last one with a detection."""
@@ -94,14 +140,10 @@ class OwnDetections:
 
     def _learn(self, count: Index, frames: Index, expected: Mask) -> None:
         """Adapt the usual numbers of expected robots in the cameras that sent frames; forget those of others."""
-        self._usual[~expected] = self._learned[~expected] = self._unseen[~expected] = 0
-        at = np.ix_(expected, frames > 0)
-        self._unseen[at] = count[at] == 0
-        self._learned[at] += 1
-        rate = 1 / np.minimum(self._learned[at], LEARNED)
-        self._usual[at] += rate * (count[at] / frames[frames > 0] - self._usual[at])
-
-
-def _log_normal(x: Array, S: Array) -> float:
-    """Log-density of a normal distribution of covariance S at a distance x from its mean."""
-    return float(-0.5 * (x @ np.linalg.solve(S, x) + np.linalg.slogdet(S)[1] + len(x) * LOG_2PI))
+        known = expected[:, None] & (frames > 0)
+        for column in (self._usual, self._learned, self._unseen):
+            column[~expected] = 0
+        self._unseen = np.where(known, count == 0, self._unseen)
+        self._learned += known
+        rate = known / np.clip(self._learned, 1, LEARNED)
+        self._usual += rate * (count / np.maximum(frames, 1) - self._usual)

@@ -60,7 +60,7 @@ def _errors(found: Roundel, sight: Sight) -> Array:
 
 def measure(run: Run, console: Console) -> list[Verdict]:
     """Print all sizes and return the verdicts on the goals for paper bent by 2 %."""
-    count = 100 if run.thorough else 16
+    count = 100 if run.thorough else 32
     done = {(b, d): measure_bend(run, b, d, count) for b in BENDS for d in DIAMETERS}
     rows = [
         (f"{100 * b:g} %, {d} px", f"{e.found:.2f}", f"{e.centre:.1f}", f"{e.size:.1f}")

@@ -47,6 +47,7 @@ class PoseJudge:
         max_error_m: smaller errors are right.
         clock: by which poses arrive.
         count, rms_m, largest_m: of tracked poses: their number, and their errors.
+        largest_by_cameras_m: the largest error of the poses to which exactly these cameras contributed.
     """
 
     world: World
@@ -58,6 +59,7 @@ class PoseJudge:
     count: int = 0
     squared_m2: float = 0.0
     largest_m: float = 0.0
+    largest_by_cameras_m: dict[tuple[str, ...], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._last_s: dict[str, float] = {}
@@ -86,6 +88,7 @@ class PoseJudge:
             self.gaps.clear()
             self.wrong.clear()
             self.count, self.squared_m2, self.largest_m = 0, 0.0, 0.0
+            self.largest_by_cameras_m.clear()
 
     @property
     def rms_m(self) -> float:
@@ -119,6 +122,8 @@ class PoseJudge:
         self.count += 1
         self.squared_m2 += error_m**2
         self.largest_m = max(self.largest_m, error_m)
+        largest, cameras = self.largest_by_cameras_m, tuple(sorted(pose.cameras))
+        largest[cameras] = max(largest.get(cameras, 0.0), error_m)
         if error_m <= self.max_error_m:
             return
         covariance = pose.covariance_matrix[POSITION, POSITION]

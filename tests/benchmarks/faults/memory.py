@@ -3,7 +3,8 @@
 
 The median of the slopes between all pairs of samples of the same life, and the interval from Kendall's statistic (Sen
 1968; over several lives: Gilbert 1987, section 16.4.2). Each sample is the smallest of some seconds, because buffers
-come and go. Only anonymous memory counts: pages of libraries are read once.
+come and go, and what is freed stays resident until `return_freed_memory` returns it. Only anonymous memory counts: the
+pages of libraries are read once.
 """
 
 from collections.abc import Sequence
@@ -13,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.arrays import Array
+from camera_node.processes.allocator import PERIOD_S
 
 WARM_UP_S = 120.0  # of a life, which does not count: imports, caches and the allocator's arenas fill
-SAMPLE_S = 5.0  # of which the smallest value counts
+# Time of which the smallest value counts: a program returns freed memory only periodically.
+SAMPLE_S = 2 * PERIOD_S
 MIN_MINUTES = 4.0  # of all lives after the warm-up, from which a growth is computed
 NORMAL = 1.96  # two-sided quantile of 95 %
 MAX_MB_PER_MIN = 0.5  # that the interval must not exclude

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Landmarks are located by their distances, and fix the world; ambiguous ones are refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
-from calib.world.landmarks import find_still_roundels, locate_landmarks
+from calib.world.landmarks import locate_landmarks
+from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.config import load_yaml
 from camera_node.geometry.body import Body
 from tests.calib.synthetic import ring
-from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
+from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world, see_discs
 from tests.conftest import ROOT
 
 
@@ -28,6 +31,21 @@ def test_an_l_shaped_frame_fixes_the_world(numbered: bool):
     assert max(distances.values()) < 5e-4
     for name, camera in moved.cameras.items():
         assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 1.0], [0.48, -0.36, 0.8]])
+def test_landmarks_are_the_centres_of_discs(normal: list[float]):
+    """Without noise within 0.02 mm, which messages of 32 bits leave; centres of ellipses are 0.3 mm or more off."""
+    arena = ring(4)
+    landmarks = {name: np.array(at) for name, at in L_FRAME.items()}
+    roundels = find_still_roundels(see_discs(arena, L_FRAME, normal, 0.06))
+    located = locate_landmarks(arena.truth.cameras, roundels, landmarks)
+    off = np.array([located[name] - at for name, at in landmarks.items()])
+    points = [replace(roundel, shape=np.full((2, 2), np.nan)) for roundel in roundels]
+    by_points = locate_landmarks(arena.truth.cameras, points, landmarks)
+    off_points = np.array([by_points[name] - at for name, at in landmarks.items()])
+    assert np.linalg.norm(off_points, axis=1).max() > 3e-4
+    assert np.linalg.norm(off, axis=1).max() < 2e-5
 
 
 def test_a_standing_wand_fixes_the_floor_and_the_vertical():

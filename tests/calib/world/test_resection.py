@@ -7,8 +7,8 @@ import pytest
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
-from calib.world.landmarks import StillRoundel, find_still_roundels
 from calib.world.resection import SIGMA_PX, place_by_points
+from calib.world.still_roundels import StillRoundel, find_still_roundels
 from camera_node.geometry.pose import invert, vector_from_rotation
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import detect_landmarks
@@ -22,6 +22,7 @@ FLOOR = {
 }
 POINTS = {name: np.array(at) for name, at in FLOOR.items()}
 SIGMA_M = 0.002
+UNKNOWN_SHAPE = np.full((2, 2), np.nan)
 
 
 def camera() -> Camera:
@@ -32,7 +33,8 @@ def see(points: dict[str, np.ndarray], number: bool = True, noise_px: np.ndarray
     """The roundels at the points in the camera."""
     uv = camera().project_world(np.array(list(points.values()))) + noise_px
     return [
-        StillRoundel("cam1", at, int(name) if number else -1) for name, at in zip(points, uv, strict=True)
+        StillRoundel("cam1", at, int(name) if number else -1, UNKNOWN_SHAPE)
+        for name, at in zip(points, uv, strict=True)
     ]
 
 

@@ -7,14 +7,28 @@ import msgspec
 import numpy as np
 import pytest
 
+from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.simulation.sensor import HARSH, MILD, Sensor
-from tests.benchmarks.detector.cameras import Errors, acquainted, covered, errors, over_exposed, share_found
+from tests.benchmarks.detector.cameras import (
+    Errors,
+    acquainted,
+    covered,
+    errors,
+    over_exposed,
+    share_found,
+    uncovered,
+)
+from tests.benchmarks.detector.pictures import sight_of
+from tests.benchmarks.detector.recall import SIZE
 from tests.benchmarks.detector.table import Run
+from tests.camera_node.tracing import ellipse_of
 
 RUN = Run("chords", Detector, False)
 MILD_SHARE = 0.8  # goal for covered roundels behind a mild camera
 CARDS = 90  # in three pictures
+FALLS_OFF = Sensor(noise=1.5, vignetting=0.3, shading=0.2)
+MIDDLE = (np.array(SIZE[::-1]) - 1) / 2
 
 
 @cache
@@ -71,6 +85,34 @@ def test_what_no_exponent_describes_is_within_the_claims(change):
     assert measured.size < 3
 
 
+class Film(Sensor, frozen=True):
+    """A sensor whose tone curve has a shoulder: sRGB, of which the upper 30 % are compressed."""
+
+    def expose(self, light: Array, rng: np.random.Generator) -> Grey:
+        """The picture (h, w), uint8, of light (h, w)."""
+        return FILM[super().expose(light, rng)]
+
+
+def film() -> Grey:
+    """(256,) encoded level of each linear level."""
+    encoded = 1.055 * (1.3 * np.arange(256) / 255) ** (1 / 2.4) - 0.055
+    over = np.maximum(encoded - 0.7, 0) / 0.3
+    return np.rint(255 * np.maximum(np.minimum(encoded, 0.7) + 0.3 * (1 - np.exp(-over)), 0)).astype(np.uint8)
+
+
+FILM = film()
+
+
+@pytest.mark.parametrize("band", [(14, 20), (32, 60)])
+def test_roundels_are_found_and_claimed_behind_a_curve_with_a_shoulder(band):
+    """Light falls off, so that each roundel has another part of the curve."""
+    sensor = Film(noise=1.5, vignetting=0.5, shading=0.5)
+    measured: Errors = errors(known(sensor), sensor, band, 2)
+    assert measured.found > 0.97
+    assert measured.centre < 3
+    assert measured.size < 3
+
+
 @pytest.mark.parametrize(("from_rim", "goal"), [(False, MILD_SHARE), (True, 0.9)])
 def test_covered_roundels_are_found_behind_a_mild_camera(mild: Detector, from_rim, goal):
     """A fifth of the diameter is covered. Four binomial standard deviations of the goal are subtracted."""
@@ -93,3 +135,18 @@ def test_a_camera_that_denoises_and_sharpens_is_learned():
 def test_clipped_paper_is_found(paper):
     clean = Sensor(noise=3.0)
     assert share_found(known(clean), clean, partial(over_exposed, paper), 3) > 0.97
+
+
+def test_the_light_that_falls_off_towards_the_corners_is_learned():
+    """On clutter a roundel shows little of it; without the camera's fall-off centres lie 0.01 px outwards."""
+    outwards = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        light, cards = uncovered(rng)
+        found = known(FALLS_OFF).adjusted().detect(FALLS_OFF.expose(light, rng))
+        for card in cards:
+            k = int(np.linalg.norm(found.uv - card.uv, axis=1).argmin())
+            away = (np.array(card.uv) - MIDDLE) / 320
+            outwards.append((found.uv[k] - ellipse_of(sight_of(card, (SIZE[1], SIZE[0])))[0]) @ away)
+    mean, sigma = np.mean(outwards), np.std(outwards) / np.sqrt(len(outwards))
+    assert abs(mean) < 3 * sigma + 0.001

@@ -7,7 +7,8 @@ from camera_node.detection.detector import Detector
 from camera_node.simulation.sensor import SENSORS
 from tests.benchmarks.detector.bent import measure_bend
 from tests.benchmarks.detector.cameras import acquainted, errors
-from tests.benchmarks.detector.lighting import BAND, KINDS
+from tests.benchmarks.detector.lighting import BAND, KINDS, NOISE
+from tests.benchmarks.detector.second.measurement import First, measure_cell
 from tests.benchmarks.detector.table import Run
 
 RUN = Run("chords", Detector, False)
@@ -29,6 +30,14 @@ def test_flat_paper_is_not_taken_for_bent(diameter):
     assert measure_bend(RUN, 0.0, diameter, 8).centre > 1 - 3 * 0.35
 
 
+@pytest.mark.parametrize("bend", [0.0, 0.02])
+def test_a_bend_that_small_roundels_do_not_show_is_claimed(bend):
+    """Their residuals together show it. Forty coordinates on flat paper have a standard deviation of 0.22."""
+    measured = measure_cell(Detector(), First(NOISE, bend=bend).show, (20, 32), 1)
+    assert measured.found == 1
+    assert 1 - 3 * 0.22 < measured.centre < CLAIM  # of bent paper 64 without the claim
+
+
 @pytest.mark.parametrize("what", ["soft shadow", "gloss"])
 def test_uneven_light_is_within_the_claims(what):
     sensor, disturb, _ = KINDS[what]
@@ -39,8 +48,9 @@ def test_uneven_light_is_within_the_claims(what):
 
 @pytest.mark.parametrize("name", ["clean", "mild"])
 def test_cluttered_ground_is_within_the_claims(name):
-    """Mean squared errors of 160 coordinates; with pixels that count alike whatever they see of the ground, 6."""
+    """Mean squared errors of 160 coordinates have a standard deviation of 0.11; with equal weights 6, and without the
+    fall-off of the mild camera's light 2.8."""
     sensor = SENSORS[name]
     measured = errors(acquainted(RUN, sensor), sensor, (20, 32), 4, on="clutter")
     assert measured.found > 0.97
-    assert measured.centre < CLAIM
+    assert measured.centre < 1.5 + 3 * 0.11

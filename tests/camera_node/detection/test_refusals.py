@@ -45,9 +45,10 @@ def bullseye() -> np.ndarray:
         (picture(Card(MIDDLE, 44), dark=70.0, bright=90.0), {}, Reason.CONTRAST),
         (picture(Card(MIDDLE, 20)), {"min_diameter_px": 30.0}, Reason.SIZE),
         (picture(Card(MIDDLE, 44)), {"max_diameter_px": 40.0}, Reason.SIZE),
+        (picture(Card(MIDDLE, 14), floor=190.0, dark=140.0), {}, Reason.PALE_INK),
         (bullseye(), {}, Reason.BULLSEYE),
     ],
-    ids=["thin ring", "other print", "faint", "small", "large", "bullseye"],
+    ids=["thin ring", "other print", "faint", "small", "large", "thin and pale", "bullseye"],
 )
 def test_a_refused_ring_is_listed_with_the_test_that_it_fails(light, settings: dict, reason: Reason):
     """The centre is within a pixel of the ring's; the text says what was measured."""

@@ -83,7 +83,7 @@ CALLS = {
         ),
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
-    "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)))),
+    "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)), np.ones((N, 2)), np.ones(N))),
 }
 # Constructors check the indices only where they know what the indices refer to.
 UNCHECKED = {"DiscColumns", "DetectionColumns"}

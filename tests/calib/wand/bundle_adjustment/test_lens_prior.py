@@ -10,7 +10,15 @@ from scipy.stats import chi2
 
 from calib.rig.camera import stated_sigma
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import calibrated_sigma, usual_sigma, widen_lenses
+from calib.wand.bundle_adjustment.lens_prior import (
+    KINDS,
+    SHARES,
+    UNIFORM,
+    calibrated_sigma,
+    estimate_shares,
+    usual_sigma,
+    widen_lenses,
+)
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.assessment import assess
 from calib.wand.recalibration import recalibrate_camera
@@ -107,6 +115,26 @@ def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_ri
         error = np.array([D[2, 1], D[0, 2], D[1, 0], *D[:3, 3]])
         squared += error @ np.linalg.solve(np.array(here.covariance), error)
     assert squared < chi2.ppf(0.999, 6 * len(SEEDS))
+
+
+def test_claimed_deviations_are_those_of_the_lenses():
+    """With n lens errors of a kind that the recording shows exactly, of the sum Q of squares, the uniform prior of the
+    share claims the variance Q / (n - 3), less the part of its tail beyond the usual deviation, about Q^1/2 of it. A
+    recording that shows nothing claims the prior's own variance."""
+    lens, lenses = recorded(1).truth.cameras["cam00"], 4
+    sigma = np.tile(usual_sigma(lens), (lenses, 1))
+    unknown, information = np.ones(sigma.shape, bool), np.diag(1e10 / sigma.ravel() ** 2)
+    off = 0.01 * np.random.default_rng(0).standard_normal(sigma.shape)
+    gradient = information @ (off * sigma).ravel()
+    shares = estimate_shares(information, gradient, sigma, unknown, UNIFORM)
+    for kind in np.unique(KINDS):
+        squares = off[:, kind == KINDS] ** 2
+        expected = squares.sum() / (squares.size - 3)
+        assert shares[:, kind == KINDS] ** 2 == pytest.approx(
+            np.full(squares.shape, expected), rel=3 * squares.sum() ** 0.5
+        )
+    nothing = estimate_shares(0 * information, 0 * gradient, sigma, unknown, UNIFORM)
+    assert nothing**2 == pytest.approx(np.full(sigma.shape, UNIFORM @ SHARES**2))
 
 
 def test_standard_deviations_of_a_lens_are_read_and_checked():

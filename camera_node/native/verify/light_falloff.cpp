@@ -1,0 +1,149 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "verify/light_falloff.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+#include "numeric/cholesky.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr double kFirst = 2e-4;      // per pixel: a tenth across half of a picture
+constexpr double kLeast = 2e-5;      // of a gradient and of its rest
+constexpr double kMostNoise = 2e-3;  // of one measurement
+constexpr double kSlopePrior = 2;    // standard deviation of M over that of the gradient
+constexpr int kSteps = 3;            // of the prior's variances
+constexpr double kLeastLevel = 0.3;  // of the light in the middle
+constexpr double kMemory = 0.8;      // of a frame in the next one
+constexpr double kOutlier = 3;       // standard deviations, from which a roundel counts less (Cauchy)
+
+double median_of(std::vector<double>& values) {
+    const auto middle = values.begin() + ptrdiff_t(values.size() / 2);
+    std::nth_element(values.begin(), middle, values.end());
+    return *middle;
+}
+
+bool is_measured(const RoundelFit* fit) {
+    return fit->shading.variance > 0 && fit->shading.variance < square(kMostNoise);
+}
+
+double dot(const auto& a, const auto& b) {
+    double sum = 0;
+    for (size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+    return sum;
+}
+
+/// The variance of a gradient beyond that of its measurement, from the median over roundels: the squared
+/// length of a vector with independent components has the median 2 ln 2 variances.
+template <typename Squared>
+double variance_of(const std::vector<const RoundelFit*>& measured, const Squared& squared) {
+    std::vector<double> excess;
+    for (const RoundelFit* fit : measured)
+        excess.push_back(squared(*fit) / (2 * std::numbers::ln2) - fit->shading.variance);
+    return std::max(median_of(excess), square(kLeast));
+}
+
+}  // namespace
+
+LightFalloff::LightFalloff() : information_{}, right_{}, all_(square(kFirst)), rest_(square(kFirst)) {}
+
+std::pair<LightFalloff::Row, LightFalloff::Row> LightFalloff::rows(double x, double y) const {
+    const double u = (x - x_) * per_radius_, v = (y - y_) * per_radius_;
+    return {{1, 0, u, v, 0}, {0, 1, 0, u, v}};
+}
+
+void LightFalloff::set_size(const ImageView& image) {
+    const double x = (image.width - 1) / 2.0, y = (image.height - 1) / 2.0;
+    if (x == x_ && y == y_) return;
+    *this = {};
+    x_ = x, y_ = y, per_radius_ = 1 / std::hypot(x, y);
+}
+
+LightGradient LightFalloff::at(double x, double y) const {
+    if (!knows_) return {0, 0, kFirst};
+    const auto [by_x, by_y] = rows(x, y);
+    double variance = 2 * rest_;
+    for (size_t i = 0; i < kCoefficients; ++i)
+        variance += by_x[i] * dot(cov_[i], by_x) + by_y[i] * dot(cov_[i], by_y);
+    const auto [u, v] = expected(x, y);
+    return {u, v, std::sqrt(variance / 2)};
+}
+
+/// The light over that in the middle of the picture: 1 + a x + x M u / 2, x in pixels.
+double LightFalloff::level(double x, double y) const {
+    const auto [by_x, by_y] = rows(x, y);
+    const double twice =
+        (x - x_) * (dot(by_x, mean_) + mean_[kAx]) + (y - y_) * (dot(by_y, mean_) + mean_[kAy]);
+    return std::max(kLeastLevel, 1 + twice / 2);
+}
+
+std::pair<double, double> LightFalloff::expected(double x, double y) const {
+    const auto [by_x, by_y] = rows(x, y);
+    const double level = this->level(x, y);
+    return {dot(by_x, mean_) / level, dot(by_y, mean_) / level};
+}
+
+void LightFalloff::learn(const std::vector<const RoundelFit*>& fits, const ImageView& image) {
+    set_size(image);
+    std::vector<const RoundelFit*> measured;
+    std::copy_if(fits.begin(), fits.end(), std::back_inserter(measured), is_measured);
+    if (measured.empty()) return;
+    const double gain = knows_ ? 1 - kMemory : 1;
+    const double all = variance_of(
+        measured, [](const RoundelFit& fit) { return square(fit.shading.x) + square(fit.shading.y); });
+    all_ += gain * (all - all_);
+    for (Row& row : information_)
+        for (double& value : row) value *= kMemory;
+    for (double& value : right_) value *= kMemory;
+    for (const RoundelFit* fit : measured) include(*fit);
+    solve();
+    const double rest = variance_of(measured, [this](const RoundelFit& fit) {
+        const auto [x, y] = expected(fit.outer.x, fit.outer.y);
+        return square(fit.shading.x - x) + square(fit.shading.y - y);
+    });
+    rest_ += gain * (rest - rest_), knows_ = true;
+}
+
+void LightFalloff::scale(double factor) {
+    for (double& value : right_) value *= factor;
+    for (double& value : mean_) value *= factor;
+    all_ *= square(factor), rest_ *= square(factor);
+}
+
+/// Adds a measurement to the normal equations.
+void LightFalloff::include(const RoundelFit& fit) {
+    const auto [by_x, by_y] = rows(fit.outer.x, fit.outer.y);
+    const double level = this->level(fit.outer.x, fit.outer.y), variance = fit.shading.variance + rest_;
+    double weight = 1 / variance;
+    if (knows_) {
+        const auto [x, y] = expected(fit.outer.x, fit.outer.y);
+        weight /= 1 + (square(fit.shading.x - x) + square(fit.shading.y - y)) / (square(kOutlier) * variance);
+    }
+    const double sx = fit.shading.x * level, sy = fit.shading.y * level;
+    for (size_t i = 0; i < kCoefficients; ++i) {
+        for (size_t j = 0; j <= i; ++j)
+            information_[i][j] += weight * (by_x[i] * by_x[j] + by_y[i] * by_y[j]);
+        right_[i] += weight * (by_x[i] * sx + by_y[i] * sy);
+    }
+}
+
+/// Solves the normal equations with a prior whose variances follow from the coefficients themselves
+/// (empirical Bayes): a shrunk estimate would be biased alike in all of a corner.
+void LightFalloff::solve() {
+    for (int k = 0; k < kSteps; ++k) {
+        const double slope = (square(mean_[kMxx]) + square(mean_[kMxy]) + square(mean_[kMyy])) / 3;
+        const double middle = std::max(all_, (square(mean_[kAx]) + square(mean_[kAy])) / 2);
+        auto information = information_;
+        for (const size_t i : {kAx, kAy}) information[i][i] += 1 / middle;
+        for (const size_t i : {kMxx, kMxy, kMyy})
+            information[i][i] += 1 / (square(kSlopePrior) * std::max(all_, slope));
+        const Cholesky<kCoefficients> factor(information);
+        if (!factor.positive()) return;
+        mean_ = factor.solve(right_), cov_ = factor.inverse_tail<kCoefficients>();
+    }
+}
+
+}  // namespace roundel

@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "verify/tone_curve.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "fit/roundel_model.hpp"
+
+namespace roundel {
+
+namespace {
+
+constexpr size_t kSamples = 64, kMinSamples = 6;
+constexpr double kDarkest = 1 / 255.0;
+constexpr int kSteps = 3;
+constexpr double kModelSigma = 0.05;                     // of a curvature: what the family leaves
+constexpr double kHuber = 1.5;                           // standard deviations
+constexpr double kExponent = 1.6, kExponentSigma = 0.8;  // priors
+constexpr double kShoulderSigma = 4;
+constexpr double kLeastExponent = 0.3, kMostExponent = 5;
+constexpr double kLeastShoulder = -0.9, kMostShoulder = 15;  // the first over the exponent: light increases
+constexpr double kSignificant = 4;                           // standard deviations
+
+}  // namespace
+
+EncodedLevel::EncodedLevel(double share) {
+    const double v = std::clamp(share, kDarkest, 1.0), cube = v * v * v;
+    by_exponent = std::log(v), by_shoulder = (cube * cube - 1) / 6;
+}
+
+void ToneCurve::include(const ToneSample& sample) {
+    if (samples_.size() < kSamples) {
+        samples_.push_back(sample);
+        return;
+    }
+    samples_[next_] = sample, next_ = (next_ + 1) % kSamples;
+}
+
+double ToneCurve::light(const EncodedLevel& level) const {
+    return std::exp(exponent_ * level.by_exponent + shoulder_ * level.by_shoulder);
+}
+
+double ToneCurve::light(double share) const { return light(EncodedLevel(share)); }
+
+bool ToneCurve::has_shoulder() const {
+    return samples_.size() >= kMinSamples && std::abs(shoulder_) > kSignificant * shoulder_sigma_;
+}
+
+double ToneCurve::left_by(double exponent) const {
+    double sum = 0, weights = 0;
+    for (const ToneSample& sample : samples_) {
+        const auto power = [&](const EncodedLevel& level) { return std::exp(exponent * level.by_exponent); };
+        const double dark = power(sample.dark), range = power(sample.bright) - dark;
+        if (range <= 0) continue;
+        const double left = 4 * ((power(sample.middle) - dark) / range - 0.5);
+        const double variance = square(sample.sigma) + square(kModelSigma);
+        sum += square(left) / variance - 1, weights += 1 / variance;
+    }
+    return weights > 0 ? std::sqrt(std::max(0.0, sum / weights)) : 0;
+}
+
+/// Gauss-Newton with Huber's weights on the curvatures that the curve leaves in the samples, 4 (s - 1/2) with
+/// s = (L_middle - L_dark) / (L_bright - L_dark).
+void ToneCurve::fit() {
+    for (int k = 0; k < kSteps; ++k) {
+        Symmetric A{1 / square(kExponentSigma), 0, 1 / square(kShoulderSigma)};
+        double x = A.xx * (kExponent - exponent_), y = -A.yy * shoulder_;
+        for (const ToneSample& sample : samples_) {
+            const double dark = light(sample.dark), middle = light(sample.middle),
+                         bright = light(sample.bright), range = bright - dark;
+            if (range <= 0) continue;
+            const double share = (middle - dark) / range;
+            const auto slope = [&](double EncodedLevel::* by) {
+                const double d = dark * sample.dark.*by, m = middle * sample.middle.*by,
+                             b = bright * sample.bright.*by;
+                return 4 * (m - d - share * (b - d)) / range;
+            };
+            const double off = -4 * (share - 0.5), sigma = std::hypot(sample.sigma, kModelSigma);
+            const double weight = std::min(1.0, kHuber * sigma / std::abs(off)) / square(sigma);
+            const double u = slope(&EncodedLevel::by_exponent), v = slope(&EncodedLevel::by_shoulder);
+            A.xx += weight * u * u, A.xy += weight * u * v, A.yy += weight * v * v;
+            x += weight * u * off, y += weight * v * off;
+        }
+        exponent_ = std::clamp(exponent_ + (A.yy * x - A.xy * y) / A.det(), kLeastExponent, kMostExponent);
+        shoulder_ = std::clamp(shoulder_ + (A.xx * y - A.xy * x) / A.det(), kLeastShoulder * exponent_,
+                               kMostShoulder);
+        shoulder_sigma_ = std::sqrt(A.xx / A.det());
+    }
+}
+
+}  // namespace roundel

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Block tridiagonal matrices, against the same matrices written out."""
+
+import numpy as np
+import pytest
+
+from calib.wand.block_tridiagonal import GROUP_SIZE, BlockTridiagonal
+from camera_node.arrays import Array
+
+# Scalars of a block, and blocks: less than a group, whole groups, and a part of one at the end; blocks above a group.
+SIZES = [(6, 2), (6, 3), (6, 8), (6, 21), (12, 2), (12, 7), (24, 5), (30, 4)]
+
+
+def random_chain(h: int, blocks: int) -> tuple[BlockTridiagonal, Array]:
+    """A positive definite matrix with a condition number of up to 1e8, and the same written out."""
+    rng = np.random.default_rng([h, blocks])
+    J = rng.standard_normal((blocks - 1, 3 * h, 2 * h)) * np.geomspace(1, 1e-4, 2 * h)
+    dense = np.zeros((blocks * h, blocks * h))
+    for k, part in enumerate(J.mT @ J):
+        dense[k * h : (k + 2) * h, k * h : (k + 2) * h] += part
+    return BlockTridiagonal.of_chain(J.mT @ J), dense
+
+
+@pytest.mark.parametrize(("h", "blocks"), SIZES)
+def test_products_and_solutions_are_those_of_the_matrix(h: int, blocks: int):
+    """The relative residual of a backward stable solution is some rounding errors (2e-16) times the condition."""
+    matrix, dense = random_chain(h, blocks)
+    columns = np.random.default_rng(0).standard_normal((blocks, h, 5))
+    flat = columns.reshape(-1, 5)
+    assert matrix.multiply(columns).reshape(-1, 5) == pytest.approx(
+        dense @ flat, abs=1e-12 * np.abs(dense).max()
+    )
+    solved = matrix.factorize().solve(columns).reshape(-1, 5)
+    expected = np.linalg.solve(dense, flat)
+    tolerance = 100 * np.finfo(float).eps * np.linalg.cond(dense)
+    assert np.linalg.norm(solved - expected) < tolerance * np.linalg.norm(expected)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused():
+    matrix, _ = random_chain(6, 2 * GROUP_SIZE)
+    diagonal = matrix.diagonal.copy()
+    diagonal[-1] = -diagonal[-1]
+    with pytest.raises(np.linalg.LinAlgError):
+        BlockTridiagonal(diagonal, matrix.below).factorize()
