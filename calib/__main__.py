@@ -2,9 +2,13 @@
 """`python -m calib`: calibrates lenses, camera poses and the world frame."""
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, get_args
+
+# Before NumPy is loaded, as in fusion.__main__.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 

@@ -45,6 +45,7 @@ LIVE_FILES = (
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _reserved_ports: set[int] = set()
 NICENESS = 10  # of tests that only compute
+SLOW_TIMEOUT_S = 3600
 
 # A shell that runs the tests in the background makes them, and the programs that they start, ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -61,10 +62,15 @@ def is_live(item: pytest.Item) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run live tests first and one at a time, and the others of one file in one process, which shares fixtures."""
+    """Run live tests first and one at a time, and the others of one file in one process, which shares fixtures.
+
+    A slow test gets more time before it counts as hanging.
+    """
     items.sort(key=lambda item: not is_live(item))
     for item in items:
         item.add_marker(pytest.mark.xdist_group("live" if is_live(item) else str(item.path)))
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

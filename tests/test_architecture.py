@@ -2,6 +2,7 @@
 """Rules of the source code that no linter checks. The layers are contracts of import-linter in pyproject.toml."""
 
 import ast
+import os
 import subprocess
 import sys
 from collections import Counter, defaultdict
@@ -157,3 +158,10 @@ def test_a_camera_node_runs_without_the_server_extra(extra: str):
         "import camera_node.sources.observations\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_live_tests_share_one_process_of_the_suite(request: pytest.FixtureRequest):
+    """In two processes at once they disturb each other; a pytest that pytest-xdist does not know ignores the groups."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        pytest.skip("the tests run in one process")
+    assert request.node.nodeid.endswith(f"@{request.path}")

@@ -3,12 +3,16 @@
 
 import contextlib
 import logging
+import os
 import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+
+# Before NumPy is loaded, as in fusion.__main__: the page calibrates cameras.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from camera_node.command_line import parse
 from camera_node.config import example_file

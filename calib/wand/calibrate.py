@@ -62,27 +62,11 @@ def calibrate(
     Raises:
         CalibrationError: the recording or the wand does not place two cameras, or most cameras contradict each other.
     """
-    from threadpoolctl import threadpool_limits
-
     check_recording(rig, messages)
     check_cameras(rig, background, "the background points")
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
-    # The matrices are many and small: a second thread of the linear algebra only waits for the first.
-    with threadpool_limits(1, "blas"):
-        return _calibrate(rig, wand, messages, distance, synchronous, background)
-
-
-def _calibrate(
-    rig: Rig,
-    wand: Body,
-    messages: Sequence[Detections],
-    distance: Distance | None,
-    synchronous: bool,
-    background: Sequence[Detections],
-) -> WandCalibration:
-    """`calibrate` with a checked recording."""
     recording, timing = label_by_timing(rig, wand, messages, synchronous)
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]

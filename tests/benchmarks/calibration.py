@@ -7,11 +7,15 @@ same run. `honesty` measures whether covariances are true (`calibration_honesty`
 bundle adjustment (`calibration_data`).
 """
 
+import os
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
+
+# Before NumPy is loaded, as in the programs that calibrate.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from rich.console import Console

@@ -4,6 +4,7 @@
 Server, cameras, viewer, page, recorder and client run as processes and follow ten robots during the run.
 """
 
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -131,13 +132,17 @@ def main(messages: int = 1_000_000, seed: int = 1, rate: float = 2000.0, only: s
         only: part of the name of a target of `Fuzzer`; all unless given.
     """
     result = FuzzResult()
-    with tempfile.TemporaryDirectory(prefix="roundel-fuzz-") as folder:
-        steps = fuzz(Path(folder), Fuzz(messages, rate, seed, only))
-        for step in track(steps, "fuzzing", messages / rate):
-            if isinstance(step, FuzzResult):
-                result = step
+    folder = Path(tempfile.mkdtemp(prefix="roundel-fuzz-"))
+    steps = fuzz(folder, Fuzz(messages, rate, seed, only))
+    for step in track(steps, "fuzzing", messages / rate):
+        if isinstance(step, FuzzResult):
+            result = step
     report(result)
-    return int(bool(result.failures()))
+    if result.failures():
+        say(f"logs of the programs: {folder}")
+        return 1
+    shutil.rmtree(folder)
+    return 0
 
 
 def report(result: FuzzResult) -> None:

@@ -18,6 +18,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -86,7 +87,9 @@ PHASES = (
 
 def render(folder: Path) -> None:
     """Write the pictures `<camera>/<t_ns>.png` of `FOLDERS`, and the videos `<camera>/<camera>.avi` of `VIDEOS`."""
-    with ProcessPoolExecutor() as processes:
+    with ProcessPoolExecutor(
+        mp_context=get_context("spawn")
+    ) as processes:  # a fork has no thread of Zenoh or OpenCV
         for done in [processes.submit(_render_phase, folder, k) for k in range(len(PHASES))]:
             done.result()
     for name in FPS:
