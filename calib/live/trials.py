@@ -6,11 +6,12 @@ Covariances are inversely proportional to the number of frames, which predicts t
 
 import os
 import signal
+import threading
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from multiprocessing.pool import AsyncResult
+from multiprocessing import get_context, parent_process
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
@@ -77,18 +78,26 @@ class Trial:
 
 
 def _init_trial_process() -> None:
-    """Run at low priority, so that cameras keep the processor, and leave Ctrl-C to the main process."""
+    """Run at low priority, so that cameras keep the processor, leave Ctrl-C to the main process, and end with it."""
     os.nice(10)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, name="end with the parent", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Without this the process of a killed session waits for its next trial for ever."""
+    if (parent := parent_process()) is not None:
+        parent.join()
+        os._exit(1)
 
 
 class TrialSolver:
-    """Computes trials, one at a time, in a process of its own."""
+    """Computes trials, one at a time, in a process of its own; a process that ends early is replaced."""
 
     def __init__(self, settings: WandSession) -> None:
         self._settings = settings
-        self._pool = get_context("spawn").Pool(1, _init_trial_process) if settings.trials else None
-        self._running: AsyncResult[Trial] | None = None
+        self._executor = _one_process() if settings.trials else None
+        self._running: Future[Trial] | None = None
         self._latest: Trial | None = None
         self._next_s = settings.trial_every_s
 
@@ -96,20 +105,34 @@ class TrialSolver:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.terminate()
-            self._pool.join()
+        """Do not wait: the process ends with the trial that it computes."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=False, cancel_futures=True)
 
     def update(self, messages: Sequence[Detections], now_s: float) -> Trial | None:
         """Collect a finished trial, and start the next one when it is due; returns the latest finished one."""
-        if self._running is not None and self._running.ready():
-            self._latest, self._running = self._running.get(), None
+        if self._executor is None:
+            return None
+        if self._running is not None and self._running.done():
+            self._latest, self._running = self._collect(self._running), None
             self._next_s = now_s + self._settings.trial_every_s
-        if self._pool is not None and self._running is None and now_s >= self._next_s and messages:
+        if self._running is None and now_s >= self._next_s and messages:
             part = select_blocks(messages)
             share = len(part) / len(messages)
-            self._running = self._pool.apply_async(compute_trial, (self._settings, part, share))
+            self._running = self._executor.submit(compute_trial, self._settings, part, share)
         return self._latest
+
+    def _collect(self, finished: Future[Trial]) -> Trial:
+        """The trial of a finished computation; without its process, a failed one, and another process for the next."""
+        try:
+            return finished.result(0)
+        except BrokenExecutor as error:
+            self._executor = _one_process()
+            return Trial(fault=f"the process of the trials ended ({error}); the session continues")
+
+
+def _one_process() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, get_context("spawn"), _init_trial_process)
 
 
 def select_blocks(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Detections]:

@@ -2,14 +2,19 @@
 """A wand session reports its progress, and ends when more frames would not improve the result."""
 
 import shlex
+import subprocess
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
+from multiprocessing import active_children
 from pathlib import Path
 
 import msgspec
+import psutil
 import pytest
 import zenoh
 
@@ -26,14 +31,15 @@ from calib.live.session_progress import (
     is_wand_gone,
     summarize,
 )
-from calib.live.trials import Trial, WandSession, select_blocks
+from calib.live.trials import Trial, TrialSolver, WandSession, select_blocks
 from calib.live.wand_session import run_wand_session
 from calib.rig.recording import read_detections
 from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import assert_near, record, ring
-from tests.conftest import free_port
+from tests.conftest import ROOT, free_port
+from tests.waiting import wait_for
 
 
 @contextmanager
@@ -211,6 +217,40 @@ def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.2, 0, 0], [0.5, 0, 0]]}")
     execute(words[3:])
     assert_near(load_rig(out), arena.truth, 2e-4, 2e-4)  # no noise
+
+
+def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
+    arena, now_s = ring(3), count(10.0, 10.0)
+    messages = record(arena, 8.0)
+    with TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand)) as solver:
+        assert solver.update(messages, next(now_s)) is None
+        for process in active_children():
+            process.kill()
+        trial = wait_for(lambda: solver.update(messages, next(now_s)))
+        assert "the process of the trials ended" in trial.fault
+        wait_for(lambda: (trial := solver.update(messages, next(now_s))) and not trial.fault)
+
+
+def test_a_killed_session_leaves_no_process():
+    """SIGKILL gives it no chance to end the process of its trials."""
+    code = (
+        "import sys\nfrom calib.live.trials import TrialSolver, WandSession\n"
+        "from tests.calib.live.test_wand_session import ring, record\n"
+        "if __name__ == '__main__':\n"
+        "    arena = ring(2)\n"
+        "    solver = TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand, trial_every_s=0.0))\n"
+        "    while not (trial := solver.update(record(arena, 2.0), 1.0)): pass\n"
+        "    print(flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as session:
+        assert session.stdout is not None
+        session.stdout.readline()
+        children = psutil.Process(session.pid).children()
+        session.kill()
+    assert children
+    assert not psutil.wait_procs(children, timeout=10.0)[1]
 
 
 def test_blocks_are_contiguous_and_evenly_spaced():
