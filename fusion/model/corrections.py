@@ -24,6 +24,11 @@ def corrected_camera(undone: Rig, restored: Rig) -> str | None:
     return name if was != _correction(restored) and name in restored.cameras else None
 
 
+def is_corrected(rig: Rig) -> bool:
+    """Whether the server corrected a camera since the calibration."""
+    return bool(_correction(rig))
+
+
 def _correction(rig: Rig) -> dict[str, Any]:
     entry = rig.calibration.get(CORRECTED)  # from a file or a message: of any type
     return entry if isinstance(entry, dict) and isinstance(entry.get("camera"), str) else {}

@@ -9,19 +9,21 @@ Each camera is compared in turn, just often enough to find a move within a secon
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.arrays import Mask
+from camera_node.geometry.pose import Pose
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import MarkerTable
 from fusion.model.states import States
 from fusion.monitoring.expected_views import ExpectedViews
-from fusion.monitoring.recalibration import ExpectedFrame, fits_equally, recalibrate
+from fusion.monitoring.recalibration import ExpectedFrame, recalibrate, residual_px
 
 AGREEMENT_PX = 2.0  # between an expected and a detected roundel of a camera that was not moved
 MEMORY_NS = 700_000_000  # of the comparisons that decide about a camera
@@ -34,7 +36,10 @@ MIN_OTHERS = 2  # other cameras that must see a robot, and that must be correct
 RECALIBRATION_MARKERS = 300  # expected markers from which a recalibration is tried
 FRESH_NS = 4_000_000_000  # older frames of a moved camera are discarded
 RETRY_NS = 300_000_000  # between recalibrations
-MAX_EARLIER = 4  # poses of a camera, to which it may return
+MAX_KNOWN = 4  # poses of a camera, to which it may return
+# By which the median residual of a known pose may be larger than that of the recalibration, if the other cameras are
+# calibrated, and if one of them is recalibrated itself: to 1 to 3 mm.
+EQUAL_PX, ROUGHLY_EQUAL_PX = 0.1, 0.5
 MAX_COMPARED = 20  # markers of a frame
 INTERVAL_NS = 250_000_000  # between comparisons with so many markers; shorter with fewer
 
@@ -64,8 +69,8 @@ class ExtrinsicsCorrection:
 
     Attributes:
         name: of the camera.
-        camera: with its new pose when it is recalibrated; None when it is excluded.
-        has_returned: whether the new pose is one that it had before.
+        camera: with the pose with which it is used again; None when it is excluded.
+        has_returned: whether that pose is the one in use, or one before.
     """
 
     name: str
@@ -75,7 +80,14 @@ class ExtrinsicsCorrection:
 
 @dataclass(slots=True)
 class _MonitoredCamera:
-    """Comparisons (time, expected, agreeing, detected) of one camera, and the frames for its recalibration."""
+    """Comparisons of one camera, and the frames for its recalibration.
+
+    Attributes:
+        comparisons: time, markers expected, those that agree, and roundels detected, at most as many as expected: what
+            else a frame shows does not stand for the markers of a frame that shows nothing.
+        views: frames after its exclusion.
+        tried_ns: time of the last recalibration.
+    """
 
     comparisons: deque[tuple[int, int, int, int]] = field(default_factory=deque)
     views: deque[ExpectedFrame] = field(default_factory=deque)
@@ -101,7 +113,7 @@ class ExtrinsicsMonitor:
         self.excluded: set[str] = set()
         self.pinned: set[str] = set()
         self._cameras: dict[str, _MonitoredCamera] = {}
-        self._earlier: dict[str, deque[Camera]] = {}
+        self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self._offset = 0  # rotates through more than MAX_COMPARED markers
         self._turns: dict[str, int] = {}  # of each camera at its last comparison
 
@@ -131,14 +143,30 @@ class ExtrinsicsMonitor:
             self.excluded.add(name)
             corrections.append(ExtrinsicsCorrection(name, None))
         for name in sorted(self.excluded) if recalibrates else ():
-            if (correction := self._recalibrate(name, scene.cameras[name])) is not None:
+            if (correction := self._recalibrate(name, scene.cameras)) is not None:
                 corrections.append(correction)
         return tuple(corrections)
+
+    def remember(self, rigs: Iterable[Mapping[str, Camera]]) -> None:
+        """Poses of cameras in earlier rigs, oldest first, to which these cameras may return."""
+        for rig in rigs:
+            for name, camera in rig.items():
+                self._remember(name, camera)
+
+    def inherit_poses(self, old: "ExtrinsicsMonitor") -> None:
+        """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
+        self._known, self.pinned = old._known, old.pinned
+
+    def _remember(self, name: str, camera: Camera) -> None:
+        known = self._known.setdefault(name, [])
+        if camera.T_world_cam is not None and camera.T_world_cam not in known:
+            known.append(camera.T_world_cam)
+            del known[1 : 1 - MAX_KNOWN]  # never the calibration's: the others are less accurate
 
     def readmit(self, name: str) -> None:
         """Use the detections of a camera that was calibrated again; its earlier poses are forgotten."""
         self._use(name)
-        self._earlier.pop(name, None)
+        self._known.pop(name, None)
 
     def pin(self, name: str) -> None:
         """Readmit a camera whose pose a user confirmed; it is not excluded again."""
@@ -177,7 +205,8 @@ class ExtrinsicsMonitor:
         uv = camera.project_world(expected.points.T)
         off = np.linalg.norm(uv[:, None] - frame.roundels.uv[None], axis=2)
         agreeing = int((off.min(1, initial=np.inf) < AGREEMENT_PX).sum())
-        monitored.comparisons.append((frame.t_ns, len(uv), agreeing, len(frame.roundels)))
+        detected = min(len(frame.roundels), len(uv))
+        monitored.comparisons.append((frame.t_ns, len(uv), agreeing, detected))
         while monitored.comparisons[0][0] < frame.t_ns - MEMORY_NS:
             monitored.comparisons.popleft()
         if frame.camera in self.excluded:
@@ -195,7 +224,7 @@ class ExtrinsicsMonitor:
         moved = [name for name, share in shares.items() if share < MOVED_SHARE and name not in ignored]
         return moved[0] if len(moved) == 1 and len(correct) >= MIN_OTHERS else None
 
-    def _recalibrate(self, name: str, camera: Camera) -> ExtrinsicsCorrection | None:
+    def _recalibrate(self, name: str, cameras: CameraArray) -> ExtrinsicsCorrection | None:
         """The camera with its present pose, or None while its frames do not determine it."""
         monitored = self._cameras.get(name)
         if monitored is None or not monitored.views:
@@ -205,14 +234,30 @@ class ExtrinsicsMonitor:
         if now_ns - monitored.tried_ns < RETRY_NS or n_markers < RECALIBRATION_MARKERS:
             return None
         monitored.tried_ns = now_ns
-        recalibrated = recalibrate(camera, list(views))
+        recalibrated = recalibrate(cameras[name], list(views))
         if recalibrated is not None:
-            earlier = self._earlier.setdefault(name, deque(maxlen=MAX_EARLIER))
-            same = next((c for c in earlier if fits_equally(c, recalibrated, list(views))), None)
-            if camera not in earlier:
-                earlier.append(camera)
+            known = self._known_pose(recalibrated, name, cameras, list(views))
             self._use(name)
-            return ExtrinsicsCorrection(name, same or recalibrated, same is not None)
+            return ExtrinsicsCorrection(name, known or recalibrated, known is not None)
         for _ in range(len(views) // 2):  # the camera may have been moving in the older ones
             views.popleft()
+        return None
+
+    def _known_pose(
+        self, recalibrated: Camera, name: str, cameras: CameraArray, views: list[ExpectedFrame]
+    ) -> Camera | None:
+        """The camera with the first of its known poses that explains the views as well as the recalibration.
+
+        Recalibration from some hundred markers is less accurate than a calibration, and its errors would add up.
+        """
+        for other in cameras.names:
+            self._remember(other, cameras[other])
+        is_rough = any(
+            cameras[other].T_world_cam != self._known[other][0] for other in cameras.names if other != name
+        )
+        allowed_px = residual_px(recalibrated, views) + (ROUGHLY_EQUAL_PX if is_rough else EQUAL_PX)
+        for pose in self._known[name]:
+            known = msgspec.structs.replace(recalibrated, T_world_cam=pose)
+            if residual_px(known, views) < allowed_px:
+                return known
         return None

@@ -26,7 +26,6 @@ MIN_SHARE = 1 / 3  # of the expected markers with a correspondence
 MAX_RESIDUAL_PX = 1.2  # median, of an accepted pose
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.008, 0.004  # of an accepted pose, for residuals of NOMINAL_PX
 NOMINAL_PX = 0.5
-EQUAL_PX = 0.1  # by which the median residual of an earlier pose may be larger
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,16 +59,7 @@ def recalibrate(camera: Camera, views: list[ExpectedFrame]) -> Camera | None:
     return _with_pose(camera, T)
 
 
-def fits_equally(earlier: Camera, recalibrated: Camera, views: list[ExpectedFrame]) -> bool:
-    """Whether an earlier pose explains the views as well: a camera that was only shaken has its calibrated pose.
-
-    Recalibration from some hundred markers is less accurate than a calibration, and its errors would add up.
-    """
-    allowed_px = _residual_px(recalibrated, views) + EQUAL_PX
-    return _residual_px(earlier, views) < allowed_px
-
-
-def _residual_px(camera: Camera, views: list[ExpectedFrame]) -> float:
+def residual_px(camera: Camera, views: list[ExpectedFrame]) -> float:
     """The median distance from an expected marker to the nearest detection of its view; infinite without views."""
     distances = [
         np.linalg.norm(

@@ -57,6 +57,8 @@ class TrackingPipeline:
         self._is_wand_recorded = False
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
+        if self.tracker is not None:
+            self.tracker.monitors.extrinsics.remember(rig.placed() for rig in self.active_rig.earlier())
 
     def _load_robots(self) -> dict[str, Robot]:
         """The newer of the given and the saved robots; if both are one file, it may be missing or empty."""
@@ -77,6 +79,7 @@ class TrackingPipeline:
         self._start(self.cameras)
         if old is not None and self.tracker is not None:
             self.tracker.monitors.clocks.inherit(old.monitors.clocks)
+            self.tracker.monitors.extrinsics.inherit_poses(old.monitors.extrinsics)
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
@@ -110,8 +113,8 @@ class TrackingPipeline:
             self.active_rig.message = message
 
     def correct_rig(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
-        """Update the active rig by a camera that the tracker recalibrated."""
-        if correction.camera is not None:
+        """Update the active rig by a camera with another pose."""
+        if correction.camera is not None and correction.camera != self.cameras.get(correction.name):
             self.active_rig.correct(correction.name, correction.camera, now_ns)
 
     def _use(self, rig: Rig, save: Callable[[], object], pinned: str | None = None) -> None:

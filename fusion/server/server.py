@@ -198,7 +198,7 @@ class Server:
         if self.pipeline.active_rig.message is not None:
             self._publisher.publish_rig(self.pipeline.active_rig.message)
         if correction.has_returned:
-            change = "camera %s is back at an earlier pose, and used again"
+            change = "camera %s is at a known pose, and used again"
         else:
             change = "camera %s is recalibrated and used again; roundel undo reverts that"
         log.warning(change, correction.name, extra=about(correction.name))

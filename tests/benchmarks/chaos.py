@@ -130,6 +130,7 @@ def chaos(
         yield from run.run(seconds)
     run.result.crashes = arena.programs.crashes
     run.result.growths = arena.programs.growths()
+    arena.programs.save_memory(folder / "memory.txt")
     yield run.result
 
 

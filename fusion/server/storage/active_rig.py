@@ -19,7 +19,7 @@ from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.config import write_atomically
 from camera_node.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
-from fusion.model.corrections import correct
+from fusion.model.corrections import correct, is_corrected
 from fusion.server.storage.persistence import is_newer
 
 log = logging.getLogger("fusion")
@@ -131,6 +131,21 @@ class ActiveRig:
     def next(self) -> Rig:
         """The rig that `redo` restores; raises as `previous`."""
         return load_rig(self._history.next())
+
+    def earlier(self) -> list[Rig]:
+        """The rigs from the calibration on that the server's corrections changed, oldest first, to the one in use.
+
+        The history may not reach as far; the rig of the configuration is the calibration then.
+        """
+        rigs = [self.rig] if self.rig is not None else []
+        is_saved = self._saved is not None and self._saved.exists()
+        files = [*reversed(self._history.older())] if is_saved else []
+        for path in (*files, self._given):
+            if path is None or not rigs or not is_corrected(rigs[-1]):
+                break
+            with contextlib.suppress(RoundelError):
+                rigs.append(load_rig(path))
+        return rigs[::-1]
 
     def neighbours(self) -> list[Rig]:
         """The rigs in the files to which undo and redo would go; those that can't be read are left out."""

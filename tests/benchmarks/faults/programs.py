@@ -136,6 +136,16 @@ class Programs:
         measured = {name: growth(of_name) for name, of_name in lives.items()}
         return {name: result for name, result in measured.items() if result is not None}
 
+    def save_memory(self, path: Path) -> None:
+        """Write the samples of all programs that ended: name, number of the life, age in seconds, MB."""
+        rows = [
+            f"{name} {k} {age_s:.0f} {memory_mb:.2f}\n"
+            for name, lives in self._lives.items()
+            for k, samples in enumerate(lives)
+            for age_s, memory_mb in samples.reshape(-1, 2)
+        ]
+        path.write_text("".join(rows))
+
     def memory_mb(self, name: str) -> float:
         """Of the last sample; 0 without one."""
         memory = self._running[name].memory if name in self._running else []

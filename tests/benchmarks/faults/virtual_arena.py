@@ -83,7 +83,9 @@ class VirtualArena:
         self._arrived_ns = dict.fromkeys(self.cameras, 0)
         self._tick_ns = START_NS
         self._log = _Lines()
-        self.server = self._server(folder, rig or Rig(cameras=load.rig))
+        self._folder = folder
+        save_rig(rig or Rig(cameras=load.rig), folder / "rig.yaml")
+        self.server = self._server()
 
     def __enter__(self) -> "VirtualArena":
         logging.getLogger("fusion").addHandler(self._log)
@@ -128,13 +130,15 @@ class VirtualArena:
     def inspect(self, samples_memory: bool) -> None:
         """There are no programs that could end."""
 
-    def _server(self, folder: Path, rig: Rig) -> Server:
-        save_rig(rig, folder / "rig.yaml")
+    def restart(self) -> None:
+        """Replace the server by one that knows only its files."""
+        self.server = self._server()
+
+    def _server(self) -> Server:
         bodies = {name: msgspec.to_builtins(body) for name, body in self.load.bodies.items()}
-        (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
-        server = Server(
-            ArenaConfig(arena=ARENA, rig=str(folder / "rig.yaml"), robots=str(folder / "robots.yaml"))
-        )
+        rig, saved, robots = (str(self._folder / f"{file}.yaml") for file in ("rig", "saved_rig", "robots"))
+        Path(robots).write_bytes(msgspec.yaml.encode({"robots": bodies}))
+        server = Server(ArenaConfig(arena=ARENA, rig=rig, saved_rig=saved, robots=robots))
         server.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
         outbox = Outbox(self.judge)
         server._publisher = ArenaPublisher(outbox, self._keys, server.shard)  # pyright: ignore[reportArgumentType]
