@@ -234,14 +234,16 @@ def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
 def test_a_killed_session_leaves_no_process():
     """SIGKILL gives it no chance to end the process of its trials."""
     code = (
-        "import sys\nfrom calib.live.trials import TrialSolver, WandSession\n"
-        "from tests.calib.live.test_wand_session import ring, record\n"
-        "if __name__ == '__main__':\n"
-        "    arena = ring(2)\n"
-        "    solver = TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand, trial_every_s=0.0))\n"
-        "    while not (trial := solver.update(record(arena, 2.0), 1.0)): pass\n"
-        "    print(flush=True)\n"
-        "    sys.stdin.read()\n"
+        "import sys\n"
+        "from calib.live.trials import TrialSolver, WandSession\n"
+        "from tests.calib.synthetic import record, ring\n"
+        "from tests.waiting import wait_for\n"
+        "arena = ring(2)\n"
+        "messages = record(arena, 2.0)\n"
+        "solver = TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand, trial_every_s=0.0))\n"
+        "wait_for(lambda: solver.update(messages, 1.0))\n"
+        "print(flush=True)\n"
+        "sys.stdin.read()\n"
     )
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as session:
