@@ -26,8 +26,9 @@ class LogLimits:
     """How many lines are written at once, and how often after that.
 
     Attributes:
-        pause_s: after the first line of a kind. It doubles with each line of the kind, so that a flood that has lasted
-            for T has written log2(T / pause_s) lines, ...
+        pause_s: after the first line of a kind. It grows by `growth` with each line of the kind, so that a flood that
+            has lasted for T has written log(T / pause_s) / log(growth) lines, ...
+        growth: of the pause.
         longest_pause_s: ... up to this, ...
         quiet_s: ... and halves with each such time without the kind. What is held back is written after it as well.
         lines: of all kinds at once; those of a traceback count ...
@@ -39,6 +40,7 @@ class LogLimits:
     """
 
     pause_s: float = 1.0
+    growth: float = 4.0
     longest_pause_s: float = 3600.0
     quiet_s: float = 60.0
     lines: int = 32
@@ -48,7 +50,7 @@ class LogLimits:
 
 
 class _Pause:
-    """The time between two lines: it doubles with each line, and halves with each quiet time."""
+    """The time between two lines: it grows with each line, and halves with each quiet time."""
 
     def __init__(self, limits: LogLimits) -> None:
         self._limits = limits
@@ -84,7 +86,8 @@ class _Pause:
 
     def restart(self, now_s: float) -> None:
         """A line is written."""
-        self._pause_s = min(max(self._limits.pause_s, 2 * self._pause_s), self._limits.longest_pause_s)
+        limits = self._limits
+        self._pause_s = min(max(limits.pause_s, limits.growth * self._pause_s), limits.longest_pause_s)
         self._written_s = now_s
 
 
