@@ -227,6 +227,7 @@ def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
         for process in active_children():
             process.kill()
         trial = wait_for(lambda: solver.update(messages, next(now_s)))
+        assert trial is not None
         assert "the process of the trials ended" in trial.fault
         wait_for(lambda: (trial := solver.update(messages, next(now_s))) and not trial.fault)
 
