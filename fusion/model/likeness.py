@@ -52,7 +52,9 @@ class _Markers:
         return len(self.numbers)
 
 
-@lru_cache(maxsize=512)  # each body is compared with all others: at most 256 in an arena, and those of a request
+@lru_cache(
+    maxsize=512
+)  # each body is compared with all others: at most 256 in an arena, and those of a request
 def _distinctive(body: Body) -> list[_Markers]:
     """The parts of a constellation that acquisition may see alone: its sides with three markers or more, or all."""
     large = [side for side in sides(body) if len(side) >= MIN_MARKERS]
