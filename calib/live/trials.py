@@ -114,21 +114,31 @@ class TrialSolver:
         if self._executor is None:
             return None
         if self._running is not None and self._running.done():
-            self._latest, self._running = self._collect(self._running), None
+            self._latest, self._running = _collect(self._running), None
             self._next_s = now_s + self._settings.trial_every_s
         if self._running is None and now_s >= self._next_s and messages:
             part = select_blocks(messages)
             share = len(part) / len(messages)
-            self._running = self._executor.submit(compute_trial, self._settings, part, share)
+            self._running = self._submit(self._executor, part, share)
         return self._latest
 
-    def _collect(self, finished: Future[Trial]) -> Trial:
-        """The trial of a finished computation; without its process, a failed one, and another process for the next."""
+    def _submit(
+        self, executor: ProcessPoolExecutor, part: Sequence[Detections], share: float
+    ) -> Future[Trial]:
+        """Start a trial, in another process if that of the last one has ended."""
         try:
-            return finished.result(0)
-        except BrokenExecutor as error:
+            return executor.submit(compute_trial, self._settings, part, share)
+        except BrokenExecutor:
             self._executor = _one_process()
-            return Trial(fault=f"the process of the trials ended ({error}); the session continues")
+            return self._executor.submit(compute_trial, self._settings, part, share)
+
+
+def _collect(finished: Future[Trial]) -> Trial:
+    """The trial of a finished computation; a failed one if its process ended before."""
+    try:
+        return finished.result(0)
+    except BrokenExecutor as error:
+        return Trial(fault=f"the process of the trials ended ({error}); the session continues")
 
 
 def _one_process() -> ProcessPoolExecutor:

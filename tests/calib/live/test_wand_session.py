@@ -39,7 +39,7 @@ from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import ROOT, free_port
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 
 
 @contextmanager
@@ -220,16 +220,29 @@ def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command
 
 
 def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
+    """Also if the process ends while it waits for the next trial."""
     arena, now_s = ring(3), count(10.0, 10.0)
     messages = record(arena, 8.0)
-    with TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand)) as solver:
-        assert solver.update(messages, next(now_s)) is None
+
+    def end_process() -> None:
         for process in active_children():
             process.kill()
+            process.join(DEADLINE_S)
+
+    with TrialSolver(WandSession(rig=arena.intrinsics, wand=arena.wand)) as solver:
+
+        def solved() -> Trial | None:
+            trial = solver.update(messages, next(now_s))
+            return trial if trial is not None and not trial.fault else None
+
+        assert solver.update(messages, next(now_s)) is None
+        end_process()
         trial = wait_for(lambda: solver.update(messages, next(now_s)))
         assert trial is not None
         assert "the process of the trials ended" in trial.fault
-        wait_for(lambda: (trial := solver.update(messages, next(now_s))) and not trial.fault)
+        first = wait_for(solved)
+        end_process()
+        wait_for(lambda: (trial := solved()) is not None and trial is not first)
 
 
 def test_a_killed_session_leaves_no_process():
