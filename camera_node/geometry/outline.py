@@ -48,9 +48,8 @@ def centre_shifts(lens: Lens, xy: Array, half_axes: Array) -> Array:
     """
     ends = xy[:, None] + np.concatenate([half_axes, -half_axes], axis=2).transpose(0, 2, 1)  # (N, 4, 2)
     points = np.concatenate([ends, np.ones((len(xy), 4, 1))], axis=2).reshape(-1, 3)
-    J = lens.project_with_jacobian(np.nan_to_num(points, nan=-1.0, posinf=-1.0, neginf=-1.0))[1][
-        :, :, :2
-    ].reshape(-1, 4, 2, 2)
+    points = np.nan_to_num(points, nan=-1.0, posinf=-1.0, neginf=-1.0)  # behind the camera
+    J = lens.project_with_jacobian(points)[1][:, :, :2].reshape(-1, 4, 2, 2)
     image = J.mean(axis=1) @ half_axes
     change = (J[:, :2] - J[:, 2:]).transpose(0, 2, 3, 1) / 2  # of J along each half axis, the last index
     B = np.einsum("nklb,nla->nkab", change, half_axes)
