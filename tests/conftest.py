@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,6 +47,10 @@ PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and W
 _reserved_ports: set[int] = set()
 NICENESS = 10  # of tests that only compute
 SLOW_TIMEOUT_S = 3600
+
+# Examples are the same in each run, and none has a limit of wall-clock time: other tests load the machine.
+hypothesis.settings.register_profile("roundel", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("roundel")
 
 # A shell that runs the tests in the background makes them, and the programs that they start, ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)

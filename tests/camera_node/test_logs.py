@@ -152,7 +152,7 @@ def test_a_flood_of_one_kind_writes_as_many_lines_as_the_logarithm_of_its_durati
 
 
 @given(st.lists(st.sampled_from([0.0, 0.01, 0.3, 2.0, 7.0, 30.0, 59.0, 61.0, 130.0]), max_size=300))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_no_pattern_of_one_kind_writes_more_than_a_flood_and_a_line_a_minute(gaps_s: list[float]):
     """Each quiet minute halves the pause, and so permits one more line. None is held back for longer than a minute."""
     log, limits = VirtualLog(), LogLimits()

@@ -86,7 +86,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("rig") / "rig.yaml"
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(figures=st.dictionaries(st.text(max_size=10), VALUES, max_size=4))
 def test_any_figures_that_a_message_holds_are_saved_and_loaded(path: Path, figures: dict[str, Any]):
     """Compared as YAML, because NaN does not equal itself."""

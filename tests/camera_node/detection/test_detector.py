@@ -181,7 +181,7 @@ def test_the_result_does_not_depend_on_the_memory_layout():
         assert np.array_equal(Detector().detect(view).uv, Detector().detect(image).uv)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     height=st.integers(0, 40),
     width=st.integers(0, 70),

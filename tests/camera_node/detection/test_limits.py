@@ -106,7 +106,7 @@ def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
     return discs, draw(st.floats(120, 230)), draw(st.floats(0.5, 0.9)), draw(st.integers(0, 99))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(scenes())
 def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
     """Both find every roundel; their fits have different initial guesses and the same result.

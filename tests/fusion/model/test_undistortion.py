@@ -101,7 +101,7 @@ def test_the_table_covers_the_image_of_a_usual_lens(name):
     assert np.isfinite(table_of(lens).look_up(points(inside))[0][0]).mean() > 0.98
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(*[st.floats(-1e5, 1e5)] * 2, *[st.floats(width=32)] * 3), max_size=5))
 def test_any_ellipse_is_accepted(ellipses):
     """Any centre and outline in a message gives coordinates or NaN; the outline moves the centre by 0.3 radii or less

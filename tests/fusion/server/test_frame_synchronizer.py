@@ -54,7 +54,7 @@ def steps(closed: list[tuple[int, FrameSet]]) -> np.ndarray:
     return np.diff([frame_set.t_ns for _, frame_set in closed])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     phases=st.lists(st.floats(-0.5, 0.5), min_size=1, max_size=5),
     period=st.integers(10 * MS, 100 * MS),
@@ -71,7 +71,7 @@ def test_every_frame_is_in_the_nearest_frame_set_and_in_no_other(phases, period)
     assert sum(synchronizer.late.values()) == 0
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     phases=st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=4),
     delays=st.lists(st.integers(0, 140), min_size=4),
