@@ -3,6 +3,7 @@
 
 Zenoh has a thread for each core and more, and glibc gives each thread an arena of its own. Messages of changing sizes
 leave free memory in all of them, so that the resident memory of a program grows for hours although it uses no more.
+`malloc_trim` returns what is free at the end of the first arena only, so all threads share that one.
 """
 
 import ctypes
@@ -11,12 +12,12 @@ import threading
 import time
 
 M_ARENA_MAX = -8  # of mallopt(3)
-MAX_ARENAS = 2
+MAX_ARENAS = 1
 PERIOD_S = 10.0  # between two returns, each of which takes 0.2 to 3 ms on a thread without the GIL
 
 
 def return_freed_memory(period_s: float = PERIOD_S) -> None:
-    """Share few arenas between all threads, and return free pages periodically; without effect where glibc is not used.
+    """Share one arena between all threads, and return free pages periodically; without effect where glibc is not used.
 
     To be called before the program starts threads.
 
