@@ -43,7 +43,7 @@ class FuzzResult:
         gap_s: the longest gap in the poses of a robot.
         lines: of all logs during the run.
         grown_mb: memory of each program, from the first to the last sample.
-        growths: of the memory after the warm-up; empty after a short run.
+        growths: of the memory of the attacked programs after the warm-up; empty after a short run.
         summary: what the fuzzer says that it sent.
     """
 
@@ -111,7 +111,8 @@ def fuzz(
         result.grown_mb = {n: arena.programs.memory_mb(n) - mb for n, mb in first.items()}
         result.faults = dict(arena.status.faults) if arena.status else {}
     result.crashes += arena.programs.crashes
-    result.growths = arena.programs.growths()
+    result.growths = {name: growth for name, growth in arena.programs.growths().items() if name != "fuzzer"}
+    arena.programs.save_memory(folder / "memory.txt")
     result.summary = (folder / "fuzzer.out").read_text()
     yield result
 
