@@ -16,6 +16,7 @@ from rich.table import Table
 from camera_node.terminal import console, say, track
 from tests.benchmarks.faults.arena import Fuzz, LiveArena, small_load
 from tests.benchmarks.faults.fuzzer import FUZZED
+from tests.benchmarks.faults.judge import WrongPose
 from tests.benchmarks.faults.memory import Growth
 from tests.benchmarks.fusion_load import Load
 
@@ -50,7 +51,7 @@ class FuzzResult:
     errors_m: tuple[float, float] = (0.0, 0.0)
     rms_m: tuple[float, float] = (0.0, 0.0)
     by_cameras_m: dict[tuple[str, ...], float] = field(default_factory=dict)
-    wrong: int = 0
+    wrong: list[WrongPose] = field(default_factory=list)
     gap_s: float = 0.0
     lines: list[tuple[str, str]] = field(default_factory=list)
     grown_mb: dict[str, float] = field(default_factory=dict)
@@ -62,13 +63,10 @@ class FuzzResult:
     def failures(self) -> list[str]:
         """What does not hold, one line each."""
         grown = {n: mb for n, mb in self.grown_mb.items() if mb > FILL_MB}
+        worst = max(self.wrong, key=lambda pose: pose.error_m, default=None)
         return [
             *self.crashes,
-            *(
-                [f"{self.wrong} poses are off, by {self.errors_m[1] * 1e3:.1f} mm at most"]
-                if self.wrong
-                else []
-            ),
+            *([f"{len(self.wrong)} poses are wrong, the worst by {worst}"] if worst else []),
             *([f"{len(self.lines)} log lines"] if len(self.lines) >= MAX_LINES else []),
             *(f"{name} grew by {mb:.0f} MB" for name, mb in grown.items()),
             *(f"{name} grows by {growth}" for name, growth in self.growths.items() if growth.is_excessive),
@@ -105,7 +103,7 @@ def fuzz(
         result.crashes += [f"fuzzer: exit code {code}"] if code else []
         result.errors_m, result.rms_m = (before[0], arena.judge.largest_m), (before[1], arena.judge.rms_m)
         result.by_cameras_m = dict(arena.judge.largest_by_cameras_m)
-        result.wrong = len(arena.judge.wrong)
+        result.wrong = list(arena.judge.wrong)
         result.gap_s = max((gap.seconds for gap in arena.judge.gaps), default=0.0)
         result.lines += arena.programs.new_lines()
         result.grown_mb = {n: arena.programs.memory_mb(n) - mb for n, mb in first.items()}

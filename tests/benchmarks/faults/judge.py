@@ -30,12 +30,16 @@ class Gap:
 
 @dataclass(frozen=True)
 class WrongPose:
-    """A tracked pose that is further from the truth than allowed."""
+    """A tracked pose that is further from the truth than allowed, and the cameras that contributed to it."""
 
     robot: str
     received_s: float
     error_m: float
     sigmas: float
+    cameras: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.error_m:.1f} mm, {self.sigmas:.1f} sigma, from {' '.join(self.cameras) or 'no camera'}"
 
 
 @dataclass
@@ -129,4 +133,4 @@ class PoseJudge:
         covariance = pose.covariance_matrix[POSITION, POSITION]
         sigmas = float(np.sqrt(error @ np.linalg.solve(covariance, error)))
         if sigmas > MAX_SIGMAS and len(self.wrong) < LONGEST:
-            self.wrong.append(WrongPose(pose.robot, now_s, error_m, sigmas))
+            self.wrong.append(WrongPose(pose.robot, now_s, error_m, sigmas, cameras))
