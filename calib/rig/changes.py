@@ -31,11 +31,13 @@ class RigChange(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         t_ns: when it was made.
         change: what differs from the rig before; empty where unknown.
         source: who asked for it; None for the server itself, and where unknown.
+        is_correction: whether the server made it by itself, for a camera that was moved.
     """
 
     t_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     change: Annotated[str, msgspec.Meta(max_length=MAX_CHANGE)] = ""
     source: RequestSource | None = None
+    is_correction: bool = False
 
     def line(self) -> str:
         """The first line of the rig's file."""

@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +63,13 @@ class History:
             for oldest in self._older.files()[:-MAX_OLD]:
                 oldest.unlink()
             return backup
+
+    def make_room(self, is_minor: Callable[[Path], bool]) -> None:
+        """Remove the oldest version for which `is_minor`, if the next one would displace the oldest of all."""
+        with self._reporting("backed up"):
+            older = self._older.files()
+            if len(older) >= MAX_OLD and (minor := next(filter(is_minor, older), None)):
+                minor.unlink()
 
     def previous(self) -> Path:
         """The version that `undo` restores; raises CalibrationError if there is none."""

@@ -83,20 +83,23 @@ class ActiveRig:
         is_saved = self._saved is not None if saved is None else saved
         self.message = RigMessage(t_ns=now_ns, rig=rig, saved=is_saved, source=source)
 
-    def save(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
+    def save(
+        self, rig: Rig, now_ns: int, source: RequestSource | None = None, is_correction: bool = False
+    ) -> None:
         """Save another rig as the next step of the history, with what it changes, when, and who asked for it.
 
-        A file that the sender of the rig wrote before, as `calib` and the page do, is such a step already.
+        A file that the sender of the rig wrote before, as `calib` and the page do, is such a step already. Where the
+        history is full, the server's corrections leave it first: a camera that is often moved displaces no calibration.
 
         Raises:
             ConfigError, CalibrationError: it can't be saved; the files hold the rig in use.
         """
-        change = RigChange(
-            t_ns=now_ns, change=describe_change(self.rig, rig)[:MAX_CHANGE], source=source
-        ).line()
+        text = describe_change(self.rig, rig)[:MAX_CHANGE]
+        change = RigChange(t_ns=now_ns, change=text, source=source, is_correction=is_correction).line()
         path = self._history.path
         if not holds_rig(path, rig) or not self._is_in_history():
             self._save_active()
+            self._history.make_room(lambda older: read_change(older).is_correction)
             save_rig(rig, path, change)
         elif rig != self.rig:
             write_atomically(path, change + dump_rig(rig))
@@ -112,7 +115,7 @@ class ActiveRig:
         rig = correct(self.rig, name, camera, now_ns)
         saved = None
         try:
-            self.save(rig, now_ns)
+            self.save(rig, now_ns, is_correction=True)
         except RoundelError as error:
             log.warning("the corrected rig is used, but not saved for a restart: %s", error)
             saved = False

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from calib.live.rig_requests import set_rig
-from calib.rig.history import History
+from calib.rig.history import MAX_OLD, History
 from calib.rig.messages import RigHistory
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.errors import NetworkError
@@ -215,6 +215,25 @@ def loaded(given: Path, saved: Path) -> Rig | None:
     active = ActiveRig(given, saved)
     active.load(lambda rig: None)
     return active.rig
+
+
+def test_corrections_of_moved_cameras_displace_no_calibration(tmp_path: Path):
+    """The history ended at a correction after the twentieth."""
+    active = ActiveRig(None, tmp_path / "rig.saved.yaml")
+    for k in range(3):
+        active.save(numbered(k), k)
+        active.use(numbered(k), k)
+    moved = []
+    for k in range(2 * MAX_OLD):
+        pose = Pose((0.0, 0.0, float(k)), (1.0, 0.0, 0.0, 0.0))
+        active.correct("cam1", msgspec.structs.replace(MOVED, T_world_cam=pose), k)
+        assert active.rig is not None
+        moved.append(dump_rig(active.rig))
+    states = [load_rig(path) for path in History(tmp_path / "rig.saved.yaml").older()]
+    assert len(states) == MAX_OLD
+    assert [dump_rig(rig) for rig in states[:3]] == [dump_rig(numbered(k)) for k in range(3)]
+    assert [dump_rig(rig) for rig in states[3:]] == moved[-len(states) + 2 : -1]
+    assert dump_rig(active.earlier()[0]) == dump_rig(numbered(2))
 
 
 def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path: Path):
