@@ -181,7 +181,9 @@ ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
 def main(names: list[str]) -> None:
     """Print the measured figures beside their goals."""
     if unknown := [name for name in names if name not in ROWS]:
-        raise SystemExit(f"no rows {' '.join(unknown)}; the rows are {' '.join(ROWS)}; or give honesty or data")
+        raise SystemExit(
+            f"no rows {' '.join(unknown)}; the rows are {' '.join(ROWS)}; or give honesty or data"
+        )
     console, unit = Console(), reference_s()
     table = Table("row", "figure", "measured", "goal")
     for name in names or ROWS:

@@ -57,7 +57,7 @@ def test_a_distance_gives_a_light_its_scale():
     assert_near(by_tape.rig, arena.truth, 5e-3, 2e-3)
 
 
-@pytest.mark.parametrize("off", [EXACT, OLD])
+@pytest.mark.parametrize("off", [pytest.param(EXACT, marks=pytest.mark.slow), OLD])
 def test_halves_of_a_light_are_compared_by_their_shape(off: tuple[float, float, float]):
     """Each half sets its two farthest cameras 1 m apart, not the same ones in both: the scales are aligned before the
     test. Chi-square, summed over recordings, is below its 99.9 % quantile."""

@@ -73,7 +73,11 @@ def test_a_clock_that_drifts_is_reported_before_it_harms():
 
 @pytest.mark.parametrize(
     ("ppm", "reported_s", "duration_s"),
-    [(200.0, 12.0, 16.0), (-200.0, 12.0, 16.0), pytest.param(50.0, 30.0, 36.0, marks=pytest.mark.slow)],
+    [
+        (200.0, 12.0, 16.0),
+        pytest.param(-200.0, 12.0, 16.0, marks=pytest.mark.slow),
+        pytest.param(50.0, 30.0, 36.0, marks=pytest.mark.slow),
+    ],
 )
 def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, duration_s: float):
     """Before: 200 ppm after 23 to 30 s, 50 ppm never. Windows of 2 s show the offset with a sigma of about 0.1 ms."""
@@ -87,7 +91,7 @@ def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, du
     assert outcome.worst_m(FAULT_S) < 0.007  # 4.6 mm without a drift
 
 
-@pytest.mark.parametrize("speed_m_s", [0.3, 1.0])
+@pytest.mark.parametrize("speed_m_s", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_an_inaccurate_calibration_is_no_drift(speed_m_s: float):
     """Camera poses and focal lengths that are wrong by 0.2 px bias all offsets, but do not change them."""
     load = replace(LOAD, robots=4, speed_m_s=speed_m_s)

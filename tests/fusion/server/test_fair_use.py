@@ -90,7 +90,7 @@ def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
     ("key", "payload"),
     [
         ("test/robots/set", "{}"),
-        ("test/rig", ""),
+        pytest.param("test/rig", "", marks=pytest.mark.slow),
         pytest.param("test/robots", "", marks=pytest.mark.slow),
         pytest.param("test/clock", "", marks=pytest.mark.slow),
     ],

@@ -15,7 +15,11 @@ pytestmark = pytest.mark.computed
 
 
 @pytest.mark.parametrize(
-    ("kinds", "seed"), [(("camera frozen", "camera moved", "clock stepped"), 3), (("clock drifts",), 7)]
+    ("kinds", "seed"),
+    [
+        (("camera frozen", "camera moved", "clock stepped"), 3),
+        pytest.param(("clock drifts",), 7, marks=pytest.mark.slow),
+    ],
 )
 def test_a_faulty_camera_makes_no_pose_wrong(kinds: tuple[str, ...], seed: int, tmp_path: Path):
     """Before, 442 poses were wrong by up to 0.5 m in 90 s of the first, and a third of the drifts were not reported."""
