@@ -57,6 +57,11 @@ class RigVersion(RigChange, frozen=True, kw_only=True, omit_defaults=False):
     state: Literal["earlier", "in force", "undone"]
     file: Annotated[str, msgspec.Meta(max_length=255)] = ""  # empty if a restart loses it
 
+    @property
+    def unnamed_maker(self) -> str:
+        """Who made it, where `source` does not say so."""
+        return "the server" if self.is_correction else "the server or a file"
+
 
 class RigHistory(msgspec.Struct, frozen=True, kw_only=True):
     """The versions of the rig in their order, oldest first: the earlier ones, the one in force, the undone ones."""

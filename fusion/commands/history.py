@@ -44,7 +44,7 @@ def history(
 
 def _line(version: RigVersion) -> str:
     made = datetime.fromtimestamp(version.t_ns / 1e9).isoformat(" ", "seconds")
-    by = version.source or "the server or a file"
+    by = version.source or version.unnamed_maker
     where = version.file or "in no file"
     text = f"{version.state:8}  {made}  {where}: {version.change or 'unknown change'}, by {by}"
     return printable(text)

@@ -81,6 +81,6 @@ def tabulate_history(history: RigHistory | None) -> HtmlTable:
 
 def _row(version: RigVersion) -> TableRow:
     made = datetime.fromtimestamp(version.t_ns / 1e9).strftime("%Y-%m-%d %H:%M")
-    program = printable(version.source.program, 32) if version.source else "the server or a file"
+    program = printable(version.source.program, 32) if version.source else version.unnamed_maker
     cells = (made, program, version.state, printable(version.file, 32) or NO_VALUE)
     return TableRow(cells, LEVELS[version.state], printable(version.change, 120))

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from calib.rig.camera import Camera
 from calib.rig.changes import MAX_CHANGE, RigChange, describe_change, holds_rig, read_change
 from calib.rig.history import History
@@ -178,9 +180,7 @@ class ActiveRig:
     def _version(self, path: Path, state: State) -> RigVersion:
         change = read_change(path)
         file = path.name if self._saved is not None else ""
-        return RigVersion(
-            state=state, t_ns=change.t_ns, change=change.change, source=change.source, file=file
-        )
+        return RigVersion(state=state, file=file, **msgspec.structs.asdict(change))
 
     def _version_in_force(self, message: RigMessage) -> RigVersion:
         """The rig in use; a rig of the configuration is in none of the files of the history."""

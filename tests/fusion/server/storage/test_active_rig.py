@@ -234,6 +234,8 @@ def test_corrections_of_moved_cameras_displace_no_calibration(tmp_path: Path):
     assert [dump_rig(rig) for rig in states[:3]] == [dump_rig(numbered(k)) for k in range(3)]
     assert [dump_rig(rig) for rig in states[3:]] == moved[-len(states) + 2 : -1]
     assert dump_rig(active.earlier()[0]) == dump_rig(numbered(2))
+    makers = [version.unnamed_maker for version in active.history().versions]
+    assert makers == ["the server or a file"] * 3 + ["the server"] * (MAX_OLD - 2)
 
 
 def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path: Path):
