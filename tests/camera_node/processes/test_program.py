@@ -89,7 +89,9 @@ def python(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.skipif(glibc() is None, reason="the allocator is not glibc's")
-@pytest.mark.parametrize(("program", "freed_mb"), [(FRAGMENTS, 40), (THREADS, 18)])
+@pytest.mark.parametrize(
+    ("program", "freed_mb"), [(FRAGMENTS, 40), (THREADS, 18)], ids=("fragments", "threads")
+)
 def test_freed_memory_is_returned(program: str, freed_mb: float):
     """The pages of all freed blocks but those at their ends, whichever thread used them."""
     done = python(RESIDENT + program)
