@@ -52,9 +52,8 @@ class _Markers:
         return len(self.numbers)
 
 
-@lru_cache(
-    maxsize=512
-)  # each body is compared with all others: at most 256 in an arena, and those of a request
+# Each body is compared with all others: at most 256 in an arena, and those of a request.
+@lru_cache(maxsize=512)
 def _distinctive(body: Body) -> list[_Markers]:
     """The parts of a constellation that acquisition may see alone: its sides with three markers or more, or all."""
     large = [side for side in sides(body) if len(side) >= MIN_MARKERS]

@@ -125,7 +125,7 @@ class VirtualLog:
     def _write(self, released: list) -> None:
         for held, record in released:
             self._limiter.charge(held, 1)
-            self.lines.append((self.now_s, held, record.getMessage()))
+            self.lines.append((self.now_s, held, f"{record.levelname} {record.getMessage()}"))
         self._due_s = self._limiter.due_s()
 
 
@@ -227,10 +227,13 @@ def test_a_rare_line_is_quoted_in_the_digest_of_a_flood():
     log = VirtualLog(LogLimits(0.0, lines=3, most_lines=10))
     for k in range(4000):
         log.log(k / 1000, k % 40)
-    log.log(4.0, "north", "camera moved %s")
+    log.log(4.0, "north", "camera north was moved (%s)")
     log.advance(15.0)
-    at_s, _, line = next(line for line in log.lines if "moved" in line[2])
-    assert re.match(r"\d+ lines of \d+ kinds: camera moved \d+; refused: \d+ \(\d+ lines like this\); ", line)
+    at_s, _, line = next(line for line in log.lines if "north" in line[2])
+    assert re.match(
+        r"WARNING \d+ lines of \d+ kinds: camera north was moved \(\d+\); refused: \d+ \(\d+ lines like this\); ",
+        line,
+    )
     assert at_s <= 4.0 + LogLimits().most_lines * LogLimits().line_s
     assert len(log.lines) < 10
 

@@ -18,7 +18,7 @@ from tests.fusion.settable_arena import error_m, running_arena
 from tests.fusion.settable_clock import SettableClock
 from tests.waiting import Inbox
 
-SETTLED, WATCHED = 60, 60  # poses at 30 Hz before the first step, and after each
+SETTLED, WATCHED = 60, 90  # poses at 30 Hz before the first step, and after each
 SETTLE_S, LOOK_S = 3.0, 0.05
 REPORT_S = 30.0  # longest wait for the report of a drift
 GRACE_S = 0.1  # after a step, in which poses may be wrong

@@ -9,6 +9,7 @@ import pytest
 from camera_node.clocks.host_clock import unix_ahead_ns
 from fusion.server.server_clock import ServerClock
 from tests.benchmarks.faults.arena import small_load
+from tests.benchmarks.faults.judge import MAX_ERROR_M
 from tests.benchmarks.faults.live_clocks import drift_live, set_system_clock
 
 
@@ -18,7 +19,7 @@ from tests.benchmarks.faults.live_clocks import drift_live, set_system_clock
 def test_no_pose_changes_when_the_system_clock_is_set(tmp_path: Path, step_s: float):
     """Server and cameras are programs whose system clock is set while a robot drives at 0.94 m/s."""
     (judged,) = set_system_clock(tmp_path, (step_s,))
-    assert judged.wrong == 0
+    assert judged.worst_m < MAX_ERROR_M
     assert judged.share > 1 / 3  # on a busy machine frames may be late
 
 
