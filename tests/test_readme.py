@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Runs every command of README.md, with shorter times and reserved ports."""
 
-import os
+import contextlib
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from camera_node.errors import TEMPORARY_FAILURE
 from tests.calib.boards import SPEC, board_poses, render
 from tests.conftest import ROOT, free_port
 from tests.waiting import wait_for_port
+from tests.web.roundel.programs import Program
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 README = (ROOT / "README.md").read_text()
@@ -187,20 +189,15 @@ def test_the_client_and_ros2_receive_poses(tmp_path: Path, scene: Path, endpoint
     (code,) = [block for block in blocks("python") if "Arena.connect" in block]
     (tmp_path / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
     demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60"]
-    env = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    demo += ["--listen", endpoint, "--scene", str(scene)]
-    with subprocess.Popen(demo, stdout=subprocess.PIPE, text=True) as arena:
-        assert arena.stdout is not None
-        assert any(line.startswith("calibrated") for line in arena.stdout)
-        follow = [sys.executable, "follow.py"]
-        with subprocess.Popen(follow, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True) as follower:
-            assert follower.stdout is not None
-            line = follower.stdout.readline()
-            follower.kill()
-        ros2 = words(find("roundel ros2").replace("tcp/localhost:7447", endpoint))
-        with subprocess.Popen(ros2, stderr=subprocess.PIPE, text=True) as bridge:
-            assert bridge.stderr is not None
-            assert any("publishes /rover/odometry" in line for line in bridge.stderr)
-            bridge.kill()
-        arena.terminate()
+    ros2 = words(find("roundel ros2").replace("tcp/localhost:7447", endpoint))
+    with contextlib.ExitStack() as stack:
+
+        def start(command: list[str]) -> Program:
+            program = Program(command, tmp_path)
+            stack.callback(program.stop, signal.SIGTERM)
+            return program
+
+        start([*demo, "--listen", endpoint, "--scene", str(scene)]).until("^calibrated", DEADLINE_S)
+        line = start([sys.executable, "follow.py"]).until(r"^\d{19} ")
+        start(ros2).until("publishes /rover/odometry")
     assert re.match(r"\d{19} \(.*\) \(.*\)", line), line

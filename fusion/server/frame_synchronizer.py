@@ -101,7 +101,7 @@ class FrameSynchronizer:
         if self._end_ns is None and not self._try_start(now_ns):
             return []
         return self._close(
-            lambda end_ns: not self._count_missing(end_ns) or now_ns >= end_ns + self.lateness_ns, SILENT_NS
+            lambda end_ns: self._is_complete(end_ns) or now_ns >= end_ns + self.lateness_ns, SILENT_NS
         )
 
     def open(self) -> tuple[FrameSet | None, int]:
@@ -187,6 +187,10 @@ class FrameSynchronizer:
     def _gather(self, end_ns: int, period_ns: int) -> FrameSet:
         frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
         return FrameSet(end_ns - period_ns // 2, tuple(frames))
+
+    def _is_complete(self, end_ns: int) -> bool:
+        """Whether all live cameras have delivered; without any, time decides: no set may end in the future."""
+        return bool(self._live_cameras()) and not self._count_missing(end_ns)
 
     def _count_missing(self, end_ns: int) -> int:
         """How many live cameras have not delivered a frame that is expected, at their rates, before `end_ns`."""

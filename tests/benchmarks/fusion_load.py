@@ -42,6 +42,7 @@ class Load:
     synchronised: bool = False
     sigma_px: float = 0.1
     crossing: bool = False  # through the whole arena, instead of each around its own point
+    period_s: float | None = None  # after which all motions repeat; never unless given
     seed: int = 1
 
     @cached_property
@@ -78,6 +79,9 @@ class Load:
         centre = 0 * centre if self.crossing else centre
         rate = rng.uniform(0.7, 1.3, (n, 2)) * self.speed_m_s / size
         turn = rng.uniform(-1.5, 1.5, n) * min(self.speed_m_s, 1.0)
+        if self.period_s is not None:
+            unit = 2 * np.pi / self.period_s
+            rate, turn = unit * np.round(rate / unit), unit * np.round(turn / unit)
         height = rng.uniform(0.05, 0.8, n)
         return Paths(centre, size, rate, rng.uniform(0, 6.28, (n, 2)), turn, rng.uniform(0, 6.28, n), height)
 

@@ -29,7 +29,7 @@ from tests.conftest import free_port
 
 ARENA = "load"
 DEADLINE_S = 60.0
-SCENE_S = 10.0
+SCENE_S = 10.0  # after which all robots are where they began
 DELAY_NS = 5_000_000  # from an exposure until its detections are sent
 
 
@@ -43,13 +43,13 @@ def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 
         cameras: free-running.
         hz: of each camera.
     """
-    load = Load(robots=robots, cameras=cameras, hz=hz, clutter=5)
+    load = Load(robots=robots, cameras=cameras, hz=hz, clutter=5, period_s=SCENE_S)
     endpoint, minute, memory = f"tcp/127.0.0.1:{free_port()}", 1, []
     with (
         TemporaryDirectory() as folder,
         serving(load, Path(folder), endpoint),
         Arena.connect(endpoint, arena=ARENA) as arena,
-        open_client([endpoint]) as session,
+        open_client([endpoint], 60.0) as session,
     ):
         status = arena.status(DEADLINE_S)
         status.next(DEADLINE_S)
@@ -86,7 +86,7 @@ def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[floa
     keys, pause = Keys(ARENA), threading.Event()
     publishers = {name: session.declare_publisher(keys.detections(name)) for name in load.rig}
     scene, begun_ns = list(load.messages(SCENE_S)), time.time_ns()
-    for seq, (message, after_ns) in enumerate(there_and_back(scene)):
+    for seq, (message, after_ns) in enumerate(repeated(scene)):
         t_ns = begun_ns + after_ns
         pause.wait(max(t_ns + DELAY_NS - time.time_ns(), 0) * 1e-9)
         now = msgspec.structs.replace(message, seq=seq, t_ns=t_ns, sent_ns=time.time_ns())
@@ -96,15 +96,11 @@ def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[floa
             return
 
 
-def there_and_back(scene: list[Detections]) -> Iterator[tuple[Detections, int]]:
-    """A scene's detections, forwards and backwards for ever, and their times: new ones would take too long to make."""
+def repeated(scene: list[Detections]) -> Iterator[tuple[Detections, int]]:
+    """A scene's detections again and again, and their times since the start: new ones would take too long to make."""
     for turn in count():
-        for message in scene if turn % 2 == 0 else reversed(scene):
-            t_ns = message.t_ns - START_NS
-            yield (
-                message,
-                round(turn * SCENE_S * 1e9) + (t_ns if turn % 2 == 0 else round(SCENE_S * 1e9) - t_ns),
-            )
+        for message in scene:
+            yield message, round(turn * SCENE_S * 1e9) + message.t_ns - START_NS
 
 
 def print_status(minute: int, stream: Stream[FusionStatus], load: Load) -> float:

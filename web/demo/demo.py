@@ -30,7 +30,7 @@ from fusion.protocol.messages import RobotPose
 from fusion.server.config import load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import CALIBRATION, ArenaPrograms
-from web.demo.failures import ProgramFailed, interrupt_on_signals, raise_failure
+from web.demo.failures import ProgramFailed, interrupt_on_signals, quote_end, raise_failure
 from web.demo.progress import (
     ProgressReporter,
     SceneClock,
@@ -195,7 +195,7 @@ class Demo:
         try:
             return self._programs.start_server(listen, threading.Event())[0]
         except NetworkError as error:
-            raise ProgramFailed(f"{error}; {log_path(self.path, 'server')}") from None
+            raise ProgramFailed(f"{error}; {quote_end(log_path(self.path, 'server'))}") from None
 
     def _start_programs(self, page: tuple[str, int] | None) -> None:
         """Start the cameras, the viewer and the calibration."""
@@ -219,7 +219,9 @@ class Demo:
                 return
             text = describe_calibration_step(self.clock, self.feed.state())
             self._reporter.report(text, self.clock.wand_share(), whole_second)
-        raise ProgramFailed(f"the calibration did not end in time; the logs are in {self.path}")
+        raise ProgramFailed(
+            f"the calibration did not end in time; {quote_end(log_path(self.path, CALIBRATION))}"
+        )
 
     def _align_to_scene(self) -> None:
         """Align the calibration with the cameras' true positions: a wand does not define a world frame."""

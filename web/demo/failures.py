@@ -27,8 +27,13 @@ def raise_failure(name: str, code: int, log: Path) -> None:
     lines = log.read_text(errors="replace").strip().splitlines()
     if code in (USER_ERROR, TEMPORARY_FAILURE) and lines and lines[-1].startswith("error: "):
         raise WebError(f"{name}: {lines[-1].removeprefix('error: ')}")
-    tail = "\n".join(f"  {line}" for line in lines[-TAIL_LINES:])
-    raise ProgramFailed(f"{name} stopped with code {code}; its log is {log}\n{tail}".rstrip())
+    raise ProgramFailed(f"{name} stopped with code {code}; {quote_end(log)}")
+
+
+def quote_end(log: Path) -> str:
+    """Name a log, and quote its last lines if it has any."""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return "\n".join([f"its log is {log}", *(f"  {line}" for line in lines[-TAIL_LINES:])])
 
 
 @contextmanager

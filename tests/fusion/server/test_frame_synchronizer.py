@@ -163,3 +163,23 @@ def test_cameras_that_pause_after_their_first_frame_lose_none(silence_s: float):
     closed = play(synchronizer, first + then)
     assert used(closed) == sent(first + then)
     assert set(synchronizer.late.values()) == {0}
+
+
+@pytest.mark.parametrize("silence_ms", [40, 100, 400, 3000])
+def test_no_frame_set_lies_in_the_future_while_no_camera_is_waited_for(silence_ms: int):
+    """All cameras are withheld for a while: the wait limit closes empty sets, and the next frames are on time."""
+    synchronizer = FrameSynchronizer(PERIOD)
+    arrivals = sorted(frames_of("a", 20) + frames_of("b", 20, 0.3), key=lambda arrival: arrival[0])
+    for at_ns, f in arrivals:
+        synchronizer.add(f)
+        synchronizer.take(at_ns)
+    last_ns = arrivals[-1][0]
+    synchronizer.ignore("a")
+    synchronizer.ignore("b")
+    back_ns = last_ns + silence_ms * MS
+    closed = [(now, s) for now in range(last_ns, back_ns, TICK) for s in synchronizer.take(now)]
+    assert all(now - frame_set.t_ns >= LATENESS for now, frame_set in closed)
+    assert closed or silence_ms * MS < LATENESS
+    assert synchronizer.add(frame("a", back_ns - START))
+    renewed = synchronizer.take(back_ns + LATENESS + PERIOD)
+    assert back_ns in [f.t_ns for frame_set in renewed for f in frame_set.frames]

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, poll
 
 MAIN = "from web.roundel.command import main; main()"
 
@@ -37,14 +37,16 @@ class Program:
         for line in self.process.stdout:
             self.lines.append(line)
 
-    def until(self, pattern: str) -> str:
-        """Wait for a line that matches, and return it."""
+    def until(self, pattern: str, deadline_s: float = DEADLINE_S) -> str:
+        """Wait for a line that matches, and return it; a failure shows all lines."""
 
         def find() -> str | None:
             assert self.process.poll() is None or self._reader.is_alive(), self.text
             return next((line for line in list(self.lines) if re.search(pattern, line)), None)
 
-        return wait_for(find) or ""
+        line = poll(find, deadline_s=deadline_s)
+        assert line is not None, f"no line with {pattern!r} in time:\n{self.text}"
+        return line
 
     @property
     def text(self) -> str:
