@@ -45,7 +45,7 @@ LIVE_FILES = (
 )
 PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and Windows
 _reserved_ports: set[int] = set()
-NICENESS = 10  # of tests that only compute
+PAGE_NICENESS, NICENESS = 5, 10  # of tests with a browser, and of those that only compute
 SLOW_TIMEOUT_S = 3600
 
 # Examples are the same in each run, and none has a limit of wall-clock time: other tests load the machine.
@@ -65,23 +65,37 @@ def is_live(item: pytest.Item) -> bool:
     return "endpoint" in fixtures or in_live_file
 
 
+def is_of_page(item: pytest.Item) -> bool:
+    """Whether a live test draws the page, most of them for a browser: it waits as long as that takes."""
+    return is_live(item) and item.path.parent == ROOT / "tests" / "web"
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One process for live tests, which wait for half of their time, and one for each processor."""
+    has_affinity = hasattr(os, "sched_getaffinity")  # on Linux
+    return (len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1) + 1
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run live tests first and one at a time, and the others of one file in one process, which shares fixtures.
+    """Run live tests first, one at a time but for those of the page, beside which another one runs.
 
-    A slow test gets more time before it counts as hanging.
+    Other tests of one file run in one process, which shares fixtures. A slow test gets more time before it counts as
+    hanging.
     """
-    items.sort(key=lambda item: not is_live(item))
+    items.sort(key=lambda item: (not is_live(item), is_of_page(item)))
     for item in items:
-        item.add_marker(pytest.mark.xdist_group("live" if is_live(item) else str(item.path)))
+        group = "page" if is_of_page(item) else "live" if is_live(item) else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
         if item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Give live tests priority over tests that only compute."""
-    if "PYTEST_XDIST_WORKER" in os.environ and not is_live(item):
-        os.nice(max(0, NICENESS - os.nice(0)))
+    """Give live tests priority over those of the page, and both over tests that only compute."""
+    niceness = PAGE_NICENESS if is_of_page(item) else 0 if is_live(item) else NICENESS
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.nice(max(0, niceness - os.nice(0)))
 
 
 def free_port() -> int:

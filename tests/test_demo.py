@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The whole arena as `make demo` runs it: all programs are real, only the images are simulated."""
+"""How the demo ends: killed, by a mistake, without its port; `test_readme.py` runs it to its verdict."""
 
-import re
 import socket
 import subprocess
 import sys
@@ -16,23 +15,6 @@ from web.demo.demo import Demo, conclude
 def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "web", "--demo", "--headless", "--scene", str(scene), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
-
-
-def test_the_demo_calibrates_and_tracks(scene: Path):
-    """Exit code 0: each robot is within 5 mm RMS and has no gap above 0.5 s. The summary has a line for each."""
-    result = run_demo(scene, "--seconds", "5")
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert re.search(r"calibrated: 4 cameras", result.stdout)
-    for robot in ("rover", "drone", "puck"):
-        line = rf"^{robot}: position [0-9.]+ mm RMS.* tracked [0-9.]+ %"
-        assert re.search(line, result.stdout, re.MULTILINE)
-    assert re.search(r"^latency: [0-9.]+ ms p50", result.stdout, re.MULTILINE)
-    assert re.search(r"^frames/s: ", result.stdout, re.MULTILINE)
-    assert "PASSED" in result.stdout
-    running = [
-        p for p in psutil.process_iter(["cmdline"]) if str(scene.parent) in " ".join(p.info["cmdline"] or ())
-    ]
-    assert not running, "a program of the demo still runs"
 
 
 def test_a_killed_demo_leaves_no_program(scene: Path):

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import psutil
 import pytest
 
 from camera_node.errors import TEMPORARY_FAILURE
@@ -184,20 +185,49 @@ def test_the_live_programs(server: tuple[Path, str]):
         assert process.wait(20) == 0
 
 
-def test_the_client_and_ros2_receive_poses(tmp_path: Path, scene: Path, endpoint: str):
-    """The README's Python prints poses of the running demo's rover, and the ROS 2 bridge publishes its topics."""
+def test_the_demo_tracks_and_a_client_and_ros2_receive_poses(tmp_path: Path, scene: Path):
+    """Exit code 0: each robot is within 5 mm RMS and has no gap above 0.5 s. The summary has a line for each.
+
+    A machine that starves the cameras says so, and gets two more attempts.
+    """
+    code, text, line = run_demo_with_clients(tmp_path, scene)
+    for _ in range(2):
+        if code and "this machine is too busy" in text:
+            code, text, line = run_demo_with_clients(tmp_path, scene)
+    assert code == 0, text
+    assert re.search(r"^calibrated: 4 cameras", text, re.MULTILINE)
+    for robot in ("rover", "drone", "puck"):
+        assert re.search(rf"^{robot}: position [0-9.]+ mm RMS.* tracked [0-9.]+ %", text, re.MULTILINE)
+    assert re.search(r"^latency: [0-9.]+ ms p50", text, re.MULTILINE)
+    assert re.search(r"^frames/s: ", text, re.MULTILINE)
+    assert "PASSED" in text
+    assert re.match(r"\d{19} \(.*\) \(.*\)", line), line
+    running = [
+        p for p in psutil.process_iter(["cmdline"]) if str(scene.parent) in " ".join(p.info["cmdline"] or ())
+    ]
+    assert not running, "a program of the demo still runs"
+
+
+def run_demo_with_clients(folder: Path, scene: Path) -> tuple[int, str, str]:
+    """Run the demo, the README's Python and `roundel ros2`.
+
+    Returns:
+        The demo's exit code, what it printed, and the Python program's first line.
+    """
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     (code,) = [block for block in blocks("python") if "Arena.connect" in block]
-    (tmp_path / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
-    demo = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "60"]
+    (folder / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
+    command = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "12"]
     ros2 = words(find("roundel ros2").replace("tcp/localhost:7447", endpoint))
     with contextlib.ExitStack() as stack:
 
         def start(command: list[str]) -> Program:
-            program = Program(command, tmp_path)
+            program = Program(command, folder)
             stack.callback(program.stop, signal.SIGTERM)
             return program
 
-        start([*demo, "--listen", endpoint, "--scene", str(scene)]).until("^calibrated", DEADLINE_S)
+        demo = start([*command, "--listen", endpoint, "--scene", str(scene)])
+        demo.until("^calibrated", DEADLINE_S)
         line = start([sys.executable, "follow.py"]).until(r"^\d{19} ")
         start(ros2).until("publishes /rover/odometry")
-    assert re.match(r"\d{19} \(.*\) \(.*\)", line), line
+        return demo.wait(), demo.text, line

@@ -20,6 +20,8 @@ from tests.fusion.serving import config, serving
 from tests.seccomp import HEADER
 from tests.waiting import DEADLINE_S, Inbox
 
+pytestmark = pytest.mark.computed
+
 UNITS = ROOT / "configs" / "systemd"
 WATCHDOG_S = 0.8
 EXPOSURE = 20  # tenths; of `systemd-analyze security`, which calls 0 to 2.0 "safe" or "OK"

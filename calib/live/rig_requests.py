@@ -17,7 +17,7 @@ from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import ANSWER_S, REQUEST_S, RequestSource, send_request
-from camera_node.protocol.session import reply_of_server
+from camera_node.protocol.session import ask_server
 
 OTHER_VERSION = "is it of this version of Roundel?"
 
@@ -78,8 +78,7 @@ def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S
 
 def request_rig_message(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> bytes | None:
     """The encoded `RigMessage` of the server, in preference to answers of other programs; None as `request_rig`."""
-    every = zenoh.ConsolidationMode.NONE
-    reply = reply_of_server(session, session.get(Keys(arena).rig, consolidation=every, timeout=timeout_s))
+    reply = ask_server(session, Keys(arena).rig, timeout_s)
     return reply.ok.payload.to_bytes() if reply is not None and reply.ok is not None else None
 
 

@@ -17,7 +17,7 @@ import zenoh
 from camera_node.arrays import Grey
 from camera_node.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import decode, encode
-from camera_node.protocol.session import reply_of_server
+from camera_node.protocol.session import ask_server
 
 log = logging.getLogger("camera_node.requests")
 
@@ -84,15 +84,11 @@ def send_request(
 
     Raises:
         RequestError: the request is refused; the message is the program's.
-        NetworkError: no program answers in time.
+        NetworkError: no program answers in time, or the session is closed.
     """
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
-        every = zenoh.ConsolidationMode.NONE
-        replies = session.get(
-            key, payload=payload, attachment=sender(session), consolidation=every, timeout=max(left, answer_s)
-        )
-        if reply := reply_of_server(session, replies):
+        if reply := ask_server(session, key, max(left, answer_s), payload, sender(session)):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")

@@ -5,7 +5,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import zenoh
@@ -174,12 +174,23 @@ def is_from_router(session: zenoh.Session, reply: zenoh.Reply) -> bool:
     return reply.replier_id is not None and reply.replier_id.zid in session.info.routers_zid()
 
 
-def reply_of_server(session: zenoh.Session, replies: Iterable[zenoh.Reply]) -> zenoh.Reply | None:
-    """The first reply of a router that this session is connected to; if there is none, the first reply.
+def ask_server(
+    session: zenoh.Session, key: str, timeout_s: float, payload: bytes = b"", attachment: bytes | None = None
+) -> zenoh.Reply | None:
+    """The reply of a router that this session is connected to; if there is none, the first reply, None without any.
 
     Zenoh's error reply when the time is over is no reply.
-    The query needs `consolidation=zenoh.ConsolidationMode.NONE`: otherwise Zenoh drops all replies but one.
+
+    Raises:
+        NetworkError: the session is closed.
     """
+    every = zenoh.ConsolidationMode.NONE  # otherwise Zenoh drops all replies but one
+    try:
+        replies = session.get(
+            key, payload=payload, attachment=attachment, consolidation=every, timeout=timeout_s
+        )
+    except zenoh.ZError as error:
+        raise NetworkError(f"{key} can't be queried: {_brief(error)}") from None
     first = None
     for reply in replies:
         if reply.err is not None and reply.err.payload.to_bytes() == OVER:

@@ -2,6 +2,7 @@
 """Lists recordings with their length, cameras and robots, from the index at a file's end: no message is read."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,8 +51,12 @@ def summarize_recording(path: Path) -> RecordingSummary:
 
 def list_recordings(folder: Path) -> list[RecordingSummary]:
     """The recordings (*.mcap) of a folder, the newest first."""
-    try:
-        files = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-        return [summarize_recording(path) for path in files[:MAX_FILES]]
-    except OSError:  # a file was removed since it was listed: the next list is right
-        return []
+    times_ns: dict[Path, int] = {}
+    for path in folder.glob("*.mcap"):
+        with suppress(OSError):  # it was removed or renamed just now
+            times_ns[path] = path.stat().st_mtime_ns
+    found = []
+    for path in sorted(times_ns, key=lambda path: times_ns[path], reverse=True)[:MAX_FILES]:
+        with suppress(OSError):
+            found.append(summarize_recording(path))
+    return found

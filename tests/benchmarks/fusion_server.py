@@ -49,7 +49,7 @@ def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 
         TemporaryDirectory() as folder,
         serving(load, Path(folder), endpoint),
         Arena.connect(endpoint, arena=ARENA) as arena,
-        open_client([endpoint], 60.0) as session,
+        open_client([endpoint], timeout_s=DEADLINE_S) as session,
     ):
         status = arena.status(DEADLINE_S)
         status.next(DEADLINE_S)

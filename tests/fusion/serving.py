@@ -120,12 +120,14 @@ def serving_an_unknown_robot(folder: Path) -> Iterator[tuple[str, Client]]:
     with serving(config(folder)) as (server, client):
 
         def publish() -> None:
-            for start_ns in count(time.time_ns(), 10**9):
+            begun_ns = time.time_ns()
+            for second in count():
                 for message in one_second:
-                    t_ns = start_ns + message.t_ns - one_second[0].t_ns
+                    t_ns = begun_ns + second * 10**9 + message.t_ns - one_second[0].t_ns
                     if stopped.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
                         return
-                    send(server, [msgspec.structs.replace(message, t_ns=t_ns, sent_ns=t_ns)])
+                    seq = message.seq + 30 * second
+                    send(server, [msgspec.structs.replace(message, seq=seq, t_ns=t_ns, sent_ns=t_ns)])
 
         cameras = threading.Thread(target=publish)
         cameras.start()

@@ -59,7 +59,6 @@ def test_the_world_is_measured_shown_and_accepted(
             panel.accept()
         panel._by.value = BY_L_FRAME
         with repeating(send, 0.1), browsing(view) as page:
-            page.set_default_timeout(30_000)
             page.get_by_text("Floor and origin").click()
             for decision in ("Discard", "Accept"):
                 page.get_by_role("button", name="Measure").click()
@@ -104,13 +103,13 @@ def test_the_history_is_listed_undone_and_redone(tmp_path: Path):
             for metres in (0.012, 0.034):
                 apply_rig(subscription, files, moved(rig, "north", metres))
             for change in ("north 12.0 mm", "north 22.0 mm"):
-                page.get_by_text(change).wait_for(timeout=20_000)
+                page.get_by_text(change).wait_for()
             assert page.get_by_role("button", name="Redo").is_disabled()
             page.get_by_role("button", name="Undo the last change").click()
-            page.get_by_role("cell", name="undone", exact=True).wait_for(timeout=20_000)
+            page.get_by_role("cell", name="undone", exact=True).wait_for()
             assert load_rig(files.rig) == moved(rig, "north", 0.012)
             page.get_by_role("button", name="Redo").click()
-            page.get_by_role("cell", name="undone", exact=True).wait_for(state="detached", timeout=20_000)
+            page.get_by_role("cell", name="undone", exact=True).wait_for(state="detached")
         assert load_rig(files.rig) == moved(rig, "north", 0.034)
         assert [version.state for version in client.rig_history().versions] == ["earlier"] * 2 + ["in force"]
         subscription.close()

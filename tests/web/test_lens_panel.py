@@ -51,7 +51,6 @@ def test_a_lens_is_calibrated_in_the_page(
 
     queryable = arena.session.declare_queryable(arena.keys.snapshot("east"), answer)
     with repeating(lambda: arena.camera("east"), 0.2), browsing(view) as page:
-        page.set_default_timeout(60_000)
         page.locator("xpath=//*[text()='Board']/following::input[1]").fill(SPEC)
         page.get_by_text("no lens yet").wait_for()
         page.get_by_role("button", name="Calibrate the lens with a board").click()

@@ -75,7 +75,6 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
     """Select its markers, enter its name; then the server tracks it, with x towards the first selected marker."""
     client, view, picker = arena
     with browsing(view) as page:
-        page.set_default_timeout(1e3 * DEADLINE_S)
         page.get_by_role("button", name="Select markers").click()
         page.get_by_text("click the robot's grey markers").wait_for()
         page.get_by_text("cam0").first.wait_for()  # the rig is drawn, and the view shows all of it

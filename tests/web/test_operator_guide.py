@@ -48,7 +48,7 @@ COMMAND_TESTS = {
     "robots pivot": ("tests/fusion/model/test_robot_frame.py", 'robots("pivot"'),
     "robots turn": ("tests/fusion/model/test_robot_frame.py", 'robots("turn"'),
     "robots save": ("tests/fusion/model/test_robot_frame.py", 'robots("save"'),
-    "define": ("tests/fusion/client/test_measure.py", '"define"'),
+    "define": ("tests/fusion/client/test_define.py", '"define"'),
     "record": ("tests/fusion/recordings/test_exact_replay.py", '"record"'),
     "recordings list": ("tests/web/test_record_tab.py", 'recordings("list"'),
     "recordings rename": ("tests/web/test_record_tab.py", 'recordings("rename"'),

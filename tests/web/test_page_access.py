@@ -283,7 +283,7 @@ def test_a_browser_of_each_role(closing: ExitStack):
     page = Page(PageAccess.create("0.0.0.0", free_port()), closing)
     closing.enter_context(drawing(page.view))
     with open_as(page, "viewer") as browser:
-        browser.get_by_text("Read only").wait_for(timeout=30_000)
+        browser.get_by_text("Read only").wait_for()
         assert "token" not in browser.url
         button = browser.get_by_role("button", name="Change the rig")
         assert button.evaluate("b => getComputedStyle(b).pointerEvents") == "none", (
@@ -291,7 +291,7 @@ def test_a_browser_of_each_role(closing: ExitStack):
         )
         button.dispatch_event("click")
     with open_as(page, "operator") as browser:
-        browser.get_by_role("button", name="Change the rig").click(timeout=30_000)
+        browser.get_by_role("button", name="Change the rig").click()
         assert page.clicks.until(lambda items: items)
         assert browser.get_by_text(READ_ONLY[2:11]).count() == 0
     assert page.clicks.items == ["click"], "the operator's"

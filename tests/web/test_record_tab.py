@@ -56,7 +56,6 @@ def test_a_recording_is_made_shown_exported_renamed_and_deleted(view: View, tmp_
     """Its messages are counted; the page shows it in the place of the arena, and the arena again."""
     folder = tmp_path / "recordings"
     with browsing(view) as page:
-        page.set_default_timeout(60_000)
         page.get_by_role("tab", name="Record").click()
         page.get_by_text("no recording in this folder yet").wait_for()
         page.get_by_role("button", name="Start recording").click()
@@ -105,6 +104,13 @@ def test_a_recording_is_made_shown_exported_renamed_and_deleted(view: View, tmp_
         assert not deleted.exists()
     assert len(list_recordings(folder)) == 1
     assert summary.path.with_suffix(".csv").read_text().startswith("t_ns,robot,x,y,z")
+
+
+def test_a_file_that_vanishes_hides_no_other(tmp_path: Path):
+    """A recording that is removed while the folder is read, like a link to nothing, can't be examined."""
+    shutil.copy(ROOT / "docs" / "sample.mcap", tmp_path / "monday.mcap")
+    (tmp_path / "gone.mcap").symlink_to(tmp_path / "nothing")
+    assert [summary.path.name for summary in list_recordings(tmp_path)] == ["monday.mcap"]
 
 
 def test_recordings_are_listed_renamed_and_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -40,7 +40,6 @@ def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cli
 
 
 def open_editor(page: Page) -> None:
-    page.set_default_timeout(30_000)
     page.get_by_role("tab", name="Robots").click()
     page.get_by_text("One robot").click()
     choose(page, "a")

@@ -89,29 +89,29 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     key = arena.keys.snapshot("east")
     camera = arena.session.declare_queryable(key, lambda query: query.reply(key, jpeg))
     with sending(arena):
-        page.get_by_text("camera east: an advice").wait_for(timeout=20_000)
+        page.get_by_text("camera east: an advice").wait_for()
         assert page.get_by_role("status").get_attribute("data-level") == "warn"
         for text in ("Roundel: test at tcp/127.0.0.1:1", "north", "30.0"):
-            page.get_by_text(text).first.wait_for(timeout=20_000)
+            page.get_by_text(text).first.wait_for()
         for tab, text in (
             ("Status", "30 poses/s, latency 7.7 ms"),
             ("Robots", "coasting"),
             ("Robots", "rover"),
         ):
             page.get_by_role("tab", name=tab).click()
-            page.get_by_text(text).first.wait_for(timeout=20_000)
+            page.get_by_text(text).first.wait_for()
     page.get_by_role("tab", name="Cameras").click()
-    page.get_by_text("check its cable").first.wait_for(timeout=20_000)
+    page.get_by_text("check its cable").first.wait_for()
     tables = "[...document.querySelectorAll('table')].map(t => t.offsetWidth - t.parentElement.clientWidth)"
     assert max(page.evaluate(tables)) <= 0, "a table is wider than the panel"
     page.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === 'east')")
     for _ in range(4):  # on a busy machine the view may give up before the answer arrives
         page.get_by_role("button", name="Take a snapshot").click()
         answer = page.get_by_text(re.compile("east, 64 x 48|sent no image"))
-        answer.wait_for(timeout=20_000)
+        answer.wait_for()
         if "64 x 48" in answer.inner_text():
             break
-    page.get_by_text("east, 64 x 48").wait_for(timeout=20_000)
+    page.get_by_text("east, 64 x 48").wait_for()
     page.get_by_role("tab", name="Calibrate").click()
     assert page.get_by_role("button", name="Undo the last change").is_disabled(), "there is no earlier rig"
     page.get_by_role("button", name="Show the whole arena").click()

@@ -75,13 +75,13 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
     (view, panel), sent = shown, record(ARENA, 8.0)  # no noise
     with browsing(view) as page, open_client([arena.endpoint]) as session:
         with cameras_present(arena):  # without cameras the button is disabled
-            page.get_by_role("button", name="Start wand session").click(timeout=30_000)
-            page.get_by_text("waiting for cameras").wait_for(timeout=20_000)
+            page.get_by_role("button", name="Start wand session").click()
+            page.get_by_text("waiting for cameras").wait_for()
         for message in sent:
             key = arena.keys.detections(message.camera)
             session.put(key, encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
         for name in ARENA.truth.cameras:
-            page.get_by_text(name).first.wait_for(timeout=20_000)
+            page.get_by_text(name).first.wait_for()
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
         assert "wave where" in panel.next_action()
         page.get_by_role("button", name="End wand session").click()
@@ -90,8 +90,8 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
         wait_for(lambda: "decide" in panel.next_action())
         page.get_by_role("button", name="Accept the calibration").click()
         page.get_by_text("but not in force: no server answers").wait_for(timeout=CALIBRATION_MS)
-        page.get_by_text("grade").first.wait_for(timeout=20_000)
-        page.get_by_role("button", name="Start wand session").wait_for(timeout=20_000)
+        page.get_by_text("grade").first.wait_for()
+        page.get_by_role("button", name="Start wand session").wait_for()
         assert panel.next_action() == ""
     saved = {(m.camera, m.t_ns) for m in read_detections(files.rig.with_name("rig.wave.mcap"))}
     assert saved <= {(m.camera, m.t_ns) for m in sent}
@@ -153,8 +153,8 @@ def test_a_discarded_calibration_changes_nothing(
     save_rig(ARENA.truth, files.candidate)
     panel._candidate = load_rig(files.candidate)
     with browsing(view) as page:
-        page.get_by_role("button", name="Discard the calibration").click(timeout=30_000)
-        page.get_by_text("discarded; the recording is").wait_for(timeout=20_000)
+        page.get_by_role("button", name="Discard the calibration").click()
+        page.get_by_text("discarded; the recording is").wait_for()
     assert not files.candidate.exists()
     assert files.rig.read_bytes() == before
     with pytest.raises(WebError, match="no calibration to accept"):

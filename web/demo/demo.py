@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ from web.demo.progress import (
     describe_tracking_step,
 )
 from web.demo.score import PoseScore, summarize
-from web.demo.usage import ResourceUsage
+from web.demo.usage import ResourceUsage, describe_overload
 from web.errors import WebError
 from web.state.feed import Feed
 from web.state.subscription import Subscription
@@ -113,6 +113,14 @@ def calibrated_lenses(scene: Scene) -> dict[str, Camera]:
         sigma = (focal * camera.fx, focal * camera.fy, centre_px, centre_px, k1)
         cameras[name] = replace(camera.with_parameters(parameters), lens_sigma=sigma)
     return cameras
+
+
+def require_poses(rig: Rig, cameras: Iterable[str]) -> None:
+    """Raise ProgramFailed, with the reasons, if the wand session placed only some of the cameras."""
+    reasons = rig.calibration.get("unplaced", {})
+    if missing := sorted(set(cameras) - set(rig.placed())):
+        why = "; ".join(f"{name}: {reasons.get(name, 'it was not recorded')}" for name in missing)
+        raise ProgramFailed(f"the calibration has no pose for {why}")
 
 
 def conclude(faults: list[str], is_test: bool) -> tuple[str, int]:
@@ -226,8 +234,7 @@ class Demo:
     def _align_to_scene(self) -> None:
         """Align the calibration with the cameras' true positions: a wand does not define a world frame."""
         rig = load_rig(self._folder.rig)
-        if missing := set(self.scene.cameras) - set(rig.placed()):
-            raise ProgramFailed(f"the calibration has no pose for {', '.join(sorted(missing))}")
+        require_poses(rig, self.scene.cameras)
         positions = {name: self.scene.T_world_cam(name)[:3, 3] for name in self.scene.cameras}
         aligned, errors_m = align_cameras(rig, positions)
         set_rig(self.session, ARENA, aligned, "roundel demo")
@@ -258,7 +265,9 @@ class Demo:
         status = self.feed.state().status
         reasons = status.message.not_acquired if status else {}
         faults = [fault for result in results for fault in result.faults(reasons.get(result.robot))]
-        for line in (*summarize(results, score.latencies_ms), *usage.summarize(self.scene.cameras)):
+        usual = {name: camera.fps for name, camera in self.scene.cameras.items()}
+        overload = describe_overload(usage.frame_rates(usual), usual)
+        for line in (*summarize(results, score.latencies_ms), *usage.summarize(usual), *overload):
             print(line)
         text, code = conclude(faults, is_test=seconds is not None)
         print(text, flush=True)

@@ -2,11 +2,13 @@
 """Measures processor time, memory and frame rates of an arena's programs."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import psutil
 
 from web.state.feed import Feed
+
+MIN_RATE = 0.9  # of a camera's frame rate, below which the machine is too slow for it
 
 
 class ResourceUsage:
@@ -60,3 +62,17 @@ class ResourceUsage:
             f"frames/s: {rates}",
             f"all programs: {100 * processor:.0f} % of one processor, {memory}",
         ]
+
+
+def describe_overload(rates: Mapping[str, float], usual: Mapping[str, float]) -> list[str]:
+    """A line on the camera that lacks most frames, if this machine is too slow to simulate the cameras.
+
+    Args:
+        rates: frames per second, by camera.
+        usual: those of a machine that is fast enough.
+    """
+    name = min(rates, key=lambda camera: rates[camera] / usual[camera])
+    if rates[name] >= MIN_RATE * usual[name]:
+        return []
+    frames = f"camera {name} sent {rates[name]:.1f} of {usual[name]:.1f} frames/s"
+    return [f"this machine is too busy or too slow for the demo: {frames}; end other programs and try again"]

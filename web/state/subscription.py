@@ -174,9 +174,9 @@ class Subscription:
             return
 
         def request(arena: str) -> None:
-            if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
-                self.feed.receive(key, key, data)
-                with contextlib.suppress(RoundelError):  # the next status asks again
+            with contextlib.suppress(RoundelError):  # the next status asks again
+                if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
+                    self.feed.receive(key, key, data)
                     self.feed.store_history(request_rig_history(session, arena, RIG_TIMEOUT_S))
 
         # In a thread: Zenoh's thread, which calls this method, must not wait for replies.

@@ -30,7 +30,7 @@ def exposed(length: float, turn: float, tilt: float, ground: float) -> np.ndarra
     return np.mean([render([disc], SIZE, ground=ground, blur=0.7) for disc in discs], axis=0)
 
 
-@pytest.mark.parametrize("length", [12.0, 24.0])
+@pytest.mark.parametrize("length", [pytest.param(12.0, marks=pytest.mark.slow), 24.0])
 def test_moving_roundels_are_tracked_with_a_consistent_covariance(length: float):
     """They are found in six directions; squared Mahalanobis errors have mean 2, and four sigmas of the mean are 0.82.
 
@@ -53,7 +53,7 @@ def test_moving_roundels_are_tracked_with_a_consistent_covariance(length: float)
     assert 2 - 0.82 < np.mean(squared) < 2 + 0.82 + 0.25
 
 
-@pytest.mark.parametrize("length", [12.0, 24.0])
+@pytest.mark.parametrize("length", [pytest.param(12.0, marks=pytest.mark.slow), 24.0])
 def test_moving_roundels_are_found_on_the_first_frame_with_a_consistent_covariance(length: float):
     """A new detector finds 95 % in twelve directions; the limits on squared errors are those of tracked roundels."""
     rng, squared, n_frames = np.random.default_rng(12), [], 0

@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from camera_node.errors import ConfigError, NetworkError
+from camera_node.protocol.requests import send_request
 from camera_node.protocol.session import (
     BURST_BUFFER,
     MAX_MESSAGE,
@@ -183,3 +184,12 @@ def test_a_giant_message_reaches_nobody_and_harms_no_other(network, inbox, event
     assert set(got.items) == {4}
     assert eventually(lambda: sender.put("a/small", bytes(7)) or 7 in got.items)
     assert set(got.items) == {4, 7}
+
+
+def test_a_request_in_a_closed_session_is_a_network_error(network):
+    """A thread of a program that ends may still ask."""
+    network.router()
+    client = network.client()
+    client.close()
+    with pytest.raises(NetworkError, match=r"test/robots.*closed"):
+        send_request(client, "test/robots")

@@ -58,6 +58,7 @@ def test_health_and_doctor_of_a_running_arena(tmp_path: Path):
     assert "no date recorded" in checked.stdout
 
 
+@pytest.mark.computed
 def test_without_a_server_health_is_2_and_doctor_says_what_to_do(tmp_path: Path):
     nowhere = f"tcp/127.0.0.1:{free_port()}"
     done = fusion("health", "--connect", nowhere, "--timeout-s", "0.5")

@@ -24,6 +24,7 @@ from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.computed
 LIMIT = 200_000  # bytes that the full disk of these tests holds
 Entry = tuple[str, bytes, int]
 FULL_DISK = """

@@ -146,6 +146,7 @@ def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[TrackingResult]:
     )
 
 
+@pytest.mark.computed
 def test_smoothing_is_more_accurate_and_its_covariance_is_consistent():
     """Velocities improve most if the cameras are synchronous, because the filter then has them from the past only. The
     squared Mahalanobis errors of pose in the middle of 8 runs: chi-square with 6 degrees, mean 6 +- 4 sqrt(12 / 8)."""

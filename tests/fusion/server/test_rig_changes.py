@@ -146,6 +146,7 @@ def test_a_rig_that_the_server_can_t_save_is_refused(tmp_path: Path):
         assert rig_of(endpoint).cameras == ARENA.cameras
 
 
+@pytest.mark.computed
 def test_without_a_server_commands_exit_with_2_and_one_line(tmp_path: Path):
     """All at once, because each waits for a server until its time is over."""
     save_rig(OTHER, tmp_path / "mine.yaml")

@@ -9,11 +9,15 @@ from pathlib import Path
 
 import psutil
 import pytest
+from msgspec.structs import replace
 
+from calib.rig.rig import Rig
+from camera_node.geometry.pose import Pose
 from camera_node.processes.supervisor import Supervisor, log_path
+from camera_node.simulation.scene import Scene
 from tests.conftest import free_port
 from tests.waiting import wait_for
-from web.demo.demo import Demo
+from web.demo.demo import Demo, calibrated_lenses, require_poses
 from web.demo.failures import ProgramFailed, interrupt_on_signals, raise_failure
 from web.demo.usage import ResourceUsage
 from web.errors import WebError
@@ -87,6 +91,18 @@ def test_a_calibration_of_the_demo_may_end(scene: Path, tmp_path: Path):
     (folder / "camera-sim-north.log").write_text("")
     with pytest.raises(ProgramFailed, match="camera sim:north stopped with code 0"):
         demo._ended("camera sim:north", 0)
+
+
+def test_a_camera_without_a_pose_is_named_with_the_reason(scene: Path):
+    """A wand session that the machine's load cut short may place some of the cameras only."""
+    simulated = Scene.load(scene)
+    lenses = calibrated_lenses(simulated)
+    pose = Pose((0.0, 0.0, 3.0), (0.0, 1.0, 0.0, 0.0))
+    placed = {name: replace(lens, T_world_cam=pose) for name, lens in lenses.items()}
+    require_poses(Rig(cameras=placed), simulated.cameras)
+    figures = {"unplaced": {"east": "it shares 3 wand positions with others"}}
+    with pytest.raises(ProgramFailed, match="no pose for east: it shares 3 wand positions"):
+        require_poses(Rig(cameras=placed | {"east": lenses["east"]}, calibration=figures), simulated.cameras)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])

@@ -7,6 +7,7 @@ import pytest
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from fusion.protocol.messages import RobotPose, TrackingState
 from web.demo.score import PoseScore, angle_deg, longest_gap_s, summarize
+from web.demo.usage import describe_overload
 
 SECOND = 10**9
 ROBOTS = {"rover": 3, "puck": 1}
@@ -126,3 +127,11 @@ def test_the_summary_has_one_line_per_robot():
     assert [line.split(":")[0] for line in lines] == ["rover", "puck", "latency"]
     assert "5.0 ms p50" in lines[-1]
     assert len(summarize(results, [])) == 2
+
+
+def test_a_machine_that_is_too_slow_is_named():
+    """A verdict on a machine that drops frames says little about the software."""
+    usual = {"north": 20.0, "east": 30.0}
+    assert describe_overload({"north": 18.5, "east": 27.5}, usual) == []
+    (line,) = describe_overload({"north": 11.0, "east": 16.0}, usual)
+    assert "camera east sent 16.0 of 30.0 frames/s" in line

@@ -52,6 +52,12 @@ class Program:
     def text(self) -> str:
         return "".join(self.lines)
 
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Wait until it ends by itself and all its lines are read; return its exit code."""
+        code = self.process.wait(deadline_s)
+        self._reader.join(deadline_s)
+        return code
+
     def stop(self, number: int = signal.SIGINT) -> int:
         if self.process.poll() is None:
             self.process.send_signal(number)

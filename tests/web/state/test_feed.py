@@ -11,6 +11,8 @@ from web.state.feed import MAX_PENDING, MAX_REASONS, REMOVED_CAMERA_S, Feed
 from web.state.messages import DemoProgress, progress_key
 from web.state.subscription import Subscription
 
+pytestmark = pytest.mark.computed
+
 
 def test_messages_are_stored(arena: LiveArena, feed: Feed):
     """Poses, camera status, server status and coverage arrive as they were sent."""

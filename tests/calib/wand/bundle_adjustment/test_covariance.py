@@ -43,7 +43,9 @@ def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibrati
     return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
 
 
-@pytest.mark.parametrize(("correlated", "expected"), [(False, 1.0), (True, 2.5)])
+@pytest.mark.parametrize(
+    ("correlated", "expected"), [pytest.param(False, 1.0, marks=pytest.mark.slow), (True, 2.5)]
+)
 def test_halves_agree_within_their_covariance(correlated: bool, expected: float):
     """Compares the two halves of recordings. The summed chi-square of their differences has the degrees of freedom D as
     mean and (2 D)^1/2 as standard deviation; with independent errors it is within 4 of these, and the inflation is 1 up

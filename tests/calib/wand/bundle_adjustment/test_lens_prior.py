@@ -44,7 +44,9 @@ def placed(seed: int, off: tuple[float, float, float], with_sigma: bool) -> Wand
     return result
 
 
-@pytest.mark.parametrize(("off", "with_sigma"), [(CAREFUL, True), (OLD, False), (SHEET, False)])
+@pytest.mark.parametrize(
+    ("off", "with_sigma"), [(CAREFUL, True), pytest.param(OLD, False, marks=pytest.mark.slow), (SHEET, False)]
+)
 def test_covariances_of_rigs_from_inaccurate_lenses_are_right(
     off: tuple[float, float, float], with_sigma: bool
 ):

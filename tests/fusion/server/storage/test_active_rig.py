@@ -34,6 +34,8 @@ from tests.fusion.serving import (
 )
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.computed
+
 GIVEN = Rig(cameras=ARENA.cameras)
 FEWER = Rig(cameras={name: ARENA.cameras[name] for name in ("cam0", "cam1")})
 MOVED = msgspec.structs.replace(ARENA.cameras["cam1"], T_world_cam=Pose((0, 0, 2), (1, 0, 0, 0)))

@@ -24,6 +24,8 @@ from tests.fusion.synthetic import WIDE
 from tests.security.lab import ARENA, Lab, certificates
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.computed
+
 
 def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command that measures a robot in a running arena and declares it."""
+
+import subprocess
+import sys
+from functools import partial
+
+import pytest
+
+from camera_node.errors import ConfigError
+from fusion.commands.define import define
+from fusion.errors import FusionError
+from fusion.model.robots import load_robots
+from tests.conftest import ROOT, free_port
+from tests.fusion.serving import DEADLINE_S, serving_an_unknown_robot, until
+
+
+def command(endpoint: str, *words: str) -> list[str]:
+    return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
+
+
+def test_a_robot_is_replaced_on_request_only(tmp_path):
+    """Its name is refused before the measurement, and the declaration stays."""
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client):
+        measure = partial(define, "a", diameter=0.12, connect=(endpoint,), arena="test")
+        before = client.declared_robots().robots["a"]
+        with pytest.raises(ConfigError, match="add --replace"):
+            measure()
+        assert client.declared_robots().robots["a"] == before
+        assert measure(seconds=1.0, replace=True) == 0
+        assert client.declared_robots().robots["a"] != before
+
+
+def test_a_robot_in_a_running_arena_is_defined(tmp_path):
+    """By the command, while the server tracks another one; the output is an entry for robots.yaml."""
+    with serving_an_unknown_robot(tmp_path) as (endpoint, client):
+        words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
+        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "the server now tracks b, with 3 markers" in done.stdout
+        until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
+        robots = client.change_robots()
+        assert set(robots) == {"a", "b"}
+        path = tmp_path / "measured.yaml"
+        path.write_text("robots:\n" + done.stdout.partition("robots.yaml:\n")[2])
+        assert load_robots(path) == {"b": robots["b"]}
+        with pytest.raises(FusionError, match="no robot 'c'"):
+            client.change_robots(remove=["c"])
+
+
+def test_a_misspelt_command_gets_a_suggestion():
+    words = [sys.executable, "-m", "fusion", "defined", "b"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "did you mean define?" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("b/c", "--diameter", "0.12"), "can't name a robot"),
+        (("b", "--diameter", "0.12", "--seconds", "-1"), "above 0"),
+    ],
+)
+def test_an_invalid_definition_is_reported_in_one_line(words, said):
+    words = command(f"tcp/127.0.0.1:{free_port()}", *words)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+LIGHT = """
+import sys
+import fusion.__main__, fusion.client.arena, fusion.client.define
+import fusion.commands.define, fusion.commands.bridges.ros2, fusion.commands.history
+heavy = {"gtsam", "scipy", "viser", "mcap", "fusion.server", "fusion.tracking"} & set(sys.modules)
+sys.exit(", ".join(sorted(heavy)) or 0)
+"""
+
+
+def test_clients_and_bridges_import_neither_the_server_nor_its_libraries():
+    """A robot's computer has none of them: the client, `define`, `undo`, `ros2`, and the help of the server."""
+    for words in (["-c", LIGHT], ["-X", "importtime", "-m", "fusion", "--help"]):
+        done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        assert "gtsam" not in done.stderr
