@@ -2,8 +2,8 @@
 """Records an arena's messages in MCAP, one channel a key, and reads such recordings.
 
 Messages are in MessagePack as on the wire, under their Zenoh keys. `log_time` is the time of arrival in the recorder's
-clock. At the start the recorder requests the active rig and the robots from the server, so a recording contains
-everything that a replay needs.
+clock. The recorder requests the active rig and the robots from the server, so a recording contains everything
+that a replay needs.
 """
 
 import math
@@ -37,6 +37,8 @@ REQUEST_S = (
     1.0  # the timeout of a request for the rig or the robots, and the longest pause until the next one
 )
 FIRST_PAUSE_S = 0.1  # the first request may precede the route to the server
+# After the end of a recording that lacks the robots: the server may be busy, and without them there is no replay.
+ANSWER_S = 3.0
 
 
 @dataclass
@@ -104,7 +106,10 @@ class ArenaRecorder:
         self._session: zenoh.Session | None = None
         self._subscriber: zenoh.Subscriber | None = None
         self._is_over = False
-        self._missing = {Keys(arena).rig, robots_key(arena)}
+        self._missing = [
+            Keys(arena).rig,
+            robots_key(arena),
+        ]  # a server without a rig answers the second one only
         self._request_at_s, self._pause_s = 0.0, FIRST_PAUSE_S
         self._received: queue.Queue[Entry] = queue.Queue(QUEUE_SIZE)
         self._lock = threading.Lock()
@@ -112,6 +117,8 @@ class ArenaRecorder:
 
     def run(self, stop: threading.Event, seconds: float | None = None) -> None:
         """Write until `stop` is set, or for `seconds`; then write what was received before.
+
+        A short recording ends up to `ANSWER_S` later, with the robots that the server did not send yet.
 
         Raises:
             ConfigError: the disk is full; the file is closed.
@@ -126,6 +133,10 @@ class ArenaRecorder:
             self._unsubscribe()
         for _ in range(self._received.qsize()):
             self._write_next(0.0)
+        end_s = time.monotonic() + ANSWER_S
+        while self._writer.counts and robots_key(self._arena) in self._missing and time.monotonic() < end_s:
+            self._request_missing()
+            self._write_next(WAIT_S)
 
     def _subscribe(self, session: zenoh.Session) -> None:
         with self._lock:
@@ -168,7 +179,8 @@ class ArenaRecorder:
             self.lost[f"messages on more than {MAX_KEYS} keys"] += 1
             return
         self._writer.put(key, data, received_ns)
-        self._missing.discard(key)
+        if key in self._missing:
+            self._missing.remove(key)
 
     def _request_missing(self) -> None:
         """Query the server for the rig and the robots; the replies are recorded as if they were published."""

@@ -27,7 +27,7 @@ class _CameraRate:
 
     times: deque[int] = field(default_factory=lambda: deque(maxlen=RATE_FRAMES))
     late: int = 0
-    interval_ns: int = 0  # median
+    interval_ns: int = 0  # median; 0 while it is unknown
 
     def add(self, t_ns: int) -> None:
         """Add a capture time; times before a long silence are dropped."""
@@ -35,7 +35,7 @@ class _CameraRate:
             self.times.clear()
         self.times.append(t_ns)
         steps = sorted(b - a for a, b in pairwise(self.times))
-        self.interval_ns = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) // 2 if steps else 0
+        self.interval_ns = steps[(len(steps) - 1) // 2] if len(steps) > 1 else 0  # one step may be a pause
 
 
 class FrameSynchronizer:
@@ -100,9 +100,7 @@ class FrameSynchronizer:
         """The frame sets that are closed at `now_ns`: a server's time, or offline the newest capture time."""
         if self._end_ns is None and not self._try_start(now_ns):
             return []
-        return self._close(
-            lambda end_ns: self._is_complete(end_ns) or now_ns >= end_ns + self.lateness_ns, SILENT_NS
-        )
+        return self._close(lambda end_ns: self._is_due(end_ns, now_ns), SILENT_NS)
 
     def open(self) -> tuple[FrameSet | None, int]:
         """The frames of the next set that have arrived (None without any), and how many are missing."""
@@ -188,9 +186,11 @@ class FrameSynchronizer:
         frames = sorted((f for f in self._waiting if f.t_ns < end_ns), key=lambda f: (f.camera, f.t_ns))
         return FrameSet(end_ns - period_ns // 2, tuple(frames))
 
-    def _is_complete(self, end_ns: int) -> bool:
-        """Whether all live cameras have delivered; without any, time decides: no set may end in the future."""
-        return bool(self._live_cameras()) and not self._count_missing(end_ns)
+    def _is_due(self, end_ns: int, now_ns: int) -> bool:
+        """Whether the wait limit is reached, or all live cameras have delivered to a set that has begun."""
+        has_begun = self.period_ns is not None and now_ns >= end_ns - self.period_ns
+        is_complete = has_begun and bool(self._live_cameras()) and not self._count_missing(end_ns)
+        return is_complete or now_ns >= end_ns + self.lateness_ns
 
     def _count_missing(self, end_ns: int) -> int:
         """How many live cameras have not delivered a frame that is expected, at their rates, before `end_ns`."""

@@ -2,6 +2,7 @@
 """Recordings: reading returns what was written, a replay repeats the poses, smoothing uses later frames."""
 
 import csv
+import threading
 from pathlib import Path
 
 import msgspec
@@ -12,18 +13,19 @@ from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
 from camera_node.errors import ConfigError
+from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.model.limits import Limits
 from fusion.protocol.messages import Robots
-from fusion.recordings.record import read_recording
+from fusion.recordings.record import ArenaRecorder, read_recording
 from fusion.recordings.run import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
-from tests.waiting import repeating
+from tests.waiting import DEADLINE_S, repeating, wait_for
 
 MOVING = Arena(
     {"a": TRIANGLE}, {"a": line((0.2, -0.3, 0.4), (0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0))}, sigma_px=0.1
@@ -105,6 +107,31 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert recording.rig.cameras == ARENA.cameras
     assert recording.robots == server.pipeline.robots
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
+
+
+def test_a_short_recording_of_a_busy_server_holds_its_rig_and_robots(tmp_path):
+    """The server answers the request for its robots only after the recording was ended: that waits for the answer."""
+    stop, busy, release = threading.Event(), threading.Event(), threading.Event()
+    path = tmp_path / "live.mcap"
+    with (
+        serving(config(tmp_path)) as (server, _),
+        ServerConnection(server.endpoints) as connection,
+        RecordingWriter(path) as writer,
+    ):
+        server.transport.enqueue(lambda: busy.set() or release.wait(DEADLINE_S))
+        assert busy.wait(DEADLINE_S)
+        recorder = threading.Thread(target=ArenaRecorder(connection, "test", writer).run, args=[stop])
+        recorder.start()
+        wait_for(
+            lambda: writer.counts[KEYS.detections("cam0")], lambda: send(server, live(ARENA.messages(3)))
+        )
+        stop.set()
+        threading.Timer(0.5, release.set).start()
+        recorder.join(DEADLINE_S)
+        robots = server.pipeline.robots
+    recording = read_recording(path)
+    assert recording.robots == robots
+    assert recording.rig is not None
 
 
 def test_a_recording_rotates_by_time_in_a_fresh_process(tmp_path):

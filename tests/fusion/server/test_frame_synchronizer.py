@@ -30,7 +30,10 @@ def frames_of(camera: str, n: int, phase: float = 0.0, delay: int = 0, period: i
 
 
 def play(synchronizer: FrameSynchronizer, arrivals: Arrivals) -> list[tuple[int, FrameSet]]:
-    """The frame sets and when each closed, asked at every arrival and tick; 0 for the last ones, of `finish`."""
+    """The frame sets and when each closed, asked at every arrival and tick; 0 for the last ones, of `finish`.
+
+    No set closes before it begins: the frames of its cameras would be too late.
+    """
     arrivals = sorted(arrivals, key=lambda arrival: arrival[0])
     closed, now = [], arrivals[0][0]
     for arrival_ns, frame in arrivals:
@@ -39,6 +42,7 @@ def play(synchronizer: FrameSynchronizer, arrivals: Arrivals) -> list[tuple[int,
             closed += [(now, frame_set) for frame_set in synchronizer.take(now)]
         synchronizer.add(frame)
         closed += [(now, frame_set) for frame_set in synchronizer.take(now)]
+    assert all(now >= frame_set.t_ns - (synchronizer.period_ns or 0) for now, frame_set in closed)
     return closed + [(0, frame_set) for frame_set in synchronizer.finish()]
 
 
@@ -162,6 +166,24 @@ def test_cameras_that_pause_after_their_first_frame_lose_none(silence_s: float):
     synchronizer = FrameSynchronizer(None, LATENESS)
     closed = play(synchronizer, first + then)
     assert used(closed) == sent(first + then)
+    assert set(synchronizer.late.values()) == {0}
+
+
+@pytest.mark.parametrize("pause_s", [0.2, 0.6, 1.4, 1.9])
+def test_cameras_that_pause_after_they_were_withheld_lose_none(pause_s: float):
+    """The pause is the only interval that is known of them, and is not their rate either."""
+    synchronizer, cameras = FrameSynchronizer(PERIOD, LATENESS), {"a": 0.0, "b": 0.3}
+    before = [arrival for name, phase in cameras.items() for arrival in frames_of(name, 20, phase)]
+    for at_ns, f in sorted(before, key=lambda arrival: arrival[0]):
+        synchronizer.add(f)
+        synchronizer.take(at_ns)
+    for name in cameras:
+        synchronizer.ignore(name)
+    first = [arrival for name, phase in cameras.items() for arrival in frames_of(name, 1, phase + 21)]
+    shift = 21 + pause_s * 1e9 / PERIOD
+    then = [a for name, phase in cameras.items() for a in frames_of(name, 60, phase + shift, 5 * MS)]
+    closed = play(synchronizer, first + then)
+    assert set(sent(first + then)) <= set(used(closed))
     assert set(synchronizer.late.values()) == {0}
 
 
