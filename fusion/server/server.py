@@ -13,6 +13,7 @@ from pathlib import Path
 
 from calib.rig.messages import RigMessage
 from camera_node.logs import about
+from camera_node.protocol.linger import stop_lingering
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import listening_endpoints
 from camera_node.service import ServiceManager
@@ -105,6 +106,7 @@ class Server:
                 with self._guarded("the status"):
                     if status := self._report_status(now_ns):
                         service.report(describe_status(status))
+                        stop_lingering()  # of connections that are new since the last status
                         collect_garbage()
                 service.progress()
 
