@@ -77,7 +77,7 @@ def test_foxglove_shows_the_arena_and_continues_after_a_restart(tmp_path: Path):
 
 def check_poses(client: FoxgloveClient, inbox: Inbox) -> None:
     _, log_ns, content = client.next("/tf")
-    (transform,) = content.transforms
+    *_, transform = content.transforms  # the newest one; a bridge that was busy sends several at once
     assert nanoseconds(transform.timestamp) == log_ns
     assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "a")
     assert inbox.until(lambda poses: any(p.t_ns == log_ns for p in poses))
