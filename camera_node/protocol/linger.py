@@ -2,8 +2,8 @@
 """Ends connections to dead programs without a wait.
 
 Zenoh sets SO_LINGER of its TCP sockets to 10 s. Closing one whose last bytes nobody acknowledges then blocks the thread
-for as long, and Zenoh closes them in the two threads that receive for all connections (its issue 1101): a server that
-has lost two programs hears no other one. Zenoh has no option for it.
+for as long, and Zenoh closes them in threads that serve all connections (its issue 1101): a server that has lost two
+programs receives from no other one. Zenoh has no option for it.
 """
 
 import contextlib
@@ -13,14 +13,17 @@ import stat
 import struct
 
 DESCRIPTORS = "/dev/fd"  # of this process; on Linux /proc/self/fd
-OFF = struct.pack(
-    "ii", 0, 0
-)  # struct linger: the kernel sends what is left after the close, as it does by default
+# A `struct linger`: the kernel sends after the close what is left, as it does by default.
+OFF = struct.pack("ii", 0, 0)
 
 
 def stop_lingering() -> int:
     """Switch SO_LINGER off for all TCP sockets of this process; returns for how many it was on."""
-    return sum(map(_switch_off, map(int, os.listdir(DESCRIPTORS))))
+    try:
+        descriptors = [int(name) for name in os.listdir(DESCRIPTORS)]
+    except OSError:  # a container without /proc
+        return 0
+    return sum(map(_switch_off, descriptors))
 
 
 def _switch_off(descriptor: int) -> bool:

@@ -106,10 +106,8 @@ class ArenaRecorder:
         self._session: zenoh.Session | None = None
         self._subscriber: zenoh.Subscriber | None = None
         self._is_over = False
-        self._missing = [
-            Keys(arena).rig,
-            robots_key(arena),
-        ]  # a server without a rig answers the second one only
+        # A server without a rig answers the second one only.
+        self._missing = [Keys(arena).rig, robots_key(arena)]
         self._request_at_s, self._pause_s = 0.0, FIRST_PAUSE_S
         self._received: queue.Queue[Entry] = queue.Queue(QUEUE_SIZE)
         self._lock = threading.Lock()
