@@ -188,7 +188,7 @@ def test_the_live_programs(server: tuple[Path, str]):
 def test_the_demo_tracks_and_a_client_and_ros2_receive_poses(tmp_path: Path, scene: Path):
     """Exit code 0: each robot is within 5 mm RMS and has no gap above 0.5 s. The summary has a line for each.
 
-    A machine that starves the cameras says so, and gets two more attempts.
+    Where the machine is too slow for the cameras, the demo says so and is run again, twice at most.
     """
     code, text, line = run_demo_with_clients(tmp_path, scene)
     for _ in range(2):

@@ -3,9 +3,7 @@
 
 import contextlib
 import logging
-import os
 import socket
-import stat
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +12,7 @@ from camera_node.errors import AddressError, RoundelError
 from camera_node.extras import require
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import MessageError, Preview, decode
+from camera_node.protocol.tcp_sockets import tcp_sockets
 from camera_node.rate_limit import RateLimit
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.client.arena import Arena
@@ -58,14 +57,10 @@ def send_without_delay(port: int) -> None:
 
     The SDK does not: a message would wait until the client acknowledges the previous one, which takes up to 40 ms.
     """
-    for name in os.listdir("/dev/fd"):
-        with contextlib.suppress(OSError):  # closed since, as the folder's own descriptor
-            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                continue
-            with socket.socket(fileno=os.dup(int(name))) as listener:
-                is_listening = listener.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-                if is_listening and listener.getsockname()[1:2] == (port,):
-                    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for copy in tcp_sockets():
+        is_listening = copy.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        if is_listening and copy.getsockname()[1:2] == (port,):
+            copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 class ArenaContent:

@@ -129,12 +129,12 @@ class ArenaRecorder:
                 self._write_next(WAIT_S)
         finally:
             self._unsubscribe()
-        for _ in range(self._received.qsize()):
-            self._write_next(0.0)
+        self._write_queued()
         end_s = time.monotonic() + ANSWER_S
         while self._writer.counts and robots_key(self._arena) in self._missing and time.monotonic() < end_s:
             self._request_missing()
             self._write_next(WAIT_S)
+        self._write_queued()
 
     def _subscribe(self, session: zenoh.Session) -> None:
         with self._lock:
@@ -163,6 +163,10 @@ class ArenaRecorder:
                 return
             self._queued_bytes += size
             self._received.put_nowait((key, sample.payload.to_bytes(), time.time_ns()))
+
+    def _write_queued(self) -> None:
+        for _ in range(self._received.qsize()):
+            self._write_next(0.0)
 
     def _write_next(self, timeout_s: float) -> None:
         try:

@@ -2,7 +2,6 @@
 """A live server in Foxglove's websocket, read by the schemas that it sends."""
 
 import contextlib
-import os
 import re
 import socket
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import Preview, encode
 from camera_node.protocol.session import open_client
+from camera_node.protocol.tcp_sockets import tcp_sockets
 from fusion.bridges.foxglove import serving
 from fusion.client.arena import Arena
 from fusion.protocol.messages import RobotPose
@@ -172,8 +172,8 @@ def test_messages_do_not_wait_for_acknowledgements():
     """Nagle's algorithm is off on the server's end of a connection: it added up to 40 ms to every other frame set."""
     with serving("127.0.0.1", 0, "test") as (_, port), FoxgloveClient(port):
         ends = []
-        for name in os.listdir("/dev/fd"):
-            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(name))) as end:
+        for end in tcp_sockets():
+            with contextlib.suppress(OSError):  # a listener has no peer
                 if end.getsockname()[1:2] == (port,) and end.getpeername():
                     ends.append(end.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
         assert ends

@@ -46,6 +46,17 @@ def play(synchronizer: FrameSynchronizer, arrivals: Arrivals) -> list[tuple[int,
     return closed + [(0, frame_set) for frame_set in synchronizer.finish()]
 
 
+def withhold_after(synchronizer: FrameSynchronizer, arrivals: Arrivals) -> int:
+    """Fuse these frames, then wait for their cameras no longer; the time of the last arrival."""
+    arrivals = sorted(arrivals, key=lambda arrival: arrival[0])
+    for at_ns, f in arrivals:
+        synchronizer.add(f)
+        synchronizer.take(at_ns)
+    for name in {f.camera for _, f in arrivals}:
+        synchronizer.ignore(name)
+    return arrivals[-1][0]
+
+
 def used(closed: list[tuple[int, FrameSet]]) -> list[tuple[str, int]]:
     return sorted((f.camera, f.t_ns) for _, frame_set in closed for f in frame_set.frames)
 
@@ -174,11 +185,7 @@ def test_cameras_that_pause_after_they_were_withheld_lose_none(pause_s: float):
     """The pause is the only interval that is known of them, and is not their rate either."""
     synchronizer, cameras = FrameSynchronizer(PERIOD, LATENESS), {"a": 0.0, "b": 0.3}
     before = [arrival for name, phase in cameras.items() for arrival in frames_of(name, 20, phase)]
-    for at_ns, f in sorted(before, key=lambda arrival: arrival[0]):
-        synchronizer.add(f)
-        synchronizer.take(at_ns)
-    for name in cameras:
-        synchronizer.ignore(name)
+    withhold_after(synchronizer, before)
     first = [arrival for name, phase in cameras.items() for arrival in frames_of(name, 1, phase + 21)]
     shift = 21 + pause_s * 1e9 / PERIOD
     then = [a for name, phase in cameras.items() for a in frames_of(name, 60, phase + shift, 5 * MS)]
@@ -191,13 +198,7 @@ def test_cameras_that_pause_after_they_were_withheld_lose_none(pause_s: float):
 def test_no_frame_set_lies_in_the_future_while_no_camera_is_waited_for(silence_ms: int):
     """All cameras are withheld for a while: the wait limit closes empty sets, and the next frames are on time."""
     synchronizer = FrameSynchronizer(PERIOD)
-    arrivals = sorted(frames_of("a", 20) + frames_of("b", 20, 0.3), key=lambda arrival: arrival[0])
-    for at_ns, f in arrivals:
-        synchronizer.add(f)
-        synchronizer.take(at_ns)
-    last_ns = arrivals[-1][0]
-    synchronizer.ignore("a")
-    synchronizer.ignore("b")
+    last_ns = withhold_after(synchronizer, frames_of("a", 20) + frames_of("b", 20, 0.3))
     back_ns = last_ns + silence_ms * MS
     closed = [(now, s) for now in range(last_ns, back_ns, TICK) for s in synchronizer.take(now)]
     assert all(now - frame_set.t_ns >= LATENESS for now, frame_set in closed)

@@ -4,7 +4,7 @@
 import socket
 import struct
 
-from camera_node.protocol.linger import stop_lingering
+from camera_node.protocol.tcp_sockets import stop_lingering
 
 ON = struct.pack("ii", 1, 10)  # as Zenoh sets it
 
