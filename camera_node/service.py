@@ -7,8 +7,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
-from types import FrameType
+from collections.abc import Iterator, Sequence
 
 
 class ServiceManager:
@@ -56,20 +55,48 @@ class ServiceManager:
 
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT, SIGTERM and SIGHUP set, in place of an exception at an arbitrary point."""
+    """Yield an event that SIGINT, SIGTERM and SIGHUP set.
+
+    An exception in the place of the event can be lost: NumPy replaces it by its own, and Python ignores it in callbacks
+    such as those of the garbage collector. A thread sets the event, because a signal handler would wait for ever if it
+    interrupts `Event.wait`, which holds the same lock.
+    """
     stop = threading.Event()
-
-    def set_stop(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
     is_main = threading.current_thread() is threading.main_thread()  # only there Python allows handlers
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if is_main else ()
     heeded = [
         number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN
     ]  # not under nohup
-    before = {number: signal.signal(number, set_stop) for number in heeded}
-    try:
+    if not heeded:
         yield stop
+        return
+    with _woken_by_signals() as received:
+        thread = threading.Thread(target=_set_on_signal, args=(received, heeded, stop), daemon=True)
+        thread.start()
+        before = {number: signal.signal(number, lambda number, frame: None) for number in heeded}
+        try:
+            yield stop
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _woken_by_signals() -> Iterator[int]:
+    """The end of a pipe to read the numbers of signals from; its other end is closed with the block."""
+    received, wakeup = os.pipe()
+    os.set_blocking(wakeup, False)
+    before = signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
+    try:
+        yield received
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.set_wakeup_fd(before)
+        os.close(wakeup)
+
+
+def _set_on_signal(received: int, numbers: Sequence[int], stop: threading.Event) -> None:
+    """Set the event once one of the signals arrives; close `received` when no more can arrive."""
+    with open(received, "rb", buffering=0) as pipe:
+        while number := pipe.read(1):
+            if number[0] in numbers:
+                stop.set()

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`fusion`: the live server."""
 
-import contextlib
-import signal
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from camera_node.config import write_atomically
+from camera_node.service import stopped_by_signals
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,7 @@ class Serve:
         settings = asdict(self)
         path, endpoints_file = settings.pop("config"), settings.pop("endpoints_file")
         config = override(load_arena(path) if path else ArenaConfig(), **settings)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with contextlib.suppress(KeyboardInterrupt), Server(config) as server:
+        with stopped_by_signals() as stop, Server(config, stop) as server:
             if endpoints_file:
                 write_atomically(endpoints_file, "".join(f"{endpoint}\n" for endpoint in server.endpoints))
             server.run()

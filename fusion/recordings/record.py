@@ -33,12 +33,10 @@ MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
 MAX_QUEUED_BYTES = 1 << 28
 MAX_KEYS, MAX_KEY = 1024, 200  # the channels of a recording; characters of a key
 WAIT_S = 0.1
-REQUEST_S = (
-    1.0  # the timeout of a request for the rig or the robots, and the longest pause until the next one
-)
-FIRST_PAUSE_S = 0.1  # the first request may precede the route to the server
-# After the end of a recording that lacks the robots: the server may be busy, and without them there is no replay.
-ANSWER_S = 3.0
+# Between requests for the rig and the robots: the first one may precede the route to the server.
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
+# For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
+ANSWER_S = 10.0
 
 
 @dataclass
@@ -190,11 +188,11 @@ class ArenaRecorder:
         if session is None or not self._missing or time.monotonic() < self._request_at_s:
             return
         self._request_at_s = time.monotonic() + self._pause_s
-        self._pause_s = min(2 * self._pause_s, REQUEST_S)
+        self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
 
         def take(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
+            if reply.ok is not None and str(reply.ok.key_expr) in self._missing:
                 self._enqueue(reply.ok)
 
         for key in self._missing:
-            session.get(key, take, timeout=REQUEST_S)
+            session.get(key, take, timeout=ANSWER_S)

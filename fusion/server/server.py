@@ -46,9 +46,14 @@ MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't pro
 
 
 class Server:
-    """One arena's server; a context manager. `run` serves until `stop` or an exception such as Ctrl-C.
+    """One arena's server; a context manager. `run` serves until `stop`.
 
-    `endpoints` are those at which it is reached; after entry a port in `listen` that was 0 is the real one.
+    Args:
+        config: its settings.
+        stopped: ends `run` once it is set, as `stop` does.
+
+    Attributes:
+        endpoints: those at which it is reached; after entry a port in `listen` that was 0 is the real one.
 
     Raises, at entry:
         NetworkError: an endpoint is taken.
@@ -56,7 +61,7 @@ class Server:
             tracked.
     """
 
-    def __init__(self, config: ArenaConfig) -> None:
+    def __init__(self, config: ArenaConfig, stopped: threading.Event | None = None) -> None:
         self.config = config
         self.keys = Keys(config.arena)
         self.endpoints = config.listen
@@ -66,7 +71,7 @@ class Server:
         self._ingest = Ingest(self.keys, self.statistics)
         self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
         self._max_lag_ns = max(MAX_LAG_NS, round(config.limits.lateness_ms * 1e6))
-        self._stopped = threading.Event()
+        self._stopped = stopped or threading.Event()
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":

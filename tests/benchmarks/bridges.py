@@ -33,7 +33,8 @@ from fusion.server.server_clock import ServerClock
 from fusion.server.transport import Transport
 from tests.conftest import ROOT, free_port
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient
-from tests.fusion.bridges.pose_server import ARENA, bridge, first_line, moving_pose
+from tests.fusion.bridges.pose_server import ARENA, bridge, moving_pose
+from tests.processes import first_line
 
 ROBOTS, RATE_HZ, WARM_UP_S, CATCH_UP_S, LIMIT_MS, LIMIT_CORE = 50, 60, 3.0, 0.5, 2.0, 0.15
 PUBLISH = "import sys; from tests.benchmarks.bridges import publish; publish(sys.argv[1])"

@@ -22,6 +22,7 @@ from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.processes import running
 from tests.waiting import Inbox, wait_for
 
 T = TypeVar("T")
@@ -149,14 +150,10 @@ def serving_process(settings: ArenaConfig) -> Iterator[tuple[str, subprocess.Pop
     file, endpoints = folder / "arena.yaml", folder / "endpoints"
     endpoints.unlink(missing_ok=True)
     file.write_text(dump_yaml(settings))
-    words = ["--config", str(file), "--endpoints-file", str(endpoints)]
-    with subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT) as process:
-        try:
-            wait_for(lambda: endpoints.exists() or process.poll() is not None)
-            assert process.poll() is None, "the server ended"
-            yield endpoints.read_text().splitlines()[0], process
-        finally:
-            process.terminate()
+    with running("fusion", "--config", file, "--endpoints-file", endpoints) as process:
+        wait_for(lambda: endpoints.exists() or process.poll() is not None)
+        assert process.poll() is None, "the server ended"
+        yield endpoints.read_text().splitlines()[0], process
 
 
 def run_program(*words: str) -> subprocess.CompletedProcess[str]:

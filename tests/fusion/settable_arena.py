@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A server and cameras that run as programs, on a machine whose system clock can be set."""
 
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from tests.conftest import ROOT
 from tests.fusion.moving_cameras import MOVING
 from tests.fusion.serving import DEADLINE_S, config
 from tests.fusion.settable_clock import SettableClock
+from tests.processes import killed_at_end, running
 from tests.waiting import wait_for
 
 
@@ -28,20 +28,16 @@ def error_m(pose: RobotPose, server_ahead_ns: int) -> float:
 def running_arena(folder: Path, clock: SettableClock) -> Iterator[Client]:
     """A server and cameras, each in a process with the settable clock; and a client of the server."""
     settings, path = config(folder), folder / "endpoints"
-    files = ["--rig", str(settings.rig), "--robots", settings.robots, "--endpoints-file", str(path)]
-    serve = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
+    files = ["--rig", settings.rig, "--robots", settings.robots, "--endpoints-file", path]
+    words = ["--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
+    publish = [sys.executable, "-m", "tests.fusion.moving_cameras"]
     environment = clock.environment
-    with subprocess.Popen(serve, cwd=ROOT, env=environment) as server:
-        try:
-            wait_for(path.exists)
-            (endpoint,) = path.read_text().splitlines()
-            publish = [sys.executable, "-m", "tests.fusion.moving_cameras", endpoint]
-            with subprocess.Popen(publish, cwd=ROOT, env=environment) as cameras:
-                try:
-                    with Client.connect(endpoint, arena="test") as client:
-                        client.robot("a", DEADLINE_S).next()
-                        yield client
-                finally:
-                    cameras.terminate()
-        finally:
-            server.terminate()
+    with running("fusion", *words, env=environment):
+        wait_for(path.exists)
+        (endpoint,) = path.read_text().splitlines()
+        with (
+            killed_at_end([*publish, endpoint], cwd=ROOT, env=environment),
+            Client.connect(endpoint, arena="test") as client,
+        ):
+            client.robot("a", DEADLINE_S).next()
+            yield client

@@ -2,7 +2,6 @@
 """A server in its own process, and cameras that publish a synthetic arena in real time, well-behaved or not."""
 
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.messages import FusionStatus, RobotPose
 from tests.fusion.serving import ARENA
+from tests.processes import running
 from tests.waiting import Inbox, wait_for
 
 KEYS = Keys("test")
@@ -46,13 +46,10 @@ def server_process(folder: Path, *options: str) -> Iterator[RunningServer]:
     (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": robots}))
     endpoints, log = folder / "endpoints", folder / "server.log"
     files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml", "--endpoints-file", endpoints]
-    command = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
-    with log.open("w") as stderr, subprocess.Popen([*map(str, command), *options], stderr=stderr) as process:
-        try:
-            wait_for(lambda: process.poll() is not None or endpoints.exists())
-            yield RunningServer(process, endpoints.read_text().split()[0], log)
-        finally:
-            process.terminate()
+    words = ["--arena", "test", "--listen", "tcp/127.0.0.1:0", *files, *options]
+    with log.open("w") as stderr, running("fusion", *words, stderr=stderr) as process:
+        wait_for(lambda: process.poll() is not None or endpoints.exists())
+        yield RunningServer(process, endpoints.read_text().split()[0], log)
 
 
 class PublishingCamera:

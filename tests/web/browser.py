@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Draws a view in a thread, and opens its page in Chromium."""
 
+import ctypes
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,6 +30,7 @@ FLAGS = [
     "--disable-component-update",
     "--no-first-run",
 ]
+PR_CAPBSET_DROP, CAP_SYS_NICE = 24, 23  # <linux/prctl.h>, <linux/capability.h>
 
 
 def loopback() -> PageAccess:
@@ -68,6 +71,15 @@ def value_of(view: View, label: str) -> Any:
     return next(handle.value for handle in handles if getattr(handle, "label", None) == label)
 
 
+def _give_up_priority() -> None:
+    """Let no program that this thread starts raise its priority, as Chromium does where it runs as root.
+
+    It draws without a graphics card, and all other programs would wait for it.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_SYS_NICE, 0, 0, 0)  # refused to users, who can't raise it
+
+
 @contextmanager
 def browsing(view: View, url: str = "") -> Iterator[Page]:
     """Open the page of a view, or another address; an error on its console fails the test. Skips without Chromium."""
@@ -79,6 +91,7 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
         if message.type == "error":
             errors.append(message.text)
 
+    _give_up_priority()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1000, "height": 700})

@@ -3,7 +3,6 @@
 
 import contextlib
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import open_router
 from fusion.protocol.messages import RobotPose, RobotPoses
-from tests.conftest import ROOT
+from tests.processes import running
 from tests.waiting import DEADLINE_S, wait_for
 
 START_S = (
@@ -112,22 +111,8 @@ class PoseServer:
 @contextlib.contextmanager
 def bridge(command: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`python -m fusion COMMAND` in a process, ended by SIGTERM; it must end with exit code 0."""
-    words = [sys.executable, "-m", "fusion", command, "--arena", ARENA, *options]
-    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-            process.terminate()
-            assert process.wait(DEADLINE_S) == 0
-        finally:
-            process.kill()
-
-
-def first_line(process: subprocess.Popen[str]) -> str:
-    """The first line that a bridge prints: it listens then."""
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    assert line, "the bridge ended"
-    return line
+    with running("fusion", command, "--arena", ARENA, *options, stdout=subprocess.PIPE, text=True) as process:
+        yield process
 
 
 def restart(server: PoseServer) -> int:

@@ -12,7 +12,8 @@ import pytest
 from calib.rig.recording import RecordingWriter
 from camera_node.protocol.messages import encode
 from tests.conftest import ROOT, free_port
-from tests.fusion.bridges.pose_server import ARENA, PoseServer, first_line, moving_pose
+from tests.fusion.bridges.pose_server import ARENA, PoseServer, moving_pose
+from tests.processes import first_line
 from tests.waiting import DEADLINE_S
 from tests.web.roundel.programs import roundel_command
 

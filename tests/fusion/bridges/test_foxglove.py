@@ -25,10 +25,11 @@ from fusion.protocol.messages import RobotPose
 from tests.conftest import ROOT
 from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient
-from tests.fusion.bridges.pose_server import bridge, first_line
+from tests.fusion.bridges.pose_server import bridge
 from tests.fusion.serving import KEYS
 from tests.fusion.synthetic import TRIANGLE
 from tests.missing_package import advice_without
+from tests.processes import first_line
 from tests.waiting import DEADLINE_S, Inbox
 
 

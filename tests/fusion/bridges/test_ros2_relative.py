@@ -2,7 +2,6 @@
 """What a robot's camera locates, in ROS 2. The oracle is `rosbags`, an independent implementation of ROS's messages."""
 
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from fusion.bridges.ros2 import RELATIVE
 from fusion.bridges.ros2_messages import ANY_ANGLE, relative_poses
 from tests.camera_node.protocol.positions import pack_random
 from tests.conftest import free_port
+from tests.processes import running
 from tests.waiting import Inbox, wait_for
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -52,15 +52,12 @@ def test_messages_have_position_normal_and_covariance():
 def test_the_bridge_publishes_what_a_camera_locates():
     """Three messages for three roundels, on one topic of the camera."""
     endpoint, received = f"tcp/127.0.0.1:{free_port()}", Inbox()
-    command = [sys.executable, "-m", "fusion", "ros2", "--connect", endpoint, "--domain", "3"]
+    words = ["ros2", "--connect", endpoint, "--domain", "3", "--relative", "scout.1"]
     with open_router([endpoint]) as robot, open_client([endpoint]) as ros:
         ros.declare_subscriber("3/**", lambda sample: received.put(copy(sample)))
         key = Keys("arena").relative("scout.1")
-        with subprocess.Popen([*command, "--relative", "scout.1"], stdout=subprocess.DEVNULL) as bridge:
-            try:
-                wait_for(lambda: len(received.items) >= 3, lambda: robot.put(key, encode(SENT)))
-            finally:
-                bridge.terminate()
+        with running("fusion", *words, stdout=subprocess.DEVNULL):
+            wait_for(lambda: len(received.items) >= 3, lambda: robot.put(key, encode(SENT)))
     names, payloads = zip(*received.items, strict=True)
     kind = RELATIVE.replace("/msg/", "::msg::dds_::") + "_"
     assert set(names) == {f"3/scout_1/relative/{kind}/{ROS.hash_rihs01(RELATIVE)}"}

@@ -18,7 +18,8 @@ import pytest
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.bridges.vrpn_messages import VELOCITY_S, turn
 from tests.conftest import ROOT, free_port
-from tests.fusion.bridges.pose_server import PoseServer, bridge, first_line, restart
+from tests.fusion.bridges.pose_server import PoseServer, bridge, restart
+from tests.processes import first_line
 from tests.waiting import DEADLINE_S
 
 FLOAT32 = 1e-6  # relative; libmotioncapture converts to float32, whose steps are 1.2e-7

@@ -27,6 +27,7 @@ from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
 from tests.waiting import DEADLINE_S, repeating, wait_for
 
+BUSY_S = 3.5  # more than 3 s, after which the recorder gave up before, with answers of up to 1 s
 MOVING = Arena(
     {"a": TRIANGLE}, {"a": line((0.2, -0.3, 0.4), (0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0))}, sigma_px=0.1
 )
@@ -126,7 +127,7 @@ def test_a_short_recording_of_a_busy_server_holds_its_rig_and_robots(tmp_path):
             lambda: writer.counts[KEYS.detections("cam0")], lambda: send(server, live(ARENA.messages(3)))
         )
         stop.set()
-        threading.Timer(0.5, release.set).start()
+        threading.Timer(BUSY_S, release.set).start()
         recorder.join(DEADLINE_S)
         robots = server.pipeline.robots
     recording = read_recording(path)

@@ -13,6 +13,7 @@ import zenoh
 
 from camera_node.protocol.session import LEASE_MS, open_client
 from tests.fusion.serving import DEADLINE_S, KEYS, config, serving_process
+from tests.processes import first_line, killed_at_end
 
 LISTENER = """
 import sys, time
@@ -34,10 +35,8 @@ def frozen_listeners(endpoint: str) -> Iterator[None]:
     with ExitStack() as stack:
         for _ in range(N_FROZEN):
             command = [sys.executable, "-c", LISTENER, endpoint]
-            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            stack.callback(process.kill)
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
+            process = stack.enter_context(killed_at_end(command, stdout=subprocess.PIPE, text=True))
+            assert first_line(process) == "ready\n"
             process.send_signal(signal.SIGSTOP)
         yield
 

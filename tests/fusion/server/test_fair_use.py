@@ -22,7 +22,8 @@ from tests.fusion.traffic import (
     latency_ms,
     server_process,
 )
-from tests.waiting import wait_for
+from tests.processes import first_line, killed_at_end
+from tests.waiting import poll, wait_for
 
 SECONDS = 2.0
 SLOWER = 4.0  # ratio of latencies in one run; noise on a shared machine reaches 2, the faults 50 and more
@@ -33,9 +34,12 @@ import sys
 from camera_node.protocol.session import open_client
 endpoint, key, payload = sys.argv[1:]
 with open_client([endpoint]) as session:
+    is_answered = False
     while True:
         for reply in session.get(key, payload=payload.encode() or None, timeout=1.0):
-            if reply.ok: print("answered", flush=True)
+            if reply.ok and not is_answered:
+                is_answered = True
+                print("answered", flush=True)
 """
 
 
@@ -51,12 +55,32 @@ def arena(folder: Path, cameras: range) -> Iterator[tuple[RunningServer, Observe
         yield server, observer
 
 
-def assert_undisturbed(before: list[RobotPose], during: list[RobotPose]) -> None:
-    """As many poses from at least as many cameras, about as fast."""
-    assert np.mean([pose.state == "tracked" for pose in during]) > 0.95
-    assert len(during) < 1.5 * len(before) + HZ
-    assert np.mean([len(pose.cameras) for pose in during]) > np.mean([len(p.cameras) for p in before]) - 0.5
-    assert latency_ms(during) < SLOWER * max(latency_ms(before), FLOOR_MS)
+def assert_undisturbed(observer: Observer, before: list[RobotPose]) -> None:
+    """A time with as many poses from at least as many cameras, about as fast.
+
+    The offender disturbs every such time, other programs of this machine only some.
+    """
+    seen: list[list[str]] = []
+
+    def is_undisturbed() -> bool:
+        seen.append(disturbances(before, observer.collect(SECONDS)))
+        return not seen[-1]
+
+    assert poll(is_undisturbed), seen
+
+
+def disturbances(before: list[RobotPose], during: list[RobotPose]) -> list[str]:
+    """What is worse than before."""
+    tracked = np.mean([pose.state == "tracked" for pose in during])
+    seeing, seeing_before = (np.mean([len(pose.cameras) for pose in poses]) for poses in (during, before))
+    limit_ms = SLOWER * max(latency_ms(before), FLOOR_MS)
+    conditions = {
+        f"{tracked:.0%} of the poses are tracked": tracked > 0.95,
+        f"{len(during)} poses in the place of {len(before)}": len(during) < 1.5 * len(before) + HZ,
+        f"{seeing:.1f} cameras in the place of {seeing_before:.1f}": seeing > seeing_before - 0.5,
+        f"latency of {latency_ms(during):.1f} ms, limit {limit_ms:.1f} ms": latency_ms(during) < limit_ms,
+    }
+    return [text for text, holds in conditions.items() if not holds]
 
 
 def test_a_camera_at_ten_times_the_rate_is_thinned_and_reported(tmp_path: Path):
@@ -65,11 +89,10 @@ def test_a_camera_at_ten_times_the_rate_is_thinned_and_reported(tmp_path: Path):
         before = observer.collect(SECONDS)
         with PublishingCamera(server.endpoint, "cam3", 10 * HZ):
             wait_for(lambda: observer.status().cameras["cam3"].faults.get(ABOVE_QUOTA, 0) > 10)
-            during = observer.collect(SECONDS)
+            assert_undisturbed(observer, before)
             status = observer.status()
-        assert_undisturbed(before, during)
         assert status.cameras["cam3"].fps < 1.2 * FRAMES_PER_SET * HZ
-        assert not any(status.cameras[f"cam{k}"].faults for k in range(3))
+        assert not any(ABOVE_QUOTA in status.cameras[f"cam{k}"].faults for k in range(3))
         assert f"camera cam3: {ABOVE_QUOTA}" in server.log.read_text()
 
 
@@ -82,8 +105,7 @@ def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
             for name in ("cam2", "cam3"):
                 stack.enter_context(PublishingCamera(server.endpoint, name, HZ, Flood(n)))
             wait_for(lambda: observer.status().cameras.get("cam3"))
-            during = observer.collect(SECONDS)
-        assert latency_ms(during) < SLOWER * max(latency_ms(before), FLOOR_MS)
+            assert_undisturbed(observer, before)
 
 
 @pytest.mark.parametrize(
@@ -100,9 +122,6 @@ def test_a_client_that_queries_in_a_loop_does_not_delay_poses(tmp_path: Path, ke
         before = observer.collect(SECONDS)
         command = [sys.executable, "-c", HAMMER, server.endpoint, key, payload]
         for _ in range(2):
-            client = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            stack.callback(client.kill)
-            assert client.stdout is not None
-            assert client.stdout.readline() == "answered\n"
-        during = observer.collect(SECONDS)
-        assert_undisturbed(before, during)
+            client = stack.enter_context(killed_at_end(command, stdout=subprocess.PIPE, text=True))
+            assert first_line(client) == "answered\n"
+        assert_undisturbed(observer, before)

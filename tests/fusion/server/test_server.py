@@ -35,6 +35,8 @@ from tests.fusion.serving import (
     serving,
     until,
 )
+from tests.processes import running
+from tests.waiting import wait_for
 from tests.waiting import Inbox
 
 
@@ -176,19 +178,14 @@ def test_a_server_on_port_0_writes_the_endpoint_that_clients_reach(tmp_path):
     """`python -m fusion --listen tcp/127.0.0.1:0 --endpoints-file PATH`."""
     settings, path = config(tmp_path), tmp_path / "endpoints"
     assert settings.rig is not None
-    files = ["--rig", settings.rig, "--robots", settings.robots, "--endpoints-file", str(path)]
-    words = [sys.executable, "-m", "fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files]
-    pause = threading.Event()
-    with subprocess.Popen(words, cwd=ROOT) as process:
-        try:
-            until(lambda: pause.wait(0.05) or path.exists())
-            (endpoint,) = path.read_text().splitlines()
-            with Client.connect(endpoint, arena="test") as client:
-                rig = client.rig(DEADLINE_S)
-                assert rig is not None
-                assert rig.cameras == ARENA.cameras
-        finally:
-            process.terminate()
+    files = ["--rig", settings.rig, "--robots", settings.robots, "--endpoints-file", path]
+    with running("fusion", "--arena", "test", "--listen", "tcp/127.0.0.1:0", *files):
+        wait_for(path.exists)
+        (endpoint,) = path.read_text().splitlines()
+        with Client.connect(endpoint, arena="test") as client:
+            rig = client.rig(DEADLINE_S)
+            assert rig is not None
+            assert rig.cameras == ARENA.cameras
 
 
 def test_another_shard_does_not_connect_to_port_0(tmp_path):
