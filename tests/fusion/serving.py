@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +20,7 @@ from fusion.model.limits import Limits
 from fusion.server.config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
-from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
 from tests.processes import running
 from tests.waiting import Inbox, wait_for
 
@@ -30,8 +29,6 @@ DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
 ATTEMPT_S = 3.0  # from a burst of frames to poses, before the burst is sent again
-MAX_AGE_NS = 100_000_000  # of a frame that is still sent
-WIDE_MOTION = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))  # of a robot that the server does not know
 
 
 def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
@@ -112,35 +109,6 @@ def send_until_tracked(server: Server, client: Client, messages: list[Detections
         return poses.until(lambda items: any(pose.state == "tracked" for pose in items), ATTEMPT_S)
 
     until(is_tracked)
-
-
-@contextmanager
-def serving_an_unknown_robot(folder: Path) -> Iterator[tuple[str, Client]]:
-    """The endpoint of a server that tracks robot a, while its cameras also see the markers of `WIDE`; and a client."""
-    arena = Arena({**ARENA.robots, "b": WIDE}, {**ARENA.motions, "b": WIDE_MOTION}, sigma_px=0.05)
-    one_second, stopped = arena.messages(30), threading.Event()
-    with serving(config(folder)) as (server, client):
-
-        def publish() -> None:
-            begun_ns = time.time_ns()
-            for second in count():
-                for message in one_second:
-                    t_ns = begun_ns + second * 10**9 + message.t_ns - one_second[0].t_ns
-                    if stopped.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
-                        return
-                    if time.time_ns() - t_ns > MAX_AGE_NS:
-                        continue  # a camera on a machine that is too slow drops frames
-                    seq = message.seq + 30 * second
-                    send(server, [msgspec.structs.replace(message, seq=seq, t_ns=t_ns, sent_ns=t_ns)])
-
-        cameras = threading.Thread(target=publish)
-        cameras.start()
-        try:
-            until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-            yield server.endpoints[0], client
-        finally:
-            stopped.set()
-            cameras.join()
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from camera_node.protocol.connection import ServerConnection
 from fusion.commands.recordings import recordings
 from fusion.recordings.summary import list_recordings
 from tests.conftest import ROOT
-from tests.fusion.serving import serving_an_unknown_robot
+from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, drawing, loopback, value_of

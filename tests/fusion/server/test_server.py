@@ -36,8 +36,7 @@ from tests.fusion.serving import (
     until,
 )
 from tests.processes import running
-from tests.waiting import wait_for
-from tests.waiting import Inbox
+from tests.waiting import Inbox, wait_for
 
 
 def test_detections_become_poses_and_markers(tmp_path):
