@@ -12,7 +12,8 @@ from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from tests.conftest import ROOT, free_port
-from tests.fusion.serving import DEADLINE_S, serving_an_unknown_robot, until
+from tests.fusion.serving import DEADLINE_S, until
+from tests.fusion.unknown_robot import serving_an_unknown_robot
 
 
 def command(endpoint: str, *words: str) -> list[str]:

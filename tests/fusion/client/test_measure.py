@@ -12,9 +12,9 @@ from fusion.model.likeness import distances
 from fusion.model.robots import Robot, load_robots, require_distinct
 from fusion.protocol.messages import Markers
 from tests.conftest import ROOT
-from tests.fusion.serving import WIDE_MOTION
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line, ring
 from tests.fusion.tracks import track
+from tests.fusion.unknown_robot import WIDE_MOTION
 
 pytestmark = pytest.mark.computed
 CUBE = load_robots(ROOT / "configs" / "robots_cube.yaml")["cube"]

@@ -30,9 +30,9 @@ from tests.fusion.serving import (
     KEYS,
     config,
     run_program,
-    serving_an_unknown_robot,
     serving_process,
 )
+from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.waiting import wait_for
 
 OTHER = Rig(
