@@ -7,7 +7,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 
 class ServiceManager:
@@ -53,15 +53,45 @@ class ServiceManager:
             datagram.sendto(message.encode(), address)
 
 
+class StopEvent(threading.Event):
+    """An event that ends a program, also where it waits for something else, such as a camera's next frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lock = threading.Lock()
+        self._closes: list[Callable[[], object]] = []
+
+    def set(self) -> None:
+        """Set the event and close what is to be closed with it."""
+        super().set()
+        with self._lock:
+            closes, self._closes = self._closes, []
+        for close in closes:
+            close()
+
+    @contextlib.contextmanager
+    def closing(self, close: Callable[[], object]) -> Iterator[None]:
+        """Call `close` once the event is set within the block, on the thread that sets it; at once if it is set."""
+        with self._lock:
+            self._closes.append(close)
+        if self.is_set():
+            self.set()
+        try:
+            yield
+        finally:
+            with self._lock, contextlib.suppress(ValueError):
+                self._closes.remove(close)
+
+
 @contextlib.contextmanager
-def stopped_by_signals() -> Iterator[threading.Event]:
+def stopped_by_signals() -> Iterator[StopEvent]:
     """Yield an event that SIGINT, SIGTERM and SIGHUP set.
 
     An exception in the place of the event can be lost: NumPy replaces it by its own, and Python ignores it in callbacks
     such as those of the garbage collector. A thread sets the event, because a signal handler would wait for ever if it
     interrupts `Event.wait`, which holds the same lock.
     """
-    stop = threading.Event()
+    stop = StopEvent()
     is_main = threading.current_thread() is threading.main_thread()  # only there Python allows handlers
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if is_main else ()
     heeded = [

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Requests to the server to change the rig in force. The server validates, applies and saves it, or refuses."""
 
+import time
+
 import zenoh
 
 from calib.rig.messages import (
@@ -16,7 +18,14 @@ from calib.rig.messages import (
 from calib.rig.rig import Rig
 from camera_node.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
-from camera_node.protocol.requests import ANSWER_S, REQUEST_S, RequestSource, send_request
+from camera_node.protocol.requests import (
+    ANSWER_S,
+    REQUEST_S,
+    RETRY_S,
+    RequestError,
+    RequestSource,
+    send_request,
+)
 from camera_node.protocol.session import ask_server
 
 OTHER_VERSION = "is it of this version of Roundel?"
@@ -71,15 +80,31 @@ def request_rig_history(session: zenoh.Session, arena: str, timeout_s: float = R
 
 
 def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig | None:
-    """The rig in force; None if the server has none, or does not answer in time."""
+    """The rig in force; returns None and raises as `request_rig_message`."""
     data = request_rig_message(session, arena, timeout_s)
     return None if data is None else _read(data).rig
 
 
 def request_rig_message(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> bytes | None:
-    """The encoded `RigMessage` of the server, in preference to answers of other programs; None as `request_rig`."""
-    reply = ask_server(session, Keys(arena).rig, timeout_s)
-    return reply.ok.payload.to_bytes() if reply is not None and reply.ok is not None else None
+    """The encoded `RigMessage` of the server, in preference to answers of other programs.
+
+    Requests that the server refuses, because all its clients together ask too often, are sent again.
+
+    Returns:
+        The message; None if the server has no rig, or does not answer in time.
+
+    Raises:
+        RequestError: the server refuses until the time is over.
+        NetworkError: the session is closed.
+    """
+    end = time.monotonic() + timeout_s
+    while reply := ask_server(session, Keys(arena).rig, max(end - time.monotonic(), RETRY_S)):
+        if reply.ok is not None:
+            return reply.ok.payload.to_bytes()
+        if time.monotonic() + RETRY_S > end:
+            raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
+        time.sleep(RETRY_S)
+    return None
 
 
 def _read(data: bytes) -> RigMessage:

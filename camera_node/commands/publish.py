@@ -2,7 +2,6 @@
 """`python -m camera_node`: publishes the detections of one camera."""
 
 import contextlib
-import signal
 import time
 import typing
 from dataclasses import dataclass, field
@@ -14,8 +13,8 @@ import tyro
 from camera_node.commands.relative import RelativeSettings
 from camera_node.config import example_file, require_name
 from camera_node.errors import ConfigError
-from camera_node.protocol.registration import CameraAssignment, CameraRegistration
-from camera_node.service import ServiceManager
+from camera_node.protocol.registration import CameraRegistration
+from camera_node.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.address import is_url
 from camera_node.sources.drivers import driver_of
@@ -64,23 +63,16 @@ class Publish:
         import cv2
 
         self._check()
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
         cv2.setNumThreads(1)  # a machine runs one process for each of its cameras
-        with contextlib.suppress(KeyboardInterrupt):
+        with stopped_by_signals() as stop:
             if self.name is not None:
-                with contextlib.ExitStack() as stack:
-                    source = open_source(self.source, self.settings, self.name)
-                    stack.callback(source.close)
-                    self._detector()  # its settings may be invalid
-                    self.relative.localizer(self.name)
-                    session = stack.enter_context(self._open_session())
-                    keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
-                    self._node(self.name, source, session, keeps_stamps).run()
-                return
+                return self._publish_named(self.name, stop)
             identity, first_t_ns = identify(self.source), first_time(self.source, self.settings)
             self._detector()
-            with self._open_session() as session:
-                self._publish_registered(session, identity, first_t_ns)
+            session = self._open_session(stop)
+            if session is not None:
+                with session:
+                    self._publish_registered(session, identity, first_t_ns, stop)
 
     def _check(self) -> None:
         require_name(self.arena, "an arena")
@@ -90,8 +82,22 @@ class Publish:
             raise ConfigError("--listen runs without a server, which would name the camera; give --name")
         self.relative.check()
 
-    def _open_session(self) -> "zenoh.Session":
-        """Wait for the server, if there is to be one; the service is ready while it waits."""
+    def _publish_named(self, name: str, stop: StopEvent) -> None:
+        with contextlib.ExitStack() as stack:
+            source = open_source(self.source, self.settings, name)
+            stack.callback(source.close)
+            self._detector()  # its settings may be invalid
+            self.relative.localizer(name)
+            if (session := self._open_session(stop)) is None:
+                return
+            stack.enter_context(session)
+            keeps_stamps = source.is_recording and self.settings.stamps == "recorded"
+            node = self._node(name, source, session, keeps_stamps)
+            with stop.closing(node.close):
+                node.run()
+
+    def _open_session(self, stop: StopEvent) -> "zenoh.Session | None":
+        """Wait for the server, if there is to be one; the service is ready while it waits. None once `stop` is set."""
         from camera_node.protocol.connection import ServerConnection
         from camera_node.protocol.session import open_router
 
@@ -105,12 +111,13 @@ class Publish:
                 service.report("waits for a server")
                 service.progress()
 
-            session = ServerConnection(self.connect, self.zenoh).wait(report)
-            stack.pop_all()  # the service goes on
+            session = ServerConnection(self.connect, self.zenoh).wait_unless(stop, report)
+            if session is not None:
+                stack.pop_all()  # the service goes on
             return session
 
     def _publish_registered(
-        self, session: "zenoh.Session", identity: SourceIdentity, first_t_ns: int | None
+        self, session: "zenoh.Session", identity: SourceIdentity, first_t_ns: int | None, stop: StopEvent
     ) -> None:
         """Publish under the name that the server gives; start again under each new name."""
         from camera_node.node.registration import RegisteredNode, Registration, camera_id
@@ -125,15 +132,16 @@ class Publish:
             first_t_ns=first_t_ns,
         )
         registration = Registration(session, self.arena, request)
-        assignment: CameraAssignment | None = registration.ask()
-        arena_time = ArenaTime.of(assignment)
+        assignment = registration.ask(stop)
+        arena_time = None if assignment is None else ArenaTime.of(assignment)
         with contextlib.closing(registration):
             registered = RegisteredNode(registration)
-            while assignment is not None:
+            while assignment is not None and not stop.is_set():
                 source = open_source(self.source, self.settings, assignment.name, arena_time)
                 with contextlib.closing(source):
                     node = self._node(assignment.name, source, session, source.is_recording)
-                    assignment = registered.run(node, assignment)
+                    with stop.closing(node.close):
+                        assignment = registered.run(node, assignment)
 
     def _node(self, name: str, source: Source, session: "zenoh.Session", keep_stamps: bool) -> "Node":
         from camera_node.node.node import Node, NodeOptions

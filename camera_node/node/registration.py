@@ -77,20 +77,21 @@ class Registration:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="registration", daemon=True)
 
-    def ask(self) -> CameraAssignment:
-        """The camera's assignment; waits until a server answers, and logs once that none does.
+    def ask(self, stop: threading.Event) -> CameraAssignment | None:
+        """The camera's assignment; waits until a server answers, and logs once that none does. None once `stop` is set.
 
         Raises:
             RequestError: the server refuses the camera.
         """
         since = time.monotonic()
-        while True:
+        while not stop.is_set():
             try:
                 self.assigned = self._request_assignment()
                 return self.assigned
             except NetworkError as error:
                 if time.monotonic() - since < 2 * ASK_S:
                     log.warning("%s; retrying", error)
+        return None
 
     def follow(self, on_change: Callable[[CameraAssignment], object]) -> None:
         """Call `on_change` in this object's thread when name or settings change."""

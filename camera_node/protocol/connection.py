@@ -99,12 +99,15 @@ class ServerConnection:
         absence.end()
         return session
 
-    def wait_unless(self, stop: threading.Event) -> zenoh.Session | None:
+    def wait_unless(
+        self, stop: threading.Event, on_wait: Callable[[], object] = lambda: None
+    ) -> zenoh.Session | None:
         """As `wait`, but None as soon as `stop` is set."""
 
         def check() -> None:
             if stop.is_set():
                 raise _StopError
+            on_wait()
 
         try:
             return self.wait(check)

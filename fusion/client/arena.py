@@ -17,7 +17,13 @@ from typing import Any
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, request_rig_history, set_rig, undo_rig
+from calib.live.rig_requests import (
+    redo_rig,
+    request_rig_history,
+    request_rig_message,
+    set_rig,
+    undo_rig,
+)
 from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
 from camera_node.config import require_name
@@ -28,6 +34,7 @@ from camera_node.protocol.messages import CameraStatus, Keys, MessageError, deco
 from camera_node.protocol.relative import RelativePositions
 from camera_node.protocol.requests import RETRY_S, RequestSource
 from camera_node.protocol.server_address import LOCAL
+from camera_node.protocol.session import ask_server
 from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest
@@ -226,16 +233,15 @@ class Arena:
 
         Raises:
             NetworkError: no server answers within `timeout_s`.
+            RequestError: the server refuses until then, because all its clients together ask too often.
         """
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             # queried before the rig: a session that was just opened may reach the server between both queries
-            is_reached = any(r.ok for r in self.session.get(self.keys.clock, timeout=min(left, 1.0)))
-            for reply in self.session.get(self.keys.rig, timeout=min(left, 1.0)):
-                if reply.ok is not None and (rig := self._read_rig(reply.ok.payload.to_bytes())):
-                    return rig
-            if is_reached:
-                return None
+            is_reached = ask_server(self.session, self.keys.clock, min(left, 1.0)) is not None
+            data = request_rig_message(self.session, self.keys.arena, left)
+            if data is not None or is_reached:
+                return None if data is None else self._read_rig(data)
             time.sleep(min(RETRY_S, left))
         raise NetworkError(f"no rig {self._origin} within {timeout_s:g} s; is roundel server running there?")
 

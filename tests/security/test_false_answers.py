@@ -15,6 +15,7 @@ from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import ClockReply, encode
 from camera_node.protocol.session import listening_endpoints, open_client, open_router
+from fusion.client.arena import Arena
 from fusion.protocol.messages import Robots, robots_key
 from fusion.protocol.requests import request_robots
 from tests.fusion.serving import KEYS, config, serving
@@ -83,7 +84,7 @@ def test_false_robots_are_not_believed(tmp_path: Path):
 
 
 def test_a_false_rig_is_not_believed(tmp_path: Path):
-    """Neither by programs that ask for the rig nor by the page."""
+    """Neither by programs that ask for the rig nor by the page nor by clients."""
     false = RigMessage(t_ns=1, rig=Rig(cameras={"false": next(iter(four_cameras().cameras.values()))}))
 
     def answer(query: zenoh.Query) -> None:
@@ -102,3 +103,6 @@ def test_a_false_rig_is_not_believed(tmp_path: Path):
         stack.callback(subscription.close)
         wait_for(lambda: subscription.feed.state().rig)
         assert subscription.feed.state().rig == rig
+        client = stack.enter_context(Arena.connect(*server.endpoints, arena=KEYS.arena))
+        wait_for_answers(client.session, KEYS.rig, 2)
+        assert client.rig() == rig

@@ -22,6 +22,7 @@ from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.messages import FusedFrames, frames_key
 from fusion.server.config import ArenaConfig
+from fusion.server.requests import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 from tests.fusion.serving import (
@@ -30,6 +31,7 @@ from tests.fusion.serving import (
     KEYS,
     config,
     run_program,
+    serving,
     serving_process,
 )
 from tests.fusion.unknown_robot import serving_an_unknown_robot
@@ -161,6 +163,13 @@ def test_without_a_server_commands_exit_with_2_and_one_line(tmp_path: Path):
             assert done.returncode == 2
             (line,) = done.stderr.splitlines()
             assert "no server answers" in line
+
+
+def test_a_client_that_asks_often_always_gets_the_rig(tmp_path: Path):
+    """Above its rate the server refuses: that is no arena without a rig."""
+    with serving(config(tmp_path)) as (_, client):
+        rigs = [client.rig() for _ in range(round(2 * RIG_ANSWERS_HZ))]
+    assert all(rig is not None and rig.cameras == ARENA.cameras for rig in rigs)
 
 
 def test_a_rig_with_new_lenses_costs_no_frame_set(tmp_path: Path):
