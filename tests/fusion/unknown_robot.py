@@ -15,6 +15,7 @@ import msgspec
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
+from fusion.model.limits import Limits
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, serving_process
 from tests.fusion.synthetic import WIDE, Arena, line
@@ -28,7 +29,8 @@ WIDE_MOTION = line((-0.4, 0.2, 0.3), tilt=(0.05, -0.04, 0.7))  # of the robot th
 @contextmanager
 def serving_an_unknown_robot(folder: Path) -> Iterator[tuple[str, Client]]:
     """The endpoint of the server, and a client that has received a tracked pose of robot a."""
-    with serving_process(config(folder)) as (endpoint, _):
+    settings = msgspec.structs.replace(config(folder), limits=Limits())  # frames are sent in real time
+    with serving_process(settings) as (endpoint, _):
         command = [sys.executable, "-m", "tests.fusion.unknown_robot", endpoint]
         with killed_at_end(command, cwd=ROOT), Client.connect(endpoint, arena="test") as client:
             wait_for(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
