@@ -197,9 +197,11 @@ class Node:
         """Declare all publications, queryables and tokens, to be undeclared by `stack`."""
         keys, name, session = self._keys, self.name, self._session
         stack.callback(self.close)
+        control = zenoh.CongestionControl
         publisher = session.declare_publisher(
             keys.detections(name),
-            congestion_control=zenoh.CongestionControl.DROP,  # old frames are useless
+            # Old frames of a camera are useless; those of a recording are not old at their recorded times.
+            congestion_control=control.BLOCK if self._options.keep_stamps else control.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )

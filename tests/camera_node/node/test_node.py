@@ -81,7 +81,7 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
     """In order, with the roundel where it was drawn, to 0.1 px; rounding to sub-pixels in the drawing costs 0.03."""
     got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
     running(frames)
-    assert got.until(lambda messages: len(messages) == 40)
+    assert got.until(lambda messages: len(messages) == 40), [message.seq for message in got.items]
     assert [message.t_ns for message in got.items] == [START + 50 * MS * k for k in range(40)]
     assert [message.seq for message in got.items] == list(range(40))
     assert {(message.camera, message.width, message.height) for message in got.items} == {("cam0", 320, 240)}
@@ -89,6 +89,18 @@ def test_every_frame_arrives_with_its_recorded_time(network, inbox, running, fra
     for message in got.items:
         np.testing.assert_allclose(message.unpack().uv, [CENTRE], atol=0.1)
         assert message.detect_us > 0
+
+
+def test_a_burst_of_recorded_frames_arrives_complete(network, inbox, running, tmp_path):
+    """As after a pause of the machine: a link that is busy delays them."""
+    cv2.imwrite(str(tmp_path / f"{START}.png"), render())
+    times = [START + k for k in range(1000)]  # ns
+    for t_ns in times[1:]:
+        (tmp_path / f"{t_ns}.png").symlink_to(tmp_path / f"{START}.png")
+    got = subscribe(network.router(), KEYS.detections(), Detections, inbox)
+    running(tmp_path)
+    assert got.until(lambda messages: len(messages) == len(times)), len(got.items)
+    assert [message.t_ns for message in got.items] == times
 
 
 def test_two_nodes_with_one_name_can_be_told_apart(network, inbox, running, frames):
