@@ -2,6 +2,7 @@
 """Sessions that come and go cost the server no memory for good."""
 
 import ctypes
+import gc
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from camera_node.processes.allocator import glibc
 from camera_node.protocol.session import open_client
 from fusion.server.server import Server
 from tests.fusion.serving import KEYS, config, serving
+from tests.waiting import poll
 
 SESSIONS = 60
 MAX_BYTES = 2000  # in use for each session that has ended; Zenoh 1.10 leaves 100 to 400
@@ -24,6 +26,7 @@ class AllocatorStatistics(ctypes.Structure):
 
 def bytes_in_use() -> int:
     """Allocated and not freed, by all threads."""
+    gc.collect()
     library = glibc()
     assert library is not None
     library.mallinfo2.restype = AllocatorStatistics
@@ -43,8 +46,15 @@ def come_and_go(server: Server, sessions: int) -> None:
 
 @pytest.mark.skipif(glibc() is None, reason="the allocator is not glibc's")
 def test_a_session_that_has_ended_leaves_little_memory(tmp_path: Path):
+    """What the server has in use for a moment does not grow with their number."""
+    per_session: list[float] = []
     with serving(config(tmp_path)) as (server, _):
         come_and_go(server, SESSIONS)
         before = bytes_in_use()
-        come_and_go(server, SESSIONS)
-        assert bytes_in_use() - before < MAX_BYTES * SESSIONS
+
+        def is_little() -> bool:
+            come_and_go(server, SESSIONS)
+            per_session.append((bytes_in_use() - before) / (SESSIONS * (len(per_session) + 1)))
+            return per_session[-1] < MAX_BYTES
+
+        assert poll(is_little, deadline_s=30.0), per_session
