@@ -39,7 +39,10 @@ def killed_at_end(command: Sequence[str], **options: Any) -> Iterator[subprocess
 
 
 def first_line(process: subprocess.Popen[str]) -> str:
-    """The first line of a program's standard output, which must be a pipe; empty if it printed none in time."""
+    """The first line of a program's standard output, which must be a pipe."""
     assert process.stdout is not None
     ready, _, _ = select.select([process.stdout], [], [], DEADLINE_S)
-    return process.stdout.readline() if ready else ""
+    assert ready, "the program printed nothing in time"
+    line = process.stdout.readline()
+    assert line, "the program ended"
+    return line

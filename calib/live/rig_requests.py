@@ -22,8 +22,8 @@ from camera_node.protocol.requests import (
     ANSWER_S,
     REQUEST_S,
     RETRY_S,
-    RequestError,
     RequestSource,
+    content_of,
     send_request,
 )
 from camera_node.protocol.session import ask_server
@@ -99,10 +99,8 @@ def request_rig_message(session: zenoh.Session, arena: str, timeout_s: float = R
     """
     end = time.monotonic() + timeout_s
     while reply := ask_server(session, Keys(arena).rig, max(end - time.monotonic(), RETRY_S)):
-        if reply.ok is not None:
-            return reply.ok.payload.to_bytes()
-        if time.monotonic() + RETRY_S > end:
-            raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
+        if reply.ok is not None or time.monotonic() + RETRY_S > end:
+            return content_of(reply)
         time.sleep(RETRY_S)
     return None
 

@@ -132,8 +132,9 @@ class Publish:
             first_t_ns=first_t_ns,
         )
         registration = Registration(session, self.arena, request)
-        assignment = registration.ask(stop)
-        arena_time = None if assignment is None else ArenaTime.of(assignment)
+        if (assignment := registration.ask(stop)) is None:
+            return
+        arena_time = ArenaTime.of(assignment)
         with contextlib.closing(registration):
             registered = RegisteredNode(registration)
             while assignment is not None and not stop.is_set():

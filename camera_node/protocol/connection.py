@@ -86,33 +86,23 @@ class ServerConnection:
             raise NetworkError(NO_SERVER.format(self.endpoints, timeout_s))
         return session
 
-    def wait(self, on_wait: Callable[[], object]) -> zenoh.Session:
-        """Wait for the session; logs the server's absence once.
+    def wait_unless(
+        self, stop: threading.Event, on_wait: Callable[[], object] = lambda: None
+    ) -> zenoh.Session | None:
+        """Wait for the session, and log the server's absence once; None as soon as `stop` is set.
 
         Args:
+            stop: ends the wait.
             on_wait: called again and again; its exceptions end the wait.
         """
         absence = _Absence(self.endpoints)
         while (session := self._opened_within(WAIT_S)) is None:
+            if stop.is_set():
+                return None
             on_wait()
             absence.report()
         absence.end()
         return session
-
-    def wait_unless(
-        self, stop: threading.Event, on_wait: Callable[[], object] = lambda: None
-    ) -> zenoh.Session | None:
-        """As `wait`, but None as soon as `stop` is set."""
-
-        def check() -> None:
-            if stop.is_set():
-                raise _StopError
-            on_wait()
-
-        try:
-            return self.wait(check)
-        except _StopError:
-            return None
 
     def _opened_within(self, timeout_s: float) -> zenoh.Session | None:
         try:
@@ -140,10 +130,6 @@ class ServerConnection:
                 return taken
             self._future.set_result(session)
             return None
-
-
-class _StopError(Exception):
-    """Ends a wait."""
 
 
 class _Absence:

@@ -89,14 +89,23 @@ def send_request(
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0:
         if reply := ask_server(session, key, max(left, answer_s), payload, sender(session)):
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
-            raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
+            return content_of(reply)
         time.sleep(min(RETRY_S, left))  # a session that was just opened knows no queryable yet
     raise NetworkError(
         f"no server answers on {key} within {timeout_s:g} s; check that roundel server runs there, and check "
         "--connect and --arena"
     )
+
+
+def content_of(reply: zenoh.Reply) -> bytes:
+    """The payload of a reply.
+
+    Raises:
+        RequestError: it refuses the request; the message is the program's.
+    """
+    if reply.ok is not None:
+        return reply.ok.payload.to_bytes()
+    raise RequestError(reply.err.payload.to_string() if reply.err else "the request was refused")
 
 
 def payload_of(query: zenoh.Query) -> bytes:

@@ -76,10 +76,8 @@ def _give_up_priority() -> None:
 
     It draws without a graphics card, and all other programs would wait for it.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(
-            PR_CAPBSET_DROP, CAP_SYS_NICE, 0, 0, 0
-        )  # refused to users, who can't raise it
+    if sys.platform == "linux":  # refused to users, who can't raise it
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_SYS_NICE, 0, 0, 0)
 
 
 @contextmanager

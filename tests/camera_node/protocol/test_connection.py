@@ -43,7 +43,7 @@ def test_the_wait_ends_with_the_stop_event_or_with_an_exception(network):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        connection.wait(interrupt)
+        connection.wait_unless(threading.Event(), interrupt)
 
 
 def test_the_absence_of_the_server_is_logged_once(network, caplog, monkeypatch):
@@ -57,7 +57,7 @@ def test_the_absence_of_the_server_is_logged_once(network, caplog, monkeypatch):
         if looks == 3:
             network.router_again()
 
-    network.connection().wait(look)
+    network.connection().wait_unless(threading.Event(), look)
     assert [record.getMessage().split(":")[0] for record in caplog.records] == [
         "the server is away",
         "the server is back",

@@ -5,7 +5,7 @@ import contextlib
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import zenoh
@@ -108,11 +108,9 @@ class PoseServer:
             publish_poses(session, [self.published[robot, t_ns] for robot in (*self.robots, "gone")])
 
 
-@contextlib.contextmanager
-def bridge(command: str, *options: str) -> Iterator[subprocess.Popen[str]]:
+def bridge(command: str, *options: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
     """`python -m fusion COMMAND` in a process, ended by SIGTERM; it must end with exit code 0."""
-    with running("fusion", command, "--arena", ARENA, *options, stdout=subprocess.PIPE, text=True) as process:
-        yield process
+    return running("fusion", command, "--arena", ARENA, *options, stdout=subprocess.PIPE, text=True)
 
 
 def restart(server: PoseServer) -> int:
